@@ -1,0 +1,171 @@
+"""The maximum a posteriori from many starts, its curvature, and directions that the data do not see."""
+
+import warnings
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcal.errors import ConvergenceError, ConvergenceWarning, ShapeError
+from torchcal.inference.newton import Minima, hessian, minimise
+from torchcal.inference.setup import preserve_random_state
+from torchcal.models import Problem
+
+__all__ = ["Estimate", "Laplace", "laplace", "maximise"]
+
+NULL_CURVATURE = 1e-7
+"""Curvature, relative to the largest, below which a direction counts as not seen by the data. The differences
+behind the Hessian are good to about 1e-9 of its largest entry."""
+
+AGREEMENT = 1e-6
+"""Relative difference of objectives up to which two starts count as the same maximum."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The best of many starts.
+
+    Attributes:
+        alpha: MAP, ``(P,)``.
+        objective: Negative log-likelihood there.
+        posterior_objective: Negative log-posterior there, what was minimised.
+        minima: All starts.
+        agreeing: Number of starts that reached the best objective.
+        null_directions: Unit vectors in α along which the log-posterior does not change, ``(k, P)``.
+        curvature: Hessian of the negative log-posterior in α, ``(P, P)``.
+    """
+
+    alpha: Tensor
+    objective: float
+    posterior_objective: float
+    minima: Minima
+    agreeing: int
+    null_directions: Tensor
+    curvature: Tensor
+
+
+@dataclass(frozen=True)
+class Laplace:
+    """A normal approximation in the sampler's unbounded coordinates: ``loc`` and the factor of its covariance."""
+
+    loc: Tensor
+    scale_tril: Tensor
+
+
+def maximise(
+    problem: Problem, leading: Tensor, *, starts: Tensor | None, num_starts: int, seed: int
+) -> Estimate:
+    """Maximise the posterior of α.
+
+    Args:
+        problem: What to maximise.
+        leading: Least-squares estimate of the scaled parameters, where the means start, ``(d,)``.
+        starts: A user's own starting points ``(S, P)``, or None.
+        num_starts: Number of starting points made otherwise.
+        seed: Of the starting points.
+
+    Raises:
+        ConvergenceError: If the posterior is not finite at any start.
+
+    Warns:
+        ConvergenceWarning: If fewer than two starts of many reached the best objective.
+    """
+    like = problem.propagate.nodes
+    transform = problem.prior.transform
+    size = problem.prior.low.shape[0]
+    if starts is not None:
+        starts = torch.as_tensor(starts).to(like)
+        if starts.ndim != 2 or starts.shape[1] != size:
+            raise ShapeError(f"Expected starts of shape (S, {size}). Got {tuple(starts.shape)}.")
+    else:
+        starts = _starting_points(problem, leading.to(like), num_starts, seed)
+
+    def objective(u: Tensor) -> Tensor:
+        return -problem.log_prob(transform.bound(u))
+
+    found = minimise(objective, transform.unbound(starts))
+    if not bool(torch.isfinite(found.values[0])):
+        raise ConvergenceError(
+            f"Expected a finite posterior at some starting point. Got none at {len(starts)}. Check the "
+            "simulator over the parameters' ranges, or pass starts=."
+        )
+    if problem.propagate.pattern.num_germs and problem.propagate.refine(
+        transform.bound(found.points[:1])[..., : problem.propagate.num_alpha]
+    ):
+        found = minimise(objective, found.points[: max(4, len(found.points) // 4)])
+    best = transform.bound(found.points[0])
+    scale = 1 + float(found.values[0].abs())
+    agreeing = int((found.values - found.values[0] <= AGREEMENT * scale).sum())
+    if agreeing < 2 <= len(found.values):
+        runner_up = float(found.values[1])
+        warnings.warn(
+            f"Only 1 of {len(found.values)} starts reached the best objective {float(found.values[0]):.6g}; the "
+            f"next ended at {runner_up:.6g}. The maximum may not be the global one. Raise num_starts=.",
+            ConvergenceWarning,
+            stacklevel=3,
+        )
+    curvature = hessian(lambda a: -problem.log_prob(a), _inside(problem, best)[None])[0]
+    values, vectors = torch.linalg.eigh(torch.nan_to_num(curvature))
+    null = vectors.T[values.abs() <= NULL_CURVATURE * values.abs().max().clamp_min(1e-300)]
+    with torch.no_grad():
+        likelihood = float(problem.log_likelihood(best))
+    return Estimate(
+        alpha=best,
+        objective=-likelihood,
+        posterior_objective=float(found.values[0]),
+        minima=Minima(transform.bound(found.points), found.values, found.converged, found.iterations),
+        agreeing=agreeing,
+        null_directions=null,
+        curvature=curvature,
+    )
+
+
+def _inside(problem: Problem, alpha: Tensor) -> Tensor:
+    """A point far enough from the bounds to take differences at."""
+    low, high = problem.prior.low, problem.prior.high
+    margin = 2e-5
+    return torch.maximum(torch.minimum(alpha, high - margin), low + margin)
+
+
+def _starting_points(problem: Problem, leading: Tensor, num_starts: int, seed: int) -> Tensor:
+    """Half around the least-squares fit and half from the prior, with spreads over two decades."""
+    pattern = problem.propagate.pattern
+    with preserve_random_state(seed):
+        points = problem.prior.sample((num_starts,))
+        extra = points.shape[1] - pattern.num_alpha  # ln σ of the additive model
+        is_leading = torch.cat([pattern.leading, torch.zeros(extra, dtype=torch.bool)]).to(points.device)
+        jitter = 0.1 * torch.randn(num_starts, len(leading)).to(points)
+        spread = 10 ** (2 * torch.rand(num_starts, 1).to(points) - 2)
+        normal = torch.randn(points.shape).to(points)
+    near = torch.arange(num_starts) % 2 == 0
+    anchor = leading + jitter
+    anchor[0] = leading
+    columns = is_leading.nonzero()[:, 0]
+    rows = near.nonzero()[:, 0].to(points.device)
+    points[rows[:, None], columns] = anchor[rows]
+    if extra == 0:
+        points = torch.where(is_leading, points, spread * normal)
+    low, high = problem.prior.low, problem.prior.high
+    inner = 0.01 * torch.where(torch.isfinite(high - low), high - low, torch.ones_like(low))
+    return torch.maximum(torch.minimum(points, high - inner), low + inner)
+
+
+def laplace(problem: Problem, estimate: Estimate) -> Laplace:
+    """The normal approximation at the mode in the sampler's coordinates, which differ from α at bounds only.
+
+    Directions that the data do not see get one unit of scaled coordinates, rather than an infinite width.
+    """
+    transform = problem.prior.transform
+    loc = transform.unbound(estimate.alpha)
+
+    def objective(u: Tensor) -> Tensor:
+        return -problem.log_prob(transform.bound(u)) - transform.log_slope(u)
+
+    if not transform.free:
+        starts = torch.stack([loc, loc.clamp(-4.0, 4.0)])
+        loc = minimise(objective, starts).points[0]
+    curvature = torch.nan_to_num(hessian(objective, loc[None])[0])
+    values, vectors = torch.linalg.eigh(curvature)
+    values = values.abs().clamp_min(max(1.0, 1e-12 * float(values.abs().max())))
+    covariance = (vectors / values) @ vectors.T
+    return Laplace(loc, torch.linalg.cholesky(0.5 * (covariance + covariance.T)))

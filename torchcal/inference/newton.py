@@ -1,0 +1,122 @@
+"""Minimisation from many starts at once, as one batched tensor program."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+__all__ = ["Minima", "gradient", "hessian", "minimise"]
+
+Objective = Callable[[Tensor], Tensor]
+
+_STEP = 1e-5
+"""Central-difference step of the Hessian in scaled coordinates: gradients are good to 1e-12, so the
+Hessian is good to 1e-7 of its largest entry, and Newton steps need no more."""
+
+
+@dataclass(frozen=True)
+class Minima:
+    """Where each start ended, best first.
+
+    Attributes:
+        points: ``(S, P)``.
+        values: Objective there, ``(S,)``; +inf where it was never finite.
+        converged: Whether the start stopped by itself, ``(S,)`` bool.
+        iterations: Iterations of the longest run.
+    """
+
+    points: Tensor
+    values: Tensor
+    converged: Tensor
+    iterations: int
+
+
+def gradient(objective: Objective, points: Tensor) -> tuple[Tensor, Tensor]:
+    """Values ``(B,)`` and gradients ``(B, P)``; what is not finite becomes +inf and 0."""
+    leaf = points.detach().requires_grad_(True)
+    with torch.enable_grad():
+        values = objective(leaf)
+        (slope,) = torch.autograd.grad(values.sum(), leaf)
+    values = torch.nan_to_num(values.detach(), nan=torch.inf)
+    good = torch.isfinite(values) & torch.isfinite(slope).all(-1)
+    return torch.where(good, values, torch.inf), torch.where(good[:, None], slope, 0.0)
+
+
+def hessian(objective: Objective, points: Tensor, *, step: float = _STEP) -> Tensor:
+    """Hessians ``(B, P, P)`` by central differences of the gradient, all of them in one batch."""
+    batch, size = points.shape
+    shift = step * torch.eye(size, dtype=points.dtype, device=points.device)
+    both = torch.stack([points[:, None] + shift, points[:, None] - shift])  # (2, B, P, P)
+    _, slopes = gradient(objective, both.reshape(-1, size))
+    slopes = slopes.reshape(2, batch, size, size)
+    result = (slopes[0] - slopes[1]) / (2 * step)
+    return 0.5 * (result + result.transpose(-1, -2))
+
+
+def minimise(
+    objective: Objective,
+    starts: Tensor,
+    *,
+    max_iterations: int = 200,
+    tolerance: float = 1e-10,
+    progress: Callable[[int, Tensor], None] | None = None,
+) -> Minima:
+    r"""Damped Newton steps with absolute curvatures, from every start at once.
+
+    With the Hessian :math:`H = Q \Lambda Q^T` each iteration tries the steps
+    :math:`-Q (|\Lambda| + \mu)^{-1} Q^T g` for a ladder of dampings μ, longer steps for flat valleys, and both
+    directions of a negative curvature (a germ's column leaves zero spread along one), and keeps the best.
+
+    Args:
+        objective: ``(B, P) -> (B,)``, differentiable.
+        starts: ``(S, P)``.
+        max_iterations: Most iterations.
+        tolerance: A start is done when three iterations in a row gain less than this, relative to the objective plus
+            one: log-densities differ by nothing that matters then.
+        progress: Called with the iteration and the values so far.
+    """
+    points = starts.detach().clone()
+    size = points.shape[1]
+    with torch.no_grad():
+        values = torch.nan_to_num(objective(points), nan=torch.inf, posinf=torch.inf)
+    stalls = torch.zeros(len(points), dtype=torch.long, device=points.device)
+    active = torch.isfinite(values)
+    ladder = torch.tensor(
+        [0.0, 1e-12, 1e-10, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 1e3],
+        dtype=points.dtype,
+        device=points.device,
+    )
+    lengths = torch.tensor([1.0] * len(ladder) + [2.0, 4.0, 0.5, 0.25], dtype=points.dtype, device=points.device)
+    ladder = torch.cat([ladder, ladder.new_zeros(4)])
+    along = torch.tensor([1e-3, 1e-2, 1e-1, 0.5], dtype=points.dtype, device=points.device)
+    along = torch.cat([along, -along])
+    iteration = 0
+    for iteration in range(1, max_iterations + 1):
+        rows = active.nonzero()[:, 0]
+        if not len(rows):
+            break
+        here = points[rows]
+        _, slope = gradient(objective, here)
+        curvature, vectors = torch.linalg.eigh(torch.nan_to_num(hessian(objective, here)))
+        top = curvature.abs().amax(-1).clamp_min(1e-300)[:, None, None]
+        weight = curvature.abs()[:, None, :] + ladder[:, None] * top + 1e-15 * top
+        rotated = torch.einsum("bij,bi->bj", vectors, slope)
+        steps = -torch.einsum("bij,bcj->bci", vectors, rotated[:, None] / weight) * lengths[:, None]
+        down = torch.where(curvature[:, :1] < 0, 1.0, 0.0)[..., None] * vectors[:, :, 0][:, None]
+        tries = here[:, None] + torch.cat([steps, along[:, None] * down], dim=1)
+        with torch.no_grad():
+            found = torch.nan_to_num(objective(tries.reshape(-1, size)), nan=torch.inf, posinf=torch.inf)
+        found = found.reshape(tries.shape[:2])
+        best, which = found.min(1)
+        gain = values[rows] - best
+        better = gain > 0
+        points[rows[better]] = tries[better.nonzero()[:, 0], which[better]]
+        small = gain <= tolerance * (1 + values[rows].abs())
+        values[rows[better]] = best[better]
+        stalls[rows] = torch.where(small, stalls[rows] + 1, 0)
+        active[rows] = (stalls[rows] < 3) & (better | (stalls[rows] < 1))
+        if progress is not None:
+            progress(iteration, values)
+    order = values.argsort(stable=True)
+    return Minima(points[order], values[order], ~active[order] & torch.isfinite(values[order]), iteration)

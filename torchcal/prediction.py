@@ -1,0 +1,256 @@
+r"""Predictive moments and densities of the outputs and of λ, and scores of predictions.
+
+Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 30-32, 44, A1-A2, Table AI.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchcal import polychaos
+from torchcal.errors import ShapeError
+from torchcal.propagation import NISP
+
+__all__ = [
+    "AdditivePrediction",
+    "Moments",
+    "Prediction",
+    "Scores",
+    "additive_prediction",
+    "embedded_prediction",
+    "kernel_density",
+    "parameter_density",
+    "scores",
+]
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Mean and standard deviation of a predictive distribution, ``(n,)`` each, in the output's unit."""
+
+    mean: Tensor
+    sd: Tensor
+
+
+@dataclass(frozen=True)
+class Prediction:
+    r"""Predictive moments of an embedded calibration (Table AI).
+
+    For an embedded model the push-forward of the posterior and the posterior predictive are one thing.
+
+    Attributes:
+        x: The conditions.
+        mean: Posterior predictive mean, ``(n,)``: E[μ(α)] (Eq. A1); the MAP predictive mean without draws.
+        sd: Posterior predictive sd, ``(n,)``: :math:`\sqrt{E[\sigma(\alpha)^2] + V[\mu(\alpha)]}` (Eq. A2).
+        sd_model_error: :math:`\sqrt{E[\sigma(\alpha)^2]}`, what the embedded model error contributes.
+        sd_posterior: :math:`\sqrt{V[\mu(\alpha)]}`, what the uncertainty of α contributes; None without draws.
+        map: MAP predictive moments (Eq. 30).
+        posterior: Posterior predictive moments (Eq. 32); None without draws.
+        mean_predictive: Moments at the posterior mean of α (Table AI); None without draws.
+    """
+
+    x: Any
+    mean: Tensor
+    sd: Tensor
+    sd_model_error: Tensor
+    sd_posterior: Tensor | None
+    map: Moments
+    posterior: Moments | None
+    mean_predictive: Moments | None
+
+
+@dataclass(frozen=True)
+class AdditivePrediction:
+    """Predictive moments of a conventional calibration, the two kinds kept apart.
+
+    Attributes:
+        x: The conditions.
+        push_forward: Of f(x; λ) under the posterior of λ: what the calibrated model alone predicts.
+        posterior: Posterior predictive: with the additive discrepancy's variance E[σ²] as well.
+        map: f at the MAP λ, with the MAP σ as sd.
+    """
+
+    x: Any
+    push_forward: Moments
+    posterior: Moments
+    map: Moments
+
+
+def embedded_prediction(propagate: NISP, alpha_map: Tensor, draws: Tensor | None) -> Prediction:
+    """Predictive moments at a propagation's conditions.
+
+    Args:
+        propagate: The propagation.
+        alpha_map: MAP α, ``(P,)``.
+        draws: Posterior draws of α, ``(S, P)``, or None.
+    """
+    like = propagate.nodes
+    with torch.no_grad():
+        at_map = _moments(propagate, alpha_map.to(like))
+        if draws is None:
+            return Prediction(propagate.x, at_map.mean, at_map.sd, at_map.sd, None, at_map, None, None)
+        mean, variance = propagate.moments(draws.to(like))
+        posterior_mean = mean.mean(0)
+        model_error = variance.mean(0)
+        parameter = mean.var(0, unbiased=False)
+        posterior = Moments(_result(posterior_mean), _result((model_error + parameter).sqrt()))
+        return Prediction(
+            x=propagate.x,
+            mean=posterior.mean,
+            sd=posterior.sd,
+            sd_model_error=_result(model_error.sqrt()),
+            sd_posterior=_result(parameter.sqrt()),
+            map=at_map,
+            posterior=posterior,
+            mean_predictive=_moments(propagate, draws.mean(0).to(like)),
+        )
+
+
+def additive_prediction(
+    propagate: NISP, map_point: Tensor, draws: Tensor | None, *, log_sigma_map: float
+) -> AdditivePrediction:
+    """Predictive moments of an additive calibration at a propagation's conditions.
+
+    Args:
+        propagate: Zero-order propagation, for f itself.
+        map_point: MAP λ̃, ``(d,)``.
+        draws: Posterior draws of (λ̃, ln σ), ``(S, d + 1)``, or None for the MAP alone.
+        log_sigma_map: MAP ln σ.
+    """
+    like = propagate.nodes
+    with torch.no_grad():
+        center = _result(propagate.mean(map_point.to(like)))
+        at_map = Moments(center, torch.full_like(center, math.exp(log_sigma_map)))
+        if draws is None:
+            return AdditivePrediction(propagate.x, Moments(center, 0 * center), at_map, at_map)
+        outputs = propagate.mean(draws[:, :-1].to(like))
+        mean, variance = outputs.mean(0), outputs.var(0, unbiased=False)
+        total = variance + (2 * draws[:, -1]).exp().mean().to(like)
+    return AdditivePrediction(
+        propagate.x,
+        Moments(_result(mean), _result(variance.sqrt())),
+        Moments(_result(mean), _result(total.sqrt())),
+        at_map,
+    )
+
+
+def _moments(propagate: NISP, alpha: Tensor) -> Moments:
+    if propagate.pattern.num_germs == 0:
+        mean = propagate.mean(alpha)
+        return Moments(_result(mean), _result(0 * mean))
+    mean, variance = propagate.moments(alpha)
+    return Moments(_result(mean), _result(variance.sqrt()))
+
+
+def _result(value: Tensor) -> Tensor:
+    return value.detach().to(device="cpu", dtype=torch.float64)
+
+
+def parameter_density(propagate: NISP, alpha: Tensor, points: Tensor, *, seed: int = 0) -> Tensor:
+    r"""Density of λ averaged over draws of α (Eq. 44), at physical points.
+
+    .. math:: p(\lambda | D) = E_\alpha[\pi_\lambda(\lambda; \alpha)]
+
+    A first-order normal embedding of every free parameter is averaged exactly; otherwise, or where a density is
+    singular, a normal kernel density estimate of draws of λ is used.
+
+    Args:
+        propagate: The propagation.
+        alpha: Draws ``(S, P)``, or one α ``(1, P)``.
+        points: ``(M, d)``, physical units, the free parameters in order.
+        seed: Of the draws of λ, where they are needed.
+
+    Returns:
+        ``(M,)``, per unit of the product of the parameters' units.
+    """
+    if points.ndim != 2 or points.shape[1] != len(propagate.free):
+        raise ShapeError(
+            f"Expected points of shape (M, {len(propagate.free)}), one column per free parameter. "
+            f"Got {tuple(points.shape)}."
+        )
+    pattern, scaling = propagate.pattern, propagate.scaling
+    alpha = _result(alpha)
+    points = points.to(torch.float64)
+    exact = pattern.basis.name == "hermite" and pattern.order == 1 and pattern.embedded == pattern.names
+    if exact and not bool(scaling.log.any()):
+        mean, covariance = propagate.parameter_moments(alpha.to(propagate.nodes))
+        mean, covariance = _result(mean), _result(covariance)
+        factor, failed = torch.linalg.cholesky_ex(covariance / scaling.scale.outer(scaling.scale))
+        if not bool(failed.any()) and bool((factor.diagonal(dim1=-2, dim2=-1) > 1e-7).all()):
+            total = torch.zeros(len(points), dtype=torch.float64)
+            constant = scaling.scale.log().sum() + 0.5 * len(scaling.scale) * math.log(2 * math.pi)
+            for m, f in zip(mean.split(256), factor.split(256), strict=True):
+                offset = ((points - m.unsqueeze(1)) / scaling.scale).transpose(-1, -2)
+                white = torch.linalg.solve_triangular(f, offset, upper=False)
+                log_det = f.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
+                total += (-0.5 * white.square().sum(-2) - log_det - constant).exp().sum(0)
+            return total / len(mean)
+    num = max(1, 20_000 // len(alpha))
+    xi = propagate.draw_germ(num * len(alpha), seed=seed).reshape(len(alpha), num, -1)
+    psi = polychaos.evaluate(pattern.basis, pattern.indices, _result(xi))
+    draws = scaling.physical(torch.einsum("adk,ask->asd", pattern.matrix(alpha), psi))
+    return kernel_density(draws.reshape(-1, draws.shape[-1]), points)
+
+
+def kernel_density(draws: Tensor, points: Tensor) -> Tensor:
+    """Normal kernel density estimate with Silverman's bandwidth in whitened coordinates.
+
+    Args:
+        draws: ``(S, d)``.
+        points: ``(M, d)``.
+
+    Returns:
+        ``(M,)``.
+    """
+    count, size = draws.shape
+    center, scale = draws.mean(0), draws.std(0).clamp_min(1e-300)
+    z = (draws - center) / scale
+    covariance = z.T @ z / (count - 1) + 1e-10 * torch.eye(size, dtype=draws.dtype)
+    factor = torch.linalg.cholesky(covariance) * (4 / (count * (size + 2))) ** (1 / (size + 4))
+    white = torch.linalg.solve_triangular(factor, z.T, upper=False).T
+    target = torch.linalg.solve_triangular(factor, ((points - center) / scale).T, upper=False).T
+    log_norm = factor.diagonal().log().sum() + scale.log().sum() + 0.5 * size * math.log(2 * math.pi)
+    parts = [(-0.5 * torch.cdist(part, white).square()).exp().mean(1) for part in target.split(256)]
+    return torch.cat(parts) * torch.exp(-log_norm)
+
+
+@dataclass(frozen=True)
+class Scores:
+    """How well a predictive distribution did on data.
+
+    Attributes:
+        rmse: Root mean squared error of the mean, in the output's unit.
+        log_score: Mean log-density of the data under a normal with the predicted moments.
+        coverage: Share of the data within ``level`` central intervals of that normal.
+        level: The nominal coverage.
+    """
+
+    rmse: float
+    log_score: float
+    coverage: float
+    level: float
+
+
+def scores(y: Tensor, moments: Moments, *, noise: Tensor | None = None, level: float = 0.95) -> Scores:
+    """RMSE, log score and coverage of predicted moments against data ``(n,)``.
+
+    Args:
+        y: The data.
+        moments: Predicted mean and sd.
+        noise: Sd of the measurement noise, added in square.
+        level: Nominal coverage.
+    """
+    error = y - moments.mean
+    sd = moments.sd if noise is None else (moments.sd.square() + noise.square()).sqrt()
+    quantile = math.sqrt(2) * float(torch.erfinv(torch.tensor(level, dtype=torch.float64)))
+    z = error / sd
+    log_score = (-0.5 * z.square() - sd.log()).mean() - 0.5 * math.log(2 * math.pi)
+    return Scores(
+        rmse=float(error.square().mean().sqrt()),
+        log_score=float(log_score),
+        coverage=float((z.abs() <= quantile).to(torch.float64).mean()),
+        level=level,
+    )

@@ -1,0 +1,549 @@
+r"""Non-intrusive spectral projection: from α to the mean and standard deviation of the outputs.
+
+Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 25-29.
+"""
+
+import dataclasses
+import math
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from torchcal import polychaos
+from torchcal.embeddings import Embedding, Pattern
+from torchcal.errors import DomainError, EmbeddingError, PropagationWarning, ShapeError
+from torchcal.propagation.rules import RuleChoice, gauss_counts, sparse_or_random
+from torchcal.simulators import Conditions, Scaling, Simulator, free_parameters
+
+__all__ = ["NISP", "PropagationCheck"]
+
+
+@dataclasses.dataclass(frozen=True)
+class PropagationCheck:
+    """How much the moments at some α change with a finer rule and with a longer expansion.
+
+    Attributes:
+        nodes: Number of nodes of the rule in use.
+        finer_nodes: Number of nodes of the rule that it was held against.
+        mean_change: Largest change of a mean, relative to the larger of |mean| and sd over the outputs.
+        sd_change: Largest change of an sd, on the same scale.
+        truncated: Largest share of a variance that lies in terms above ``order``; 0 for the full variance.
+    """
+
+    nodes: int
+    finer_nodes: int
+    mean_change: float
+    sd_change: float
+    truncated: float
+
+
+class NISP(nn.Module):
+    r"""Propagates an embedding through a simulator.
+
+    .. math::
+        \mu_i(\alpha) = \sum_q w_q f(x_i; \lambda(\xi_q; \alpha)), \qquad
+        \sigma_i(\alpha)^2 = \sum_q w_q \bigl(f(x_i; \lambda(\xi_q; \alpha)) - \mu_i\bigr)^2
+
+    or, with ``order=p``, the variance of the expansion of total degree p (Eq. 29). The paper's case studies use
+    ``order=1``.
+
+    Args:
+        simulator: The model f.
+        embedding: Which parameters are uncertain, and how.
+        x: Conditions, ``(n,)`` or a dict of them.
+        fixed: Parameters to hold, ``{name: physical value}``. Parameters with a neutral value are held there.
+        outputs: Names and order of the outputs, where the simulator has several.
+        scaling: Coordinates of the free parameters; by default from their bounds or first guesses.
+        order: Total degree of the output expansion whose variance is reported; None for the full variance.
+        rule: Quadrature nodes and weights; a number of Gauss nodes per germ; or None to find enough by itself
+            (exact where the simulator is a polynomial of known degree).
+        max_nodes: Most nodes that are chosen by itself.
+        sd_floor: δ in :math:`\sqrt{\sigma^2 + \delta^2}`, which keeps the gradient finite at zero spread; in
+            the outputs' unit. The default is below any figure a user reads.
+        max_elements: Batch × nodes × outputs evaluated at once. Larger work is cut into pieces, whose
+            intermediate values are recomputed in the backward pass: 2**24 numbers are 128 MiB.
+
+    Raises:
+        EmbeddingError: If the embedding does not fit the simulator's free parameters.
+
+    Shapes: ``forward`` maps α ``(*batch, P)`` to mean and sd, ``(*batch, n)`` each, in the outputs' units.
+
+    >>> line = Simulator(lambda x, p: p["a"] * x, [Parameter("a")])
+    >>> from torchcal.embeddings import Gaussian
+    >>> mean, sd = NISP(line, Gaussian(), torch.tensor([2.0]).double())(torch.tensor([3.0, 0.5]).double())
+    >>> print(f"{float(mean):.3f} {float(sd):.3f}")
+    6.000 1.000
+    """
+
+    nodes: Tensor
+    weights: Tensor
+    _psi: Tensor
+    _projection: Tensor | None
+    _template: Tensor
+    _places: Tensor
+    _x0: Tensor
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        embedding: Embedding,
+        x: Conditions,
+        *,
+        fixed: Mapping[str, float] | None = None,
+        outputs: Sequence[str] | None = None,
+        scaling: Scaling | None = None,
+        order: int | None = None,
+        rule: polychaos.Rule | RuleChoice | int | None = None,
+        max_nodes: int = 4096,
+        sd_floor: float = 1e-8,
+        max_elements: int = 2**24,
+    ) -> None:
+        super().__init__()
+        if order is not None and (isinstance(order, bool) or not isinstance(order, int) or order < 1):
+            raise DomainError(f"Expected order as a positive integer or None. Got {order!r}.")
+        if not (math.isfinite(sd_floor) and sd_floor > 0):
+            raise DomainError(f"Expected sd_floor > 0. Got {sd_floor!r}.")
+        self.simulator = simulator
+        self.embedding = embedding
+        self.fixed = dict(fixed or {})
+        self.free, self.held = free_parameters(simulator.parameters, fixed)
+        self.pattern: Pattern = embedding.bind([parameter.name for parameter in self.free])
+        self.scaling = scaling if scaling is not None else Scaling.from_parameters(self.free)
+        self.outputs = None if outputs is None else tuple(outputs)
+        self.order = order
+        self.max_nodes = max_nodes
+        self.sd_floor = float(sd_floor)
+        self.max_elements = int(max_elements)
+        self._x_names = tuple(x) if isinstance(x, Mapping) else None
+        for i, value in enumerate(x.values() if isinstance(x, Mapping) else [x]):
+            self.register_buffer(f"_x{i}", torch.as_tensor(value).detach().to(torch.float64))
+        position = {name: i for i, name in enumerate(self.pattern.names)}
+        self.register_buffer(
+            "_template",
+            torch.tensor([self.held.get(name, 0.0) for name in simulator.names], dtype=torch.float64),
+        )
+        self.register_buffer(
+            "_places", torch.tensor([i for i, name in enumerate(simulator.names) if name in position])
+        )
+        self._evaluate: Callable[[Tensor], Tensor] | None = None
+        self._set_rule(self._choose(rule))
+
+    # --- what it is --------------------------------------------------------------------------------------
+
+    @property
+    def num_alpha(self) -> int:
+        """P, the number of coefficients α."""
+        return self.pattern.num_alpha
+
+    @property
+    def alpha_names(self) -> tuple[str, ...]:
+        """The names of α."""
+        return self.pattern.alpha_names
+
+    @property
+    def x(self) -> Conditions:
+        """The conditions, on the module's device."""
+        if self._x_names is None:
+            return self._x0
+        return {name: getattr(self, f"_x{i}") for i, name in enumerate(self._x_names)}
+
+    @property
+    def rule_choice(self) -> RuleChoice:
+        """The family and size of the quadrature rule in use."""
+        return self._choice
+
+    @property
+    def num_nodes(self) -> int:
+        """The number of quadrature nodes."""
+        return len(self.nodes)
+
+    def extra_repr(self) -> str:
+        """Shown by ``print``."""
+        return f"alpha={list(self.alpha_names)}, nodes={self.num_nodes}, order={self.order or 'full'}"
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "NISP":
+        self._evaluate = None
+        return super()._apply(fn, recurse)
+
+    # --- moments -----------------------------------------------------------------------------------------
+
+    def forward(self, alpha: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and sd of the outputs, ``(*batch, n)`` each.
+
+        Raises:
+            EmbeddingError: If nothing is embedded: there is then no model-error sd. Use `mean`.
+        """
+        mean, variance = self.moments(alpha)
+        return mean, (variance + self.sd_floor**2).sqrt()
+
+    def moments(self, alpha: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and variance of the outputs, ``(*batch, n)`` each, without the floor of `forward`."""
+        self._check_alpha(alpha)
+        if self.pattern.num_germs == 0:
+            raise EmbeddingError(
+                "Expected an embedding with at least one uncertain parameter where a model-error sd is asked "
+                "for. Got none. Use NISP.mean(alpha) for the outputs alone."
+            )
+        mean, variance = self._in_pieces(alpha, self._moments)
+        return mean, variance
+
+    def mean(self, alpha: Tensor) -> Tensor:
+        """Mean of the outputs, ``(*batch, n)``; the outputs themselves where nothing is embedded."""
+        self._check_alpha(alpha)
+        return self._in_pieces(alpha, lambda block: (self._weighted(block, self.weights[:, None])[..., 0, :],))[0]
+
+    def coefficients(self, alpha: Tensor, order: int | None = None) -> tuple[Tensor, Tensor]:
+        r"""The output's expansion, :math:`c_{ik} = \langle f_i \Psi_k \rangle / \langle \Psi_k^2 \rangle`.
+
+        Args:
+            alpha: ``(*batch, P)``.
+            order: Total degree; by default ``self.order``, else the largest that the rule can carry.
+
+        Returns:
+            Coefficients ``(*batch, n, K)`` and their multi-indices ``(K, germs)``.
+
+        Source: Sargsyan, Najm & Ghanem (2015), Eqs. 25-27.
+        """
+        self._check_alpha(alpha)
+        if order is None:
+            carried = self._choice.carried_order or max(1, self._choice.size - 1)
+            order = self.order if self.order is not None else carried
+        indices = polychaos.multi_indices(self.pattern.num_germs, order)
+        matrix = polychaos.evaluate(self.pattern.basis, indices, self.nodes) * self.weights[:, None]
+        matrix = matrix / polychaos.norms(self.pattern.basis, indices).to(matrix)
+        (result,) = self._in_pieces(alpha, lambda block: (self._weighted(block, matrix).transpose(-1, -2),))
+        return result, indices
+
+    def parameters_at(self, alpha: Tensor, xi: Tensor, *, paired: bool = False) -> Tensor:
+        """λ(ξ; α) of the free parameters in physical units, ``(*batch, S, d)``, at germs ``(S, germs)``.
+
+        With ``paired`` the germs are ``(*batch, germs)``, one for each α, and the result ``(*batch, d)``.
+        """
+        self._check_alpha(alpha)
+        psi = polychaos.evaluate(self.pattern.basis, self.pattern.indices, xi.to(alpha))
+        form = "...dk,...k->...d" if paired else "...dk,sk->...sd"
+        return self.scaling.physical(torch.einsum(form, self.pattern.matrix(alpha), psi))
+
+    def outputs_at(self, alpha: Tensor, xi: Tensor, *, paired: bool = False) -> Tensor:
+        """f(x; λ(ξ; α)), ``(*batch, S, n)``, at germs ``(S, germs)``; ``(*batch, n)`` with ``paired``."""
+        return self._simulate(self.parameters_at(alpha, xi, paired=paired))
+
+    def with_held(self, values: Tensor) -> Tensor:
+        """Values of all the simulator's parameters ``(*batch, all)`` from those of the free ones ``(*batch, d)``."""
+        if not self.held:
+            return values
+        template = self._template.to(values).expand(*values.shape[:-1], -1)
+        return template.index_copy(-1, self._places, values)
+
+    def draw_germ(self, num: int, *, seed: int) -> Tensor:
+        """Independent draws of ξ, ``(num, germs)``."""
+        generator = torch.Generator().manual_seed(seed)
+        draws = self.pattern.basis.sample((num, self.pattern.num_germs), generator=generator)
+        return draws.to(self.nodes)
+
+    def sample(self, alpha: Tensor, num: int, *, seed: int) -> Tensor:
+        """Draws from the output's density, ``(*batch, num, n)``, the same germs for every α."""
+        return self.outputs_at(alpha, self.draw_germ(num, seed=seed))
+
+    def parameter_moments(self, alpha: Tensor) -> tuple[Tensor, Tensor]:
+        r"""E[λ] ``(*batch, d)`` and Cov[λ] ``(*batch, d, d)`` of the free parameters, physical units (Eq. 9).
+
+        A parameter on a logarithmic scale has the moments of exp(λ): exact for a first-order normal germ,
+        :math:`E = \exp(m + v/2)`; by this module's nodes otherwise.
+        """
+        self._check_alpha(alpha)
+        matrix = self.pattern.matrix(alpha)
+        center, scale = self.scaling.center.to(alpha), self.scaling.scale.to(alpha)
+        log = self.scaling.log.to(alpha.device)
+        if bool(log.any()) and not (self.pattern.order <= 1 and self.pattern.basis.name == "hermite"):
+            values = self.parameters_at(alpha, self.nodes)
+            mean = torch.einsum("q,...qd->...d", self.weights, values)
+            offset = values - mean.unsqueeze(-2)
+            return mean, torch.einsum("q,...qd,...qe->...de", self.weights, offset, offset)
+        mean = center + scale * matrix[..., 0]
+        factor = scale[:, None] * matrix[..., 1:]
+        norms = polychaos.norms(self.pattern.basis, self.pattern.indices[1:]).to(alpha)
+        covariance = (factor * norms) @ factor.transpose(-1, -2)
+        if bool(log.any()):
+            variance = covariance.diagonal(dim1=-2, dim2=-1)
+            lognormal = (mean + 0.5 * variance).exp()
+            gain = torch.where(log, lognormal, torch.ones_like(mean))
+            both = log[:, None] & log[None, :]
+            inner = torch.where(both, torch.where(both, covariance, 0 * covariance).expm1(), covariance)
+            covariance = gain[..., :, None] * inner * gain[..., None, :]
+            mean = torch.where(log, lognormal, mean)
+        return mean, covariance
+
+    # --- the same embedding elsewhere --------------------------------------------------------------------
+
+    def at(self, x: Conditions, *, simulator: Simulator | None = None) -> "NISP":
+        """The same embedding, rule and coordinates at other conditions, or for another function of λ.
+
+        Args:
+            x: New conditions.
+            simulator: Another simulator of the same parameters, for another quantity of interest.
+        """
+        if simulator is None:
+            return self._copy(x=x)
+        return self._copy(x=x, simulator=simulator, outputs=None)
+
+    def _copy(self, **changes: Any) -> "NISP":
+        settings: dict[str, Any] = {
+            "simulator": self.simulator,
+            "embedding": self.embedding,
+            "x": self.x,
+            "fixed": self.fixed,
+            "outputs": self.outputs,
+            "scaling": self.scaling,
+            "order": self.order,
+            "rule": self._choice,
+            "max_nodes": self.max_nodes,
+            "sd_floor": self.sd_floor,
+            "max_elements": self.max_elements,
+        }
+        other = NISP(**{**settings, **changes})
+        return other.to(device=self.nodes.device, dtype=self.nodes.dtype)
+
+    # --- convergence -------------------------------------------------------------------------------------
+
+    def check(
+        self, alpha: Tensor, *, tolerance: float = 1e-6, order_tolerance: float = 0.05, warn: bool = True
+    ) -> PropagationCheck:
+        """Hold the moments at α against a finer rule, and the expansion against the full variance.
+
+        Args:
+            alpha: Where to look, ``(*batch, P)``.
+            tolerance: Largest change, relative to the output's scale, that passes. The default is far below
+                the Monte Carlo error of any posterior.
+            order_tolerance: Largest share of a variance above ``order`` that passes.
+            warn: Whether to warn when it does not pass.
+
+        Warns:
+            PropagationWarning: With the numbers.
+        """
+        finer = self._copy(rule=self._choice.finer(self.pattern.num_germs))
+        with torch.no_grad():
+            mean, variance = self.moments(alpha)
+            other_mean, other_variance = finer.moments(alpha)
+            truncated = 0.0
+            if self.order is not None and bool((self.weights > 0).all()):
+                whole = self._copy(order=None).moments(alpha)[1]
+                lost = 1 - variance / whole.clamp_min(self.sd_floor**2)
+                truncated = float(torch.where(whole > self.sd_floor**2, lost, 0 * lost).max())
+        scale = torch.maximum(mean.abs(), variance.sqrt()).amax(-1, keepdim=True).clamp_min(self.sd_floor)
+        result = PropagationCheck(
+            nodes=self.num_nodes,
+            finer_nodes=finer.num_nodes,
+            mean_change=float(((mean - other_mean).abs() / scale).max()),
+            sd_change=float(((variance.sqrt() - other_variance.sqrt()).abs() / scale).max()),
+            truncated=truncated,
+        )
+        if warn and not max(result.mean_change, result.sd_change) <= tolerance:
+            warnings.warn(
+                f"With {result.nodes} quadrature nodes the output's mean is off by {result.mean_change:.2g} and "
+                f"its sd by {result.sd_change:.2g} of the output's scale, against {result.finer_nodes} nodes "
+                f"(tolerance {tolerance:.0e}). Pass a larger rule= or max_nodes=.",
+                PropagationWarning,
+                stacklevel=2,
+            )
+        if warn and result.truncated > order_tolerance:
+            warnings.warn(
+                f"An expansion of order {self.order} leaves out {result.truncated:.1%} of the output's variance "
+                f"(tolerance {order_tolerance:.0%}). Use order=None for the full variance.",
+                PropagationWarning,
+                stacklevel=2,
+            )
+        return result
+
+    def refine(self, alpha: Tensor, *, tolerance: float = 1e-9) -> bool:
+        """Take more nodes until the moments at α settle. Returns whether the rule has changed."""
+        changed = False
+        germs = self.pattern.num_germs
+        while germs and self._choice.kind == "tensor" and self._exact_nodes() is None:
+            finer = self._choice.finer(germs)
+            if finer.size**germs > self.max_nodes:
+                break
+            result = self.check(alpha, warn=False)
+            if max(result.mean_change, result.sd_change) <= tolerance:
+                break
+            self._set_rule(finer)
+            changed = True
+        return changed
+
+    # --- inside ------------------------------------------------------------------------------------------
+
+    def _check_alpha(self, alpha: Tensor) -> None:
+        if alpha.ndim < 1 or alpha.shape[-1] != self.num_alpha:
+            raise ShapeError(
+                f"Expected alpha of shape (*batch, {self.num_alpha}): {', '.join(self.alpha_names)}. "
+                f"Got {tuple(alpha.shape)}."
+            )
+        if alpha.dtype != self.nodes.dtype:
+            raise ShapeError(
+                f"Expected alpha of dtype {self.nodes.dtype}. Got {alpha.dtype}. Convert it, or move the module "
+                "with .to(dtype)."
+            )
+
+    def _outputs(self, alpha: Tensor, psi: Tensor) -> Tensor:
+        """Outputs ``(*batch, S, n)`` at rows of Ψ, ``(S, K)``."""
+        scaled = torch.einsum("...dk,sk->...sd", self.pattern.matrix(alpha), psi)
+        return self._simulate(self.scaling.physical(scaled))
+
+    def _simulate(self, values: Tensor) -> Tensor:
+        """Outputs ``(*batch, n)`` at values of the free parameters ``(*batch, d)``."""
+        if self._evaluate is None:
+            self._evaluate = self.simulator.at(self.x, self.outputs)
+        return self._evaluate(self.with_held(values))
+
+    def _weighted(self, alpha: Tensor, matrix: Tensor) -> Tensor:
+        """Σ_q matrix[q, k] f_q, shape ``(*batch, k, n)``, node piece by node piece."""
+        total: Tensor | None = None
+        for piece in self._node_pieces(alpha):
+            part = matrix[piece].transpose(-1, -2) @ self._outputs(alpha, self._psi[piece])
+            total = part if total is None else total + part
+        if total is None:
+            raise DomainError("Expected a rule with at least one node. Got none.")
+        return total
+
+    def _moments(self, alpha: Tensor) -> tuple[Tensor, Tensor]:
+        if self._projection is not None:
+            terms = self._weighted(alpha, self._projection)
+            return terms[..., 0, :], terms[..., 1:, :].square().sum(-2)
+        pieces = self._node_pieces(alpha)
+        if len(pieces) == 1:
+            outputs = self._outputs(alpha, self._psi)
+            mean = torch.einsum("q,...qn->...n", self.weights, outputs)
+            offset = outputs - mean.unsqueeze(-2)
+            return mean, torch.einsum("q,...qn->...n", self.weights, offset.square())
+        with torch.no_grad():  # a shift near the mean keeps the sum of squares from cancelling
+            shift = self._weighted(alpha.detach(), self.weights[:, None])
+        first = second = alpha.new_zeros(())
+        for piece in pieces:
+            offset = self._outputs(alpha, self._psi[piece]) - shift
+            first = first + torch.einsum("q,...qn->...n", self.weights[piece], offset)
+            second = second + torch.einsum("q,...qn->...n", self.weights[piece], offset.square())
+        return shift[..., 0, :] + first, (second - first.square()).clamp_min(0)
+
+    def _node_pieces(self, alpha: Tensor) -> list[slice]:
+        rows = alpha.numel() // self.num_alpha * self._n
+        size = max(1, self.max_elements // max(1, rows))
+        return [slice(i, i + size) for i in range(0, self.num_nodes, size)]
+
+    @property
+    def _n(self) -> int:
+        return self._x0.shape[0] * (1 if self.outputs is None else len(self.outputs))
+
+    def _in_pieces(
+        self, alpha: Tensor, function: Callable[[Tensor], tuple[Tensor, ...]]
+    ) -> tuple[Tensor, ...]:
+        """Apply a function of a batch of α in pieces of bounded size."""
+        batch = alpha.shape[:-1]
+        rows = math.prod(batch)
+        size = max(1, self.max_elements // (self.num_nodes * self._n))
+        if rows * self.num_nodes * self._n <= self.max_elements or rows == 0:
+            return function(alpha)
+        flat = alpha.reshape(rows, -1)
+        parts = []
+        for start in range(0, rows, size):
+            block = flat[start : start + size]
+            if torch.is_grad_enabled() and block.requires_grad:
+                parts.append(checkpoint(function, block, use_reentrant=False))
+            else:
+                parts.append(function(block))
+        return tuple(
+            torch.cat(items).reshape(*batch, *items[0].shape[1:]) for items in zip(*parts, strict=True)
+        )
+
+    # --- rules -------------------------------------------------------------------------------------------
+
+    def _set_rule(self, choice: RuleChoice) -> None:
+        basis, indices = self.pattern.basis, self.pattern.indices
+        device, dtype = self._template.device, self._template.dtype
+        rule = choice.build(basis, self.pattern.num_germs)
+        self._choice = choice
+        projection = None
+        order = self.order if self.order is not None else choice.carried_order
+        if order is not None and self.pattern.num_germs:
+            terms = polychaos.multi_indices(self.pattern.num_germs, order)
+            values = polychaos.evaluate(basis, terms, rule.nodes)
+            projection = values * rule.weights[:, None] / polychaos.norms(basis, terms).sqrt()
+        psi = polychaos.evaluate(basis, indices, rule.nodes)
+        for name, value in (
+            ("nodes", rule.nodes),
+            ("weights", rule.weights),
+            ("_psi", psi),
+            ("_projection", projection),
+        ):
+            # Built in float64 and only then cast, so that the rule is as good as the dtype allows.
+            cast = None if value is None else value.to(device=device, dtype=dtype)
+            self.register_buffer(name, cast, persistent=False)
+
+    def _choose(self, rule: "polychaos.Rule | RuleChoice | int | None") -> RuleChoice:
+        germs = self.pattern.num_germs
+        if isinstance(rule, RuleChoice):
+            return rule
+        if isinstance(rule, polychaos.Rule):
+            if rule.nodes.shape[1] != germs:
+                raise ShapeError(f"Expected a rule with {germs} germs. Got one with {rule.nodes.shape[1]}.")
+            if not rule.positive and self.order is None:
+                raise DomainError(
+                    "Expected order= beside a rule with negative weights (a sparse grid): its variance comes "
+                    "from the expansion's coefficients. Got order=None. Pass order=, the grid's level at most."
+                )
+            return RuleChoice("given", len(rule.nodes), given=rule)
+        if germs == 0:
+            return RuleChoice("tensor", 1)
+        if rule is not None:
+            if isinstance(rule, bool) or not isinstance(rule, int) or rule < 1:
+                raise DomainError(f"Expected rule as a Rule, a positive integer or None. Got {rule!r}.")
+            return RuleChoice("tensor", rule)
+        exact = self._exact_nodes()
+        if exact is not None and exact**germs <= self.max_nodes:
+            return RuleChoice("tensor", exact)
+        counts = gauss_counts(germs, self.max_nodes)
+        if len(counts) < 3:
+            return sparse_or_random(germs, self.max_nodes)
+        return self._by_trial(counts)
+
+    def _exact_nodes(self) -> int | None:
+        """Gauss nodes per germ that integrate f² exactly: its degree is twice that of f in ξ."""
+        if self.simulator.degree is None or bool(self.scaling.log.any()):
+            return None
+        degree = self.simulator.degree * max(1, self.pattern.order)
+        # With a truncated expansion f Ψ_k is integrated, whose degree is lower.
+        return degree + 1 if self.order is None else (degree + self.order) // 2 + 1
+
+    def _by_trial(self, counts: list[int]) -> RuleChoice:
+        """The smallest tensor rule whose moments at a few trial densities agree with the next one's."""
+        alpha = self._trial_alpha()
+        order, self.order = self.order, None
+        previous: tuple[Tensor, Tensor] | None = None
+        try:
+            for count, smaller in zip(counts, [0, *counts], strict=False):
+                self._set_rule(RuleChoice("tensor", count))
+                with torch.no_grad():
+                    mean, variance = self.moments(alpha)
+                sd = variance.sqrt()
+                if previous is not None:
+                    scale = torch.maximum(mean.abs(), sd).amax(-1, keepdim=True)
+                    change = torch.maximum((mean - previous[0]).abs(), (sd - previous[1]).abs())
+                    if bool((change <= 1e-9 * scale).all()):
+                        return RuleChoice("tensor", smaller)
+                previous = (mean, sd)
+        finally:
+            self.order = order
+        return RuleChoice("tensor", counts[-1])
+
+    def _trial_alpha(self) -> Tensor:
+        """Densities to try a rule on: 3 sd reach a bound, or 1 sd is one unit of scale where there is none."""
+        low, high = self.scaling.bounds(self.free)
+        spread = torch.where(torch.isfinite(low) & torch.isfinite(high), 1 / 3, 1.0).to(torch.float64)
+        generator = torch.Generator().manual_seed(0)
+        first_order = self.pattern.indices[self.pattern.columns].sum(-1) == 1
+        size = torch.where(first_order, 1.0, 0.1).to(torch.float64) * spread[self.pattern.rows]
+        noise = torch.rand(3, self.num_alpha, generator=generator, dtype=torch.float64) * 0.5 + 0.5
+        return noise * size

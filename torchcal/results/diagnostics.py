@@ -1,0 +1,101 @@
+"""What is known about how far a calibration can be trusted."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from torchcal.propagation import PropagationCheck
+
+__all__ = ["ESS_THRESHOLD", "R_HAT_THRESHOLD", "Diagnostics", "Quality", "table"]
+
+R_HAT_THRESHOLD = 1.01
+"""Largest R-hat that passes (Vehtari et al. 2021)."""
+
+ESS_THRESHOLD = 400.0
+"""Smallest effective sample size that passes: 100 a chain for four chains (Vehtari et al. 2021). Fewer draws than
+that in all are held to a quarter of their number."""
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Convergence of one quantity.
+
+    Attributes:
+        r_hat: Rank-normalised split R-hat.
+        ess_bulk: Effective sample size of the centre.
+        ess_tail: Effective sample size of the tails.
+    """
+
+    r_hat: float
+    ess_bulk: float
+    ess_tail: float
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """Convergence of optimiser, propagation and chains.
+
+    Attributes:
+        alpha: Quality of every α by name, germ signs folded.
+        parameters: Quality of E[λ] and Cov[λ] by name, which no sign touches.
+        divergences: Number of divergent transitions.
+        null_directions: Unit vectors in α that the data do not see, ``(k, P)``.
+        starts: Number of optimiser starts.
+        agreeing: Number of them that reached the best objective.
+        propagation: How far quadrature and expansion have converged at the MAP.
+        model_error_variance: E[σ²], mean over the data (Eq. 32).
+        posterior_variance: V[μ], mean over the data; NaN without draws.
+        converged: Whether every figure is within its threshold; None without draws.
+        problems: What is not, in words.
+    """
+
+    alpha: Mapping[str, Quality]
+    parameters: Mapping[str, Quality]
+    divergences: int
+    null_directions: Tensor
+    starts: int
+    agreeing: int
+    propagation: PropagationCheck | None
+    model_error_variance: float
+    posterior_variance: float
+    converged: bool | None
+    problems: tuple[str, ...] = field(default=())
+
+    @property
+    def r_hat(self) -> float:
+        """The worst R-hat of all quantities; NaN without draws."""
+        return max((q.r_hat for q in self._all), default=float("nan"))
+
+    @property
+    def ess(self) -> float:
+        """The smallest effective sample size of all quantities, bulk or tail; NaN without draws."""
+        return min((min(q.ess_bulk, q.ess_tail) for q in self._all), default=float("nan"))
+
+    @property
+    def _all(self) -> list[Quality]:
+        return [*self.alpha.values(), *self.parameters.values()]
+
+    def __str__(self) -> str:
+        lines = [f"starts that agree: {self.agreeing} of {self.starts}"]
+        if len(self.null_directions):
+            lines.append(f"directions that the data do not see: {len(self.null_directions)}")
+        if self.alpha:
+            rows = [
+                (name, f"{q.r_hat:.3f}", f"{q.ess_bulk:.0f}", f"{q.ess_tail:.0f}")
+                for name, q in {**self.alpha, **self.parameters}.items()
+            ]
+            lines.append(table(("", "R-hat", "ESS bulk", "ESS tail"), rows))
+            lines.append(f"divergences: {self.divergences}")
+        lines.extend(f"problem: {problem}" for problem in self.problems)
+        return "\n".join(lines)
+
+
+def table(header: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
+    """Rows as aligned plain text, the first column to the left and the others to the right."""
+    widths = [max(len(row[i]) for row in [header, *rows]) for i in range(len(header))]
+    lines = []
+    for row in [header, *rows]:
+        cells = [row[0].ljust(widths[0])] + [c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True)]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)

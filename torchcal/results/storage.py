@@ -1,0 +1,339 @@
+"""Results as xarray trees and netCDF files. No pickle: what cannot be written as data or text is left out."""
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from dataclasses import asdict, fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchcal import embeddings, likelihoods
+from torchcal.data import Recording
+from torchcal.errors import DomainError, MissingDependencyError, TorchcalError
+from torchcal.prediction import AdditivePrediction, Moments, Prediction
+from torchcal.propagation import NISP, PropagationCheck
+from torchcal.results.diagnostics import Diagnostics, Quality
+from torchcal.simulators import Scaling, Simulator
+
+if TYPE_CHECKING:
+    from torchcal.results.calibration import AdditiveCalibration, Calibration
+
+__all__ = ["additive_tree", "calibration_tree", "read_additive", "read_calibration", "to_arviz", "write"]
+
+FORMAT = 1
+
+
+def _xarray() -> Any:
+    try:
+        import xarray
+    except ImportError as error:
+        raise MissingDependencyError(
+            "Expected xarray for trees and netCDF files. It is not installed: pip install 'torchcal[arviz]'."
+        ) from error
+    return xarray
+
+
+def calibration_tree(result: "Calibration") -> Any:
+    """The tree of an embedded calibration."""
+    prediction = result.predict()
+    groups = _common_groups(result)
+    values = {
+        "mean": prediction.mean,
+        "sd": prediction.sd,
+        "sd_model_error": prediction.sd_model_error,
+        "sd_posterior": prediction.sd_posterior,
+        "map_mean": prediction.map.mean,
+        "map_sd": prediction.map.sd,
+    }
+    if prediction.mean_predictive is not None:
+        values["mean_predictive_mean"] = prediction.mean_predictive.mean
+        values["mean_predictive_sd"] = prediction.mean_predictive.sd
+    groups["prediction"] = _dataset({k: ("datum", v) for k, v in values.items() if v is not None})
+    groups["map"]["covariance"] = (("parameter", "parameter_"), result.map.covariance.numpy())
+    embedding = {"kind": type(result.embedding).__name__, **_plain_fields(result.embedding)}
+    likelihood = {"kind": type(result.likelihood).__name__, **_plain_fields(result.likelihood)}
+    return _tree(groups, result, {"kind": "embedded", "embedding": embedding, "likelihood": likelihood})
+
+
+def additive_tree(result: "AdditiveCalibration") -> Any:
+    """The tree of a conventional calibration."""
+    prediction = result.predict()
+    groups = _common_groups(result)
+    values = {
+        f"{kind}_{moment}": getattr(getattr(prediction, kind), moment)
+        for kind in ("push_forward", "posterior", "map")
+        for moment in ("mean", "sd")
+    }
+    groups["prediction"] = _dataset({k: ("datum", v) for k, v in values.items()})
+    return _tree(groups, result, {"kind": "additive"})
+
+
+def to_arviz(tree: Any) -> Any:
+    """A tree as ``arviz.InferenceData`` where ArviZ still has it."""
+    try:
+        import arviz
+    except ImportError as error:
+        raise MissingDependencyError(
+            "Expected ArviZ. It is not installed: pip install 'torchcal[arviz]'."
+        ) from error
+    kind = getattr(arviz, "InferenceData", None)
+    if kind is None:
+        return tree
+    return kind(**{name: node.to_dataset() for name, node in tree.children.items()})
+
+
+def write(tree: Any, path: str | os.PathLike[str]) -> None:
+    """Write a tree to a netCDF file: to a temporary name beside it first, then moved into place."""
+    path = os.fspath(path)
+    folder = os.path.dirname(os.path.abspath(path))
+    handle, temporary = tempfile.mkstemp(suffix=".nc", dir=folder)
+    os.close(handle)
+    try:
+        tree.to_netcdf(temporary, engine="h5netcdf")
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    finally:
+        if os.path.exists(temporary):
+            os.remove(temporary)
+
+
+def read_calibration(
+    cls: type["Calibration"], path: str | os.PathLike[str], simulator: Simulator | None
+) -> "Calibration":
+    """Read an embedded calibration."""
+    groups, meta = _read(path, "embedded")
+    embedding = _rebuild(embeddings, meta["embedding"])
+    likelihood = _rebuild(likelihoods, meta["likelihood"])
+    recording = _recording(groups, meta)
+    propagate = _propagation(simulator, embedding, recording, meta)
+    p = groups["prediction"]
+    posterior = Moments(p["mean"], p["sd"]) if "sd_posterior" in p else None
+    stored = Prediction(
+        x=recording.x,
+        mean=p["mean"],
+        sd=p["sd"],
+        sd_model_error=p["sd_model_error"],
+        sd_posterior=p.get("sd_posterior"),
+        map=Moments(p["map_mean"], p["map_sd"]),
+        posterior=posterior,
+        mean_predictive=(
+            Moments(p["mean_predictive_mean"], p["mean_predictive_sd"]) if "mean_predictive_mean" in p else None
+        ),
+    )
+    return cls(
+        map=_map(groups, meta),
+        samples=_samples(groups),
+        diagnostics=_diagnostics(groups, meta),
+        recording=recording,
+        embedding=embedding,
+        likelihood=likelihood,
+        propagate=propagate,
+        settings=meta["settings"],
+        stored=stored,
+    )
+
+
+def read_additive(
+    cls: type["AdditiveCalibration"], path: str | os.PathLike[str], simulator: Simulator | None
+) -> "AdditiveCalibration":
+    """Read a conventional calibration."""
+    groups, meta = _read(path, "additive")
+    recording = _recording(groups, meta)
+    propagate = _propagation(simulator, embeddings.PolynomialChaos(order=0), recording, meta)
+    p = groups["prediction"]
+    kinds = {k: Moments(p[f"{k}_mean"], p[f"{k}_sd"]) for k in ("push_forward", "posterior", "map")}
+    return cls(
+        map=_map(groups, meta),
+        samples=_samples(groups),
+        diagnostics=_diagnostics(groups, meta),
+        recording=recording,
+        propagate=propagate,
+        settings=meta["settings"],
+        stored=AdditivePrediction(x=recording.x, **kinds),
+    )
+
+
+# --- writing ---------------------------------------------------------------------------------------------
+
+
+def _dataset(values: Mapping[str, tuple[Any, Tensor]]) -> Any:
+    return _xarray().Dataset({name: (dims, value.numpy()) for name, (dims, value) in values.items()})
+
+
+def _common_groups(result: Any) -> dict[str, Any]:
+    xarray = _xarray()
+    estimate = result.map
+    groups: dict[str, Any] = {}
+    if result.samples is not None:
+        chains, draws, _ = result.samples.shape
+        groups["posterior"] = xarray.Dataset(
+            {"alpha": (("chain", "draw", "coefficient"), result.samples.numpy())},
+            coords={
+                "chain": np.arange(chains),
+                "draw": np.arange(draws),
+                "coefficient": list(estimate.alpha_names),
+            },
+        )
+    groups["map"] = xarray.Dataset(
+        {
+            "alpha": ("coefficient", estimate.alpha.numpy()),
+            "mean": ("parameter", estimate.mean.numpy()),
+            "objective": ((), estimate.objective),
+        },
+        coords={"coefficient": list(estimate.alpha_names), "parameter": list(estimate.parameters)},
+    )
+    recording = result.recording
+    count = recording.n
+    outputs = recording.split(recording.y)
+    groups["observed_data"] = _dataset({name: ("condition", value) for name, value in outputs.items()})
+    x = recording.x if isinstance(recording.x, Mapping) else {"x": recording.x}
+    groups["constant_data"] = _dataset({name: ("condition", value) for name, value in x.items()})
+    if isinstance(recording.noise, Tensor):
+        groups["noise"] = _dataset({"sd": ("datum", recording.noise)})
+    if len(result.diagnostics.null_directions):
+        groups["null_directions"] = _dataset(
+            {"direction": (("number", "coefficient"), result.diagnostics.null_directions)}
+        )
+    if count != len(next(iter(x.values()))):
+        raise DomainError("Expected conditions and recording of one length.")
+    return groups
+
+
+def _tree(groups: dict[str, Any], result: Any, extra: Mapping[str, Any]) -> Any:
+    diagnostics = asdict(result.diagnostics)
+    del diagnostics["null_directions"]
+    recording = result.recording
+    meta = {
+        **extra,
+        "format": FORMAT,
+        "settings": dict(result.settings),
+        "diagnostics": diagnostics,
+        "recording": {
+            "named": isinstance(recording.x, Mapping),
+            "outputs": list(recording.outputs),
+            "noise": "none" if isinstance(recording.noise, str) else None,
+            "units": dict(recording.units),
+        },
+    }
+    tree = _xarray().DataTree.from_dict({f"/{name}": group for name, group in groups.items()})
+    tree.attrs["torchcal"] = json.dumps(meta)
+    return tree
+
+
+def _plain_fields(item: Any) -> dict[str, Any]:
+    values = {}
+    for entry in fields(item):
+        value = getattr(item, entry.name)
+        if isinstance(value, Tensor):
+            value = value.tolist()
+        values[entry.name] = list(value) if isinstance(value, tuple) else value
+    return values
+
+
+# --- reading ---------------------------------------------------------------------------------------------
+
+
+def _read(path: str | os.PathLike[str], kind: str) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
+    try:
+        tree = _xarray().open_datatree(os.fspath(path), engine="h5netcdf")
+    except (OSError, ValueError) as error:
+        raise TorchcalError(f"Expected a netCDF file that torchcal wrote at {path}. Got: {error}") from error
+    with tree:
+        if "torchcal" not in tree.attrs:
+            raise TorchcalError(f"Expected a netCDF file that torchcal wrote. {path} is none.")
+        meta = json.loads(tree.attrs["torchcal"])
+        groups = {
+            name: {
+                key: torch.from_numpy(np.array(value.values, dtype=np.float64))
+                for key, value in node.data_vars.items()
+            }
+            for name, node in tree.children.items()
+        }
+        meta["alpha_names"] = [str(v) for v in tree["map"]["coefficient"].values]
+        meta["parameter_names"] = [str(v) for v in tree["map"]["parameter"].values]
+    if meta["kind"] != kind:
+        raise TorchcalError(
+            f"Expected an {kind} calibration in {path}. Got an {meta['kind']} one. Load it with the other class."
+        )
+    if meta["format"] != FORMAT:
+        raise TorchcalError(f"Expected format {FORMAT} in {path}. Got {meta['format']}.")
+    return groups, meta
+
+
+def _rebuild(module: Any, spec: Mapping[str, Any]) -> Any:
+    values = {k: (tuple(v) if isinstance(v, list) else v) for k, v in spec.items() if k != "kind"}
+    if isinstance(values.get("epsilon"), tuple):
+        values["epsilon"] = torch.tensor(values["epsilon"], dtype=torch.float64)
+    return getattr(module, spec["kind"])(**values)
+
+
+def _recording(groups: Mapping[str, Any], meta: Mapping[str, Any]) -> Recording:
+    info = meta["recording"]
+    x: Any = dict(groups["constant_data"]) if info["named"] else groups["constant_data"]["x"]
+    y = {name: groups["observed_data"][name] for name in info["outputs"]}
+    noise: Any = info["noise"]
+    if "noise" in groups:
+        noise = groups["noise"]["sd"]
+    missing = any(bool(value.isnan().any()) for value in y.values())
+    return Recording(x=x, y=y, noise=noise, missing=missing, units=info["units"])
+
+
+def _propagation(
+    simulator: Simulator | None, embedding: embeddings.Embedding, recording: Recording, meta: Mapping[str, Any]
+) -> NISP | None:
+    if simulator is None:
+        return None
+    settings = meta["settings"]
+    scaling = Scaling(
+        torch.tensor(settings["center"], dtype=torch.float64),
+        torch.tensor(settings["scale"], dtype=torch.float64),
+        torch.tensor(settings["log"]),
+    )
+    return NISP(
+        simulator,
+        embedding,
+        recording.x,
+        fixed=settings["fixed"],
+        outputs=recording.outputs,
+        scaling=scaling,
+        order=settings["order"],
+        sd_floor=settings["sd_floor"],
+        rule=settings["gauss_nodes"],
+    )
+
+
+def _map(groups: Mapping[str, Any], meta: Mapping[str, Any]) -> Any:
+    from torchcal.results.calibration import MapEstimate
+
+    values = groups["map"]
+    size = len(values["mean"])
+    return MapEstimate(
+        alpha=values["alpha"],
+        mean=values["mean"],
+        covariance=values.get("covariance", torch.zeros(size, size, dtype=torch.float64)),
+        objective=float(values["objective"]),
+        alpha_names=tuple(meta["alpha_names"]),
+        parameters=tuple(meta["parameter_names"]),
+    )
+
+
+def _samples(groups: Mapping[str, Any]) -> Tensor | None:
+    return groups["posterior"]["alpha"] if "posterior" in groups else None
+
+
+def _diagnostics(groups: Mapping[str, Any], meta: Mapping[str, Any]) -> Diagnostics:
+    values = dict(meta["diagnostics"])
+    for key in ("alpha", "parameters"):
+        values[key] = {name: Quality(**quality) for name, quality in values[key].items()}
+    if values["propagation"] is not None:
+        values["propagation"] = PropagationCheck(**values["propagation"])
+    values["problems"] = tuple(values["problems"])
+    if "null_directions" in groups:
+        null = groups["null_directions"]["direction"]
+    else:
+        null = torch.zeros(0, len(meta["alpha_names"]), dtype=torch.float64)
+    return Diagnostics(null_directions=null, **values)

@@ -1,0 +1,212 @@
+"""What a simulator's parameter is, and the coordinates in which it is inferred."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcal.errors import DomainError, EmbeddingError, ShapeError
+
+__all__ = ["Parameter", "Scaling", "free_parameters"]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A named number inside a simulator.
+
+    Args:
+        name: How the simulator's function finds it, ``p[name]``.
+        unit: Its physical unit, for reports only.
+        low: Smallest physical value. It limits E[λ], not the quadrature nodes.
+        high: Largest physical value, likewise.
+        initial: A first guess.
+        neutral: The value at which the parameter has no effect. A parameter with a neutral value is held
+            there until something frees it.
+        transform: ``"log"`` for a positive scale: λ is inferred, and embedded, as ln λ.
+        per_run: Whether each run of a recording has a value of its own.
+
+    Raises:
+        DomainError: If a number is not finite, the bounds are reversed, or a guess lies outside them.
+
+    >>> Parameter("E", unit="cal/mol", low=36315.5, high=56954.0).name
+    'E'
+    """
+
+    name: str
+    unit: str | None = None
+    low: float | None = None
+    high: float | None = None
+    initial: float | None = None
+    neutral: float | None = None
+    transform: str | None = None
+    per_run: bool = False
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise DomainError(f"Expected a parameter name (a non-empty string). Got {self.name!r}.")
+        for field in ("low", "high", "initial", "neutral"):
+            value = getattr(self, field)
+            if value is None:
+                continue
+            try:
+                number = float(value)
+            except (TypeError, ValueError):
+                number = math.nan
+            if not math.isfinite(number):
+                raise DomainError(
+                    f"Expected a finite number for {field} of parameter {self.name!r}. Got {value!r}. "
+                    "Leave it out where there is none."
+                )
+            object.__setattr__(self, field, number)
+        if self.low is not None and self.high is not None and not self.low < self.high:
+            raise DomainError(
+                f"Expected low < high for parameter {self.name!r}. Got low={self.low}, high={self.high}. "
+                "Swap the bounds, or hold the parameter fixed if it has one value only."
+            )
+        if self.transform not in (None, "log"):
+            raise DomainError(
+                f"Expected transform None or 'log' for parameter {self.name!r}. Got {self.transform!r}."
+            )
+        if self.initial is not None and not self.contains(self.initial):
+            raise DomainError(
+                f"Expected initial of parameter {self.name!r} between its bounds "
+                f"[{self.low}, {self.high}]. Got {self.initial}."
+            )
+        if self.transform == "log":
+            for field in ("low", "high", "initial", "neutral"):
+                value = getattr(self, field)
+                if value is not None and value <= 0:
+                    raise DomainError(
+                        f"Expected a positive {field} for parameter {self.name!r}, which is inferred on a "
+                        f"logarithmic scale. Got {value}. Use a small positive bound or drop transform='log'."
+                    )
+
+    def contains(self, value: float) -> bool:
+        """Whether a value lies within the physical bounds, the bounds included."""
+        return (self.low is None or value >= self.low) and (self.high is None or value <= self.high)
+
+
+def free_parameters(
+    parameters: Sequence[Parameter], fixed: Mapping[str, float] | None = None
+) -> tuple[tuple[Parameter, ...], dict[str, float]]:
+    """Split parameters into those to be inferred and those held, dormant ones at their neutral value.
+
+    Args:
+        parameters: All parameters of a simulator.
+        fixed: Values of parameters that the user holds.
+
+    Returns:
+        The free parameters, in order, and ``{name: value}`` of the held ones.
+
+    Raises:
+        EmbeddingError: If ``fixed`` names a parameter that does not exist, or nothing is left free.
+        DomainError: If a fixed value is not finite.
+    """
+    fixed = dict(fixed or {})
+    names = [parameter.name for parameter in parameters]
+    unknown = sorted(set(fixed) - set(names))
+    if unknown:
+        raise EmbeddingError(f"Expected fixed parameters among {names}. Got {unknown}. Check the spelling.")
+    held: dict[str, float] = {}
+    for name, value in fixed.items():
+        number = float(value)
+        if not math.isfinite(number):
+            raise DomainError(f"Expected a finite value for the fixed parameter {name!r}. Got {value!r}.")
+        held[name] = number
+    for parameter in parameters:
+        if parameter.neutral is not None and parameter.name not in held:
+            held[parameter.name] = parameter.neutral
+    free = tuple(parameter for parameter in parameters if parameter.name not in held)
+    if not free:
+        raise EmbeddingError(
+            f"Expected at least one free parameter. Got all of {names} fixed or dormant. "
+            "Free one of them, or call the simulator directly."
+        )
+    return free, held
+
+
+@dataclass(frozen=True)
+class Scaling:
+    r"""The map between a parameter's physical value λ and the coordinate λ̃ in which it is inferred.
+
+    .. math:: \lambda = c + s \tilde\lambda \quad\text{or}\quad \lambda = \exp(c + s \tilde\lambda)
+
+    A parameter with two bounds is scaled so that they become −1 and 1 (Eq. 40 of the paper).
+
+    Args:
+        center: c, shape ``(d,)``, in physical units (their logarithm where ``log``).
+        scale: s > 0, shape ``(d,)``, likewise.
+        log: Which parameters are on a logarithmic scale, shape ``(d,)``, bool.
+    """
+
+    center: Tensor
+    scale: Tensor
+    log: Tensor
+
+    def __post_init__(self) -> None:
+        if not (self.center.shape == self.scale.shape == self.log.shape):
+            raise ShapeError(
+                "Expected center, scale and log of one shape. "
+                f"Got {tuple(self.center.shape)}, {tuple(self.scale.shape)}, {tuple(self.log.shape)}."
+            )
+
+    @classmethod
+    def from_parameters(
+        cls, parameters: Sequence[Parameter], center: Tensor | None = None, scale: Tensor | None = None
+    ) -> "Scaling":
+        """Scale by bounds where both are given, else by ``initial``, else by ``center`` and ``scale``.
+
+        Args:
+            parameters: The free parameters.
+            center: Fallback centres (from a least-squares fit), shape ``(d,)``, logarithms where the
+                parameter is logarithmic; default 0.
+            scale: Fallback scales, shape ``(d,)``; default 1.
+        """
+        centers, scales = [], []
+        for i, parameter in enumerate(parameters):
+            forward = math.log if parameter.transform == "log" else float
+            if parameter.low is not None and parameter.high is not None:
+                low, high = forward(parameter.low), forward(parameter.high)
+                c, s = 0.5 * (low + high), 0.5 * (high - low)
+            else:
+                c = 0.0 if center is None else float(center[i])
+                s = 1.0 if scale is None else float(scale[i])
+                if parameter.initial is not None and center is None:
+                    c = forward(parameter.initial)
+                    s = 1.0 if parameter.transform == "log" or c == 0 else abs(c)
+            centers.append(c)
+            scales.append(s)
+        log = torch.tensor([parameter.transform == "log" for parameter in parameters])
+        return cls(
+            torch.tensor(centers, dtype=torch.float64), torch.tensor(scales, dtype=torch.float64), log
+        )
+
+    def physical(self, scaled: Tensor) -> Tensor:
+        """λ of λ̃, last dimension d."""
+        value = self.center.to(scaled) + self.scale.to(scaled) * scaled
+        if bool(self.log.any()):
+            value = torch.where(self.log.to(scaled.device), value.exp(), value)
+        return value
+
+    def scaled(self, physical: Tensor) -> Tensor:
+        """λ̃ of λ, last dimension d."""
+        log = self.log.to(physical.device)
+        value = torch.where(log, torch.where(log, physical, torch.ones_like(physical)).log(), physical)
+        return (value - self.center.to(physical)) / self.scale.to(physical)
+
+    def bounds(self, parameters: Sequence[Parameter]) -> tuple[Tensor, Tensor]:
+        """The physical bounds in scaled coordinates, shape ``(d,)`` twice, ±inf where there is none."""
+        ends = []
+        for field, missing in (("low", -math.inf), ("high", math.inf)):
+            values = []
+            for i, parameter in enumerate(parameters):
+                value = getattr(parameter, field)
+                if value is None:
+                    values.append(missing)
+                    continue
+                value = math.log(value) if parameter.transform == "log" else value
+                values.append((value - float(self.center[i])) / float(self.scale[i]))
+            ends.append(torch.tensor(values, dtype=torch.float64))
+        return ends[0], ends[1]

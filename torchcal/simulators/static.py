@@ -1,0 +1,203 @@
+"""Static simulators: outputs as a function of conditions and parameters."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchcal.errors import DomainError, ShapeError, SimulatorError
+from torchcal.simulators.parameter import Parameter
+
+__all__ = ["Conditions", "Simulator", "check_parameters"]
+
+Conditions = Tensor | Mapping[str, Tensor]
+
+
+def check_parameters(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
+    """Return the parameters as a tuple, or raise if one is not a `Parameter` or is named twice."""
+    parameters = tuple(parameters)
+    if not parameters:
+        raise DomainError("Expected at least one parameter. Got none. Pass parameters=[Parameter(...), ...].")
+    for parameter in parameters:
+        if not isinstance(parameter, Parameter):
+            raise DomainError(
+                f"Expected torchcal.Parameter objects. Got {type(parameter).__name__}: {parameter!r}."
+            )
+    names = [parameter.name for parameter in parameters]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise DomainError(f"Expected every parameter named once. Got {twice} more than once in {names}.")
+    return parameters
+
+
+class Simulator:
+    r"""A model y = f(x; λ) written with torch operations.
+
+    The function is called as ``function(x, p)``. ``x`` is a tensor ``(n,)``, or a dict of them where there are
+    several conditions; ``p[name]`` has shape ``(*batch, 1)``. Elementwise code is therefore batched code. It
+    returns a tensor ``(*batch, n)``, or a dict of them where there are several outputs.
+
+    Args:
+        function: ``function(x, p)``.
+        parameters: In the order in which results list them.
+        degree: Total degree in the parameters, where the function is a polynomial in them. Propagation is then
+            exact with the fewest nodes; without it the number of nodes is found by trial.
+
+    Raises:
+        DomainError: If there is no parameter, or one is named twice.
+
+    >>> line = Simulator(lambda x, p: p["a"] + p["b"] * x, [Parameter("a"), Parameter("b")])
+    >>> line.at(torch.tensor([0.0, 1.0]))(torch.tensor([2.0, 3.0]))
+    tensor([2., 5.])
+    """
+
+    def __init__(
+        self,
+        function: Callable[[Any, dict[str, Tensor]], Any],
+        parameters: Sequence[Parameter],
+        *,
+        degree: int | None = None,
+    ) -> None:
+        if not callable(function):
+            raise DomainError(f"Expected a callable f(x, p). Got {type(function).__name__}.")
+        if degree is not None and (isinstance(degree, bool) or not isinstance(degree, int) or degree < 0):
+            raise DomainError(f"Expected degree as a non-negative integer or None. Got {degree!r}.")
+        self.function = function
+        self.parameters = check_parameters(parameters)
+        self.degree = degree
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters' names, in order."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(parameters={list(self.names)})"
+
+    def at(self, x: Conditions, outputs: Sequence[str] | None = None) -> Callable[[Tensor], Tensor]:
+        """The simulator at fixed conditions, as a function of parameter values alone.
+
+        Args:
+            x: Conditions, ``(n,)`` or a dict of them.
+            outputs: Names and order of the outputs wanted, where the function returns a dict.
+
+        Returns:
+            A function from values ``(*batch, d)``, physical units, to outputs ``(*batch, n)``, or
+            ``(*batch, n_outputs * n)`` with one output after another.
+        """
+        n = _length(x)
+
+        def evaluate(values: Tensor) -> Tensor:
+            p = {name: values[..., i : i + 1] for i, name in enumerate(self.names)}
+            try:
+                result = self.function(x, p)
+            except SimulatorError:
+                raise
+            except Exception as error:
+                raise SimulatorError(
+                    f"Expected the simulator to return a tensor. It raised {type(error).__name__}: {error}. "
+                    f"It was called with conditions {_describe(x)} and parameters of shape "
+                    f"{(*values.shape[:-1], 1)} ({', '.join(self.names)})."
+                ) from error
+            return self._flatten(result, values.shape[:-1], n, outputs)
+
+        return evaluate
+
+    def _flatten(self, result: Any, batch: torch.Size, n: int, outputs: Sequence[str] | None) -> Tensor:
+        if not isinstance(result, Mapping):
+            return _output(result, batch, n, "the simulator's result")
+        if not result:
+            raise SimulatorError("Expected at least one output. Got an empty dict from the simulator.")
+        wanted = tuple(outputs) if outputs is not None else tuple(result)
+        missing = [name for name in wanted if name not in result]
+        if missing:
+            raise SimulatorError(
+                f"Expected outputs {list(wanted)} from the simulator. Got {list(result)}: {missing} missing. "
+                "Use the same names in the recording and in the simulator's result."
+            )
+        return torch.cat([_output(result[name], batch, n, f"output {name!r}") for name in wanted], dim=-1)
+
+    def check(self, x: Conditions, values: Tensor, outputs: Sequence[str] | None = None) -> int:
+        """Call the simulator once, before any long work, and look hard at what it returns.
+
+        Args:
+            x: Conditions.
+            values: Parameter values to try, ``(m, d)``, physical units; one of them must work.
+            outputs: Names of the outputs wanted.
+
+        Returns:
+            The number of output values, n times the number of outputs.
+
+        Raises:
+            SimulatorError: If it raises, returns complex or non-finite numbers or the wrong shape, or if a
+                batch of parameter values gives something else than the values one by one.
+        """
+        evaluate = self.at(x, outputs)
+        leaf = values.detach().requires_grad_(True)
+        tracked = evaluate(leaf)
+        if not tracked.requires_grad:
+            raise SimulatorError(
+                "Expected outputs that depend on the parameters through torch operations. Got a result without "
+                "a gradient. Avoid .item(), .detach() and numpy inside the simulator, or wrap other code in "
+                "torchcal.ExternalSimulator."
+            )
+        together = tracked.detach()
+        finite = torch.isfinite(together).all(-1)
+        if not bool(finite.any()):
+            row, column = (int(i) for i in (~torch.isfinite(together)).nonzero()[0])
+            point = {name: float(v) for name, v in zip(self.names, values[row], strict=True)}
+            raise SimulatorError(
+                f"Expected finite outputs. Got {float(together[row, column])} at output number {column} "
+                f"for parameters {point}, and none of {len(values)} parameter values gave finite outputs "
+                "everywhere. Check the simulator there, or narrow the parameters' bounds or give initial=."
+            )
+        good = finite.nonzero()[:2, 0].repeat(2)[:2]
+        with torch.no_grad():
+            alone = evaluate(values[good[0]])
+            nested = evaluate(values[good].reshape(2, 1, -1))[:, 0]
+        difference = torch.maximum((together[good[0]] - alone).abs(), (together[good] - nested).abs().amax(0))
+        if not bool((difference <= 1e-10 + 1e-6 * alone.abs().amax()).all()):
+            raise SimulatorError(
+                "Expected the same outputs for parameter values in a batch as one at a time. Got a difference "
+                f"of {float(difference.max()):.3g}. Write the simulator elementwise: p[name] has shape "
+                "(*batch, 1), x has shape (n,), the result (*batch, n); and leave random numbers out of it."
+            )
+        return together.shape[-1]
+
+
+def _length(x: Conditions) -> int:
+    first = next(iter(x.values())) if isinstance(x, Mapping) else x
+    if first.ndim != 1:
+        raise ShapeError(f"Expected conditions of shape (n,). Got {tuple(first.shape)}.")
+    return first.shape[0]
+
+
+def _describe(x: Conditions) -> str:
+    if isinstance(x, Mapping):
+        return "{" + ", ".join(f"{name}: {tuple(value.shape)}" for name, value in x.items()) + "}"
+    return str(tuple(x.shape))
+
+
+def _output(result: Any, batch: torch.Size, n: int, what: str) -> Tensor:
+    if not isinstance(result, Tensor):
+        raise SimulatorError(
+            f"Expected {what} as a torch tensor. Got {type(result).__name__}. Use torch functions, or wrap "
+            "other code in torchcal.ExternalSimulator."
+        )
+    if result.is_complex() or not result.is_floating_point():
+        raise SimulatorError(f"Expected {what} to be real floating-point numbers. Got {result.dtype}.")
+    shape = (*batch, n)
+    if result.shape == shape:
+        return result
+    try:
+        fits = torch.broadcast_shapes(result.shape, shape) == torch.Size(shape)
+    except RuntimeError:
+        fits = False
+    # A result that lacks the condition axis by mistake must not be spread over it in silence.
+    if not fits or result.ndim == 0 or (n > 1 and result.shape[-1] != n and result.shape != (*batch, 1)):
+        raise SimulatorError(
+            f"Expected {what} of shape {shape} (batch, then conditions). Got {tuple(result.shape)}. "
+            "p[name] has shape (*batch, 1) and x has shape (n,)."
+        )
+    return result.expand(shape)
