@@ -21,7 +21,9 @@ from torchcal.errors import (
 )
 from torchcal.inference import diagnostics as measure
 from torchcal.inference.estimate import Estimate, laplace, maximise
-from torchcal.inference.nuts import Draws, run_nuts
+from torchcal.inference.batched import run_batched_nuts
+from torchcal.inference.draws import Draws
+from torchcal.inference.nuts import run_nuts
 from torchcal.inference.setup import LeastSquares, PriorMaker, check_inputs, embedded_problem, least_squares
 from torchcal.models import Problem
 from torchcal.prediction import embedded_prediction
@@ -52,6 +54,7 @@ def calibrate(
     seed: int = 0,
     device: torch.device | str | None = None,
     dtype: torch.dtype = torch.float64,
+    sampler: str = "nuts",
     progress: bool = False,
 ) -> Calibration:
     r"""Calibrate a simulator whose model error is embedded in its parameters.
@@ -68,7 +71,8 @@ def calibrate(
         fixed: Parameters to hold, ``{name: physical value}``.
         num_samples: Posterior draws a chain; 0 for the MAP alone.
         num_chains: Chains.
-        num_warmup: Draws thrown away a chain; by default half of ``num_samples``, at least 300.
+        num_warmup: Draws thrown away a chain; by default 100, and half of ``num_samples`` but at least 300 for
+            ``sampler="pyro"``.
         order: Degree of the output expansion; None for the full variance, 1 as in the paper's case studies.
         rule: Quadrature, see `torchcal.NISP`; by default found by itself.
         starts: Starting points of the optimiser ``(S, P)`` in scaled coordinates; by default made.
@@ -76,6 +80,8 @@ def calibrate(
         seed: Of every random number; the global state is left as it was.
         device: Where the tensors live; the CPU by default.
         dtype: Of the arithmetic.
+        sampler: ``"nuts"``, all chains as one batched tensor program; or ``"pyro"``, Pyro's NUTS on the Pyro model,
+            chain after chain, which is the reference.
         progress: Whether to show a bar.
 
     Returns:
@@ -92,7 +98,7 @@ def calibrate(
 
     Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276.
     """
-    num_samples, num_chains, num_warmup = _check_counts(num_samples, num_chains, num_warmup, num_starts)
+    num_samples, num_chains, num_warmup = _check_counts(num_samples, num_chains, num_warmup, num_starts, sampler)
     embedding = Gaussian() if embedding is None else embedding
     if not isinstance(embedding, Embedding):
         raise DomainError(f"Expected one of torchcal.embeddings. Got {type(embedding).__name__}.")
@@ -120,7 +126,7 @@ def calibrate(
     samples: Tensor | None = None
     if num_samples:
         draws = _sample(
-            problem, estimate, models.embedded, num_samples, num_chains, num_warmup, seed, progress
+            problem, estimate, models.embedded, num_samples, num_chains, num_warmup, seed, sampler, progress
         )
         samples = draws.alpha
         if problem.prior.symmetric:
@@ -166,6 +172,7 @@ def calibrate_additive(
     seed: int = 0,
     device: torch.device | str | None = None,
     dtype: torch.dtype = torch.float64,
+    sampler: str = "nuts",
     progress: bool = False,
 ) -> AdditiveCalibration:
     r"""Calibrate the conventional way: λ and ln σ of an additive Gaussian discrepancy (Eqs. 2-4).
@@ -184,13 +191,15 @@ def calibrate_additive(
         seed: Of every random number.
         device: Where the tensors live.
         dtype: Of the arithmetic.
+        sampler: ``"nuts"``, all chains as one batched tensor program; or ``"pyro"``, Pyro's NUTS on the Pyro model,
+            chain after chain, which is the reference.
         progress: Whether to show a bar.
 
     Raises:
         ImproperPosteriorError: If the model fits the data exactly, or has as many parameters as there are data:
             the likelihood then grows without limit as σ → 0.
     """
-    num_samples, num_chains, num_warmup = _check_counts(num_samples, num_chains, num_warmup, num_starts)
+    num_samples, num_chains, num_warmup = _check_counts(num_samples, num_chains, num_warmup, num_starts, sampler)
     free, _ = check_inputs(simulator, recording, fixed)
     observed = recording.observed
     count = int(observed.sum())
@@ -229,7 +238,7 @@ def calibrate_additive(
     draws = None
     if num_samples:
         draws = _sample(
-            problem, estimate, models.additive, num_samples, num_chains, num_warmup, seed, progress
+            problem, estimate, models.additive, num_samples, num_chains, num_warmup, seed, sampler, progress
         )
     names = (*propagate.pattern.names, "ln sigma")
     samples = None if draws is None else draws.alpha
@@ -279,23 +288,30 @@ def _sample(
     num_chains: int,
     num_warmup: int,
     seed: int,
+    sampler: str,
     progress: bool,
 ) -> Draws:
     approximation = laplace(problem, estimate)
-    prior = problem.prior.whitened(approximation.loc, approximation.scale_tril)
-    arguments: tuple[Any, ...]
-    if model is models.additive:
-        arguments = (problem.y, problem.propagate, prior, problem.noise, problem.observed)
-    else:
-        arguments = (
-            problem.y,
-            problem.propagate,
-            problem.likelihood,
-            prior,
-            problem.noise,
-            problem.observed,
-            problem.germ,
+    if sampler == "nuts":
+        transform = problem.prior.transform
+        return run_batched_nuts(
+            lambda u: problem.log_prob(transform.bound(u)) + transform.log_slope(u),
+            transform,
+            loc=approximation.loc,
+            scale_tril=approximation.scale_tril,
+            num_samples=num_samples,
+            num_chains=num_chains,
+            num_warmup=num_warmup,
+            seed=seed,
+            cost=problem.propagate.num_nodes * len(problem.y),
+            progress=progress,
         )
+    prior = problem.prior.whitened(approximation.loc, approximation.scale_tril)
+    arguments: tuple[Any, ...] = (problem.y, problem.propagate)
+    if model is models.additive:
+        arguments += (prior, problem.noise, problem.observed)
+    else:
+        arguments += (problem.likelihood, prior, problem.noise, problem.observed, problem.germ)
     return run_nuts(
         model,
         arguments,
@@ -309,9 +325,13 @@ def _sample(
 
 
 def _check_counts(
-    num_samples: int, num_chains: int, num_warmup: int | None, num_starts: int
+    num_samples: int, num_chains: int, num_warmup: int | None, num_starts: int, sampler: str
 ) -> tuple[int, int, int]:
-    warmup = max(300, num_samples // 2) if num_warmup is None else num_warmup
+    if sampler not in ("nuts", "pyro"):
+        raise DomainError(f"Expected sampler 'nuts' or 'pyro'. Got {sampler!r}.")
+    # Pooled over a crowd of chains, adaptation needs fewer transitions of each than chain by chain.
+    default = 100 if sampler == "nuts" else max(300, num_samples // 2)
+    warmup = default if num_warmup is None else num_warmup
     for name, value, least in (
         ("num_samples", num_samples, 0),
         ("num_chains", num_chains, 1),

@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -11,18 +10,11 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchcal.errors import ConvergenceError, ConvergenceWarning
+from torchcal.inference.draws import Draws
 from torchcal.inference.setup import preserve_random_state
 from torchcal.priors import CoefficientPrior
 
-__all__ = ["Draws", "run_nuts"]
-
-
-@dataclass(frozen=True)
-class Draws:
-    """Posterior draws of α ``(chains, draws, P)`` and the number of divergent transitions."""
-
-    alpha: Tensor
-    divergences: int
+__all__ = ["run_nuts"]
 
 
 def run_nuts(
