@@ -14,6 +14,9 @@ _STEP = 1e-5
 """Central-difference step of the Hessian in scaled coordinates: gradients are good to 1e-12, so the
 Hessian is good to 1e-7 of its largest entry, and Newton steps need no more."""
 
+_SAME = 1e-8
+"""Relative difference of two objectives below which two starts are taken to be in one basin."""
+
 
 @dataclass(frozen=True)
 class Minima:
@@ -82,6 +85,7 @@ def minimise(
         values = torch.nan_to_num(objective(points), nan=torch.inf, posinf=torch.inf)
     stalls = torch.zeros(len(points), dtype=torch.long, device=points.device)
     active = torch.isfinite(values)
+    leader = torch.arange(len(points), device=points.device)
     ladder = torch.tensor(
         [0.0, 1e-12, 1e-10, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 1e3],
         dtype=points.dtype,
@@ -116,7 +120,26 @@ def minimise(
         values[rows[better]] = best[better]
         stalls[rows] = torch.where(small, stalls[rows] + 1, 0)
         active[rows] = (stalls[rows] < 3) & (better | (stalls[rows] < 1))
+        if iteration % 4 == 0:
+            _join(values, active, leader)
         if progress is not None:
             progress(iteration, values)
+    for _ in range(len(points)):  # a leader may itself have joined another
+        leader = leader[leader]
+    points, values, active = points[leader], values[leader], active[leader]
     order = values.argsort(stable=True)
     return Minima(points[order], values[order], ~active[order] & torch.isfinite(values[order]), iteration)
+
+
+def _join(values: Tensor, active: Tensor, leader: Tensor) -> None:
+    """Starts whose objectives agree run towards one minimum: let one of them finish for all."""
+    rows = active.nonzero()[:, 0]
+    rows = rows[values[rows].argsort()]
+    if len(rows) < 2:
+        return
+    gap = values[rows][1:] - values[rows][:-1]
+    close = gap <= _SAME * (1 + values[rows][:-1].abs())
+    same = torch.cat([torch.zeros_like(close[:1]), close])
+    first = torch.where(~same, torch.arange(len(rows), device=rows.device), 0).cummax(0).values
+    leader[rows] = rows[first]
+    active[rows[same]] = False

@@ -1,6 +1,23 @@
 """Simulators: parameters, models written in torch, external codes, polynomial surrogates."""
 
+from torchcal.simulators.build import build_surrogate
+from torchcal.simulators.design import Evaluations
+from torchcal.simulators.external import ExternalSimulator
+from torchcal.simulators.held_out import HeldOutError
 from torchcal.simulators.parameter import Parameter, Scaling, free_parameters
 from torchcal.simulators.static import Conditions, Simulator, check_parameters
+from torchcal.simulators.surrogate import PolynomialSurrogate
 
-__all__ = ["Conditions", "Parameter", "Scaling", "Simulator", "check_parameters", "free_parameters"]
+__all__ = [
+    "Conditions",
+    "Evaluations",
+    "ExternalSimulator",
+    "HeldOutError",
+    "Parameter",
+    "PolynomialSurrogate",
+    "Scaling",
+    "Simulator",
+    "build_surrogate",
+    "check_parameters",
+    "free_parameters",
+]
