@@ -4,9 +4,10 @@ They are ordinary Pyro models and take their observations as arguments. The log-
 densities without Pyro, for the optimiser and for batched samplers.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pyro
+import torch
 from torch import Tensor
 
 from torchcal.likelihoods import Additive, Likelihood
@@ -37,6 +38,19 @@ class Problem:
     noise: Tensor | None = None
     observed: Tensor | None = None
     germ: Tensor | None = None
+
+    def cast(self, dtype: torch.dtype) -> "Problem":
+        """The same problem in another dtype."""
+        if dtype == self.y.dtype:
+            return self
+        return replace(
+            self,
+            y=self.y.to(dtype),
+            propagate=self.propagate.copy().to(dtype),
+            prior=self.prior.cast(dtype),
+            noise=None if self.noise is None else self.noise.to(dtype),
+            germ=None if self.germ is None else self.germ.to(dtype),
+        )
 
     def log_likelihood(self, alpha: Tensor) -> Tensor:
         """``(*batch,)``."""

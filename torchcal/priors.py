@@ -169,6 +169,15 @@ class CoefficientPrior(pyro.distributions.TorchDistribution):
         other.transform = Bounds(self.low, self.high, loc, scale_tril)
         return other
 
+    def cast(self, dtype: torch.dtype) -> "CoefficientPrior":
+        """The same prior in another dtype."""
+        other = copy.copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                setattr(other, name, value.to(dtype))
+        other.transform = Bounds(other.low, other.high)
+        return other
+
     def expand(self, batch_shape: _Shape, _instance: Any = None) -> "CoefficientPrior":
         """The same prior over a batch."""
         other = copy.copy(self)

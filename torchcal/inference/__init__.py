@@ -1,5 +1,6 @@
 """Inference: the maximum a posteriori, No-U-Turn sampling, and the functions a user calls."""
 
-from torchcal.inference.calibrate import calibrate, calibrate_additive
+from torchcal.inference.additive import calibrate_additive
+from torchcal.inference.calibrate import calibrate
 
 __all__ = ["calibrate", "calibrate_additive"]

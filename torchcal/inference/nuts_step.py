@@ -86,7 +86,9 @@ class Outcome:
     leaves: Tensor
 
 
-def init(position: Tensor, potential: Potential, *, step_size: float, tables: Tables, generator: torch.Generator) -> State:
+def init(
+    position: Tensor, potential: Potential, *, step_size: float, tables: Tables, generator: torch.Generator
+) -> State:
     """Chains at the start of their first trajectory, from positions ``(C, P)``."""
     chains, size = position.shape
     energy, slope = potential(position)
@@ -149,7 +151,8 @@ def step(
     write = (number == last) & even
     pair = torch.stack([momentum, sub_sum], dim=1)[:, None]
     checkpoints = torch.where(write[:, :, None, None], pair, s.checkpoints)
-    turns = _turning(checkpoints[:, :, 0], momentum[:, None], sub_sum[:, None] - checkpoints[:, :, 1] + checkpoints[:, :, 0])
+    opened = checkpoints[:, :, 0]
+    turns = _turning(opened, momentum[:, None], sub_sum[:, None] - checkpoints[:, :, 1] + opened)
     stop = (turns & (number >= first) & (number <= last) & ~even).any(-1) | divergent
 
     # A complete subtree joins the tree.

@@ -191,7 +191,6 @@ def embedded_problem(
     order: int | None,
     rule: Any,
     device: torch.device | str | None,
-    dtype: torch.dtype,
 ) -> Problem:
     """The problem of the embedded calibration, or an error that says why it has no answer."""
     if isinstance(likelihood, likelihoods.Additive):
@@ -231,7 +230,7 @@ def embedded_problem(
     else:
         # Likelihoods without a tolerance are singular at zero spread; the floor is where that is cut off.
         propagate.sd_floor = 1e-6 * float(recording.spread.min())
-    propagate = propagate.to(device=device, dtype=dtype)
+    propagate = propagate.to(device=device)
     distribution = prior(propagate)
     if not isinstance(distribution, CoefficientPrior):
         raise DomainError(
@@ -245,24 +244,16 @@ def embedded_problem(
             "Eq. 20). Use ABC(), a Uniform or Normal prior, or PolynomialChaos(order=0)."
         )
 
-    def place(value: Tensor | None) -> Tensor | None:
-        if value is None:
-            return None
-        return value.to(device=device, dtype=dtype if value.is_floating_point() else None)
-
     germ = None
     if likelihood.needs == "samples":
         germ = propagate.draw_germ(getattr(likelihood, "num_samples", 256), seed=0)
-    placed_y = place(y)
-    if placed_y is None:
-        raise RecordingError("Expected recorded outputs. Got none.")
     return Problem(
-        y=placed_y,
+        y=y.to(device=device),
         propagate=propagate,
         likelihood=likelihood,
         prior=distribution,
-        noise=place(noise),
-        observed=None if bool(observed.all()) else place(observed),
+        noise=None if noise is None else noise.to(device=device),
+        observed=None if bool(observed.all()) else observed.to(device=device),
         germ=germ,
     )
 

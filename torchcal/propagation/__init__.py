@@ -1,5 +1,7 @@
 """NISP: from α to the moments and samples of the outputs."""
 
-from torchcal.propagation.nisp import NISP, PropagationCheck
+from torchcal.propagation.convergence import PropagationCheck
+from torchcal.propagation.nisp import NISP
+from torchcal.propagation.rules import RuleChoice
 
-__all__ = ["NISP", "PropagationCheck"]
+__all__ = ["NISP", "PropagationCheck", "RuleChoice"]

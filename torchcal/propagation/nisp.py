@@ -3,9 +3,7 @@ r"""Non-intrusive spectral projection: from α to the mean and standard deviatio
 Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 25-29.
 """
 
-import dataclasses
 import math
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -15,30 +13,13 @@ from torch.utils.checkpoint import checkpoint
 
 from torchcal import polychaos
 from torchcal.embeddings import Embedding, Pattern
-from torchcal.errors import DomainError, EmbeddingError, PropagationWarning, ShapeError
-from torchcal.propagation.rules import RuleChoice, gauss_counts, sparse_or_random
+from torchcal.errors import DomainError, EmbeddingError, ShapeError
+from torchcal.propagation import choice, convergence, parameters
+from torchcal.propagation.convergence import PropagationCheck
+from torchcal.propagation.rules import RuleChoice
 from torchcal.simulators import Conditions, Scaling, Simulator, free_parameters
 
-__all__ = ["NISP", "PropagationCheck"]
-
-
-@dataclasses.dataclass(frozen=True)
-class PropagationCheck:
-    """How much the moments at some α change with a finer rule and with a longer expansion.
-
-    Attributes:
-        nodes: Number of nodes of the rule in use.
-        finer_nodes: Number of nodes of the rule that it was held against.
-        mean_change: Largest change of a mean, relative to the larger of |mean| and sd over the outputs.
-        sd_change: Largest change of an sd, on the same scale.
-        truncated: Largest share of a variance that lies in terms above ``order``; 0 for the full variance.
-    """
-
-    nodes: int
-    finer_nodes: int
-    mean_change: float
-    sd_change: float
-    truncated: float
+__all__ = ["NISP"]
 
 
 class NISP(nn.Module):
@@ -130,7 +111,7 @@ class NISP(nn.Module):
             "_places", torch.tensor([i for i, name in enumerate(simulator.names) if name in position])
         )
         self._evaluate: Callable[[Tensor], Tensor] | None = None
-        self._set_rule(self._choose(rule))
+        self.set_rule(choice.choose(self, rule))
 
     # --- what it is --------------------------------------------------------------------------------------
 
@@ -256,27 +237,7 @@ class NISP(nn.Module):
         :math:`E = \exp(m + v/2)`; by this module's nodes otherwise.
         """
         self._check_alpha(alpha)
-        matrix = self.pattern.matrix(alpha)
-        center, scale = self.scaling.center.to(alpha), self.scaling.scale.to(alpha)
-        log = self.scaling.log.to(alpha.device)
-        if bool(log.any()) and not (self.pattern.order <= 1 and self.pattern.basis.name == "hermite"):
-            values = self.parameters_at(alpha, self.nodes)
-            mean = torch.einsum("q,...qd->...d", self.weights, values)
-            offset = values - mean.unsqueeze(-2)
-            return mean, torch.einsum("q,...qd,...qe->...de", self.weights, offset, offset)
-        mean = center + scale * matrix[..., 0]
-        factor = scale[:, None] * matrix[..., 1:]
-        norms = polychaos.norms(self.pattern.basis, self.pattern.indices[1:]).to(alpha)
-        covariance = (factor * norms) @ factor.transpose(-1, -2)
-        if bool(log.any()):
-            variance = covariance.diagonal(dim1=-2, dim2=-1)
-            lognormal = (mean + 0.5 * variance).exp()
-            gain = torch.where(log, lognormal, torch.ones_like(mean))
-            both = log[:, None] & log[None, :]
-            inner = torch.where(both, torch.where(both, covariance, 0 * covariance).expm1(), covariance)
-            covariance = gain[..., :, None] * inner * gain[..., None, :]
-            mean = torch.where(log, lognormal, mean)
-        return mean, covariance
+        return parameters.moments(self, alpha)
 
     # --- the same embedding elsewhere --------------------------------------------------------------------
 
@@ -288,10 +249,11 @@ class NISP(nn.Module):
             simulator: Another simulator of the same parameters, for another quantity of interest.
         """
         if simulator is None:
-            return self._copy(x=x)
-        return self._copy(x=x, simulator=simulator, outputs=None)
+            return self.copy(x=x)
+        return self.copy(x=x, simulator=simulator, outputs=None)
 
-    def _copy(self, **changes: Any) -> "NISP":
+    def copy(self, **changes: Any) -> "NISP":
+        """The same propagation with some of its constructor's arguments changed."""
         settings: dict[str, Any] = {
             "simulator": self.simulator,
             "embedding": self.embedding,
@@ -325,52 +287,23 @@ class NISP(nn.Module):
         Warns:
             PropagationWarning: With the numbers.
         """
-        finer = self._copy(rule=self._choice.finer(self.pattern.num_germs))
-        with torch.no_grad():
-            mean, variance = self.moments(alpha)
-            other_mean, other_variance = finer.moments(alpha)
-            truncated = 0.0
-            if self.order is not None and bool((self.weights > 0).all()):
-                whole = self._copy(order=None).moments(alpha)[1]
-                lost = 1 - variance / whole.clamp_min(self.sd_floor**2)
-                truncated = float(torch.where(whole > self.sd_floor**2, lost, 0 * lost).max())
-        scale = torch.maximum(mean.abs(), variance.sqrt()).amax(-1, keepdim=True).clamp_min(self.sd_floor)
-        result = PropagationCheck(
-            nodes=self.num_nodes,
-            finer_nodes=finer.num_nodes,
-            mean_change=float(((mean - other_mean).abs() / scale).max()),
-            sd_change=float(((variance.sqrt() - other_variance.sqrt()).abs() / scale).max()),
-            truncated=truncated,
-        )
-        if warn and not max(result.mean_change, result.sd_change) <= tolerance:
-            warnings.warn(
-                f"With {result.nodes} quadrature nodes the output's mean is off by {result.mean_change:.2g} and "
-                f"its sd by {result.sd_change:.2g} of the output's scale, against {result.finer_nodes} nodes "
-                f"(tolerance {tolerance:.0e}). Pass a larger rule= or max_nodes=.",
-                PropagationWarning,
-                stacklevel=2,
-            )
-        if warn and result.truncated > order_tolerance:
-            warnings.warn(
-                f"An expansion of order {self.order} leaves out {result.truncated:.1%} of the output's variance "
-                f"(tolerance {order_tolerance:.0%}). Use order=None for the full variance.",
-                PropagationWarning,
-                stacklevel=2,
-            )
+        result = convergence.compare(self, alpha)
+        if warn:
+            convergence.warn(result, self.order, tolerance, order_tolerance)
         return result
 
     def refine(self, alpha: Tensor, *, tolerance: float = 1e-9) -> bool:
         """Take more nodes until the moments at α settle. Returns whether the rule has changed."""
         changed = False
         germs = self.pattern.num_germs
-        while germs and self._choice.kind == "tensor" and self._exact_nodes() is None:
+        while germs and self._choice.kind == "tensor" and choice.exact_count(self) is None:
             finer = self._choice.finer(germs)
             if finer.size**germs > self.max_nodes:
                 break
             result = self.check(alpha, warn=False)
             if max(result.mean_change, result.sd_change) <= tolerance:
                 break
-            self._set_rule(finer)
+            self.set_rule(finer)
             changed = True
         return changed
 
@@ -460,13 +393,14 @@ class NISP(nn.Module):
 
     # --- rules -------------------------------------------------------------------------------------------
 
-    def _set_rule(self, choice: RuleChoice) -> None:
+    def set_rule(self, rule_choice: RuleChoice) -> None:
+        """Use another quadrature rule."""
         basis, indices = self.pattern.basis, self.pattern.indices
         device, dtype = self._template.device, self._template.dtype
-        rule = choice.build(basis, self.pattern.num_germs)
-        self._choice = choice
+        rule = rule_choice.build(basis, self.pattern.num_germs)
+        self._choice = rule_choice
         projection = None
-        order = self.order if self.order is not None else choice.carried_order
+        order = self.order if self.order is not None else rule_choice.carried_order
         if order is not None and self.pattern.num_germs:
             terms = polychaos.multi_indices(self.pattern.num_germs, order)
             values = polychaos.evaluate(basis, terms, rule.nodes)
@@ -481,69 +415,3 @@ class NISP(nn.Module):
             # Built in float64 and only then cast, so that the rule is as good as the dtype allows.
             cast = None if value is None else value.to(device=device, dtype=dtype)
             self.register_buffer(name, cast, persistent=False)
-
-    def _choose(self, rule: "polychaos.Rule | RuleChoice | int | None") -> RuleChoice:
-        germs = self.pattern.num_germs
-        if isinstance(rule, RuleChoice):
-            return rule
-        if isinstance(rule, polychaos.Rule):
-            if rule.nodes.shape[1] != germs:
-                raise ShapeError(f"Expected a rule with {germs} germs. Got one with {rule.nodes.shape[1]}.")
-            if not rule.positive and self.order is None:
-                raise DomainError(
-                    "Expected order= beside a rule with negative weights (a sparse grid): its variance comes "
-                    "from the expansion's coefficients. Got order=None. Pass order=, the grid's level at most."
-                )
-            return RuleChoice("given", len(rule.nodes), given=rule)
-        if germs == 0:
-            return RuleChoice("tensor", 1)
-        if rule is not None:
-            if isinstance(rule, bool) or not isinstance(rule, int) or rule < 1:
-                raise DomainError(f"Expected rule as a Rule, a positive integer or None. Got {rule!r}.")
-            return RuleChoice("tensor", rule)
-        exact = self._exact_nodes()
-        if exact is not None and exact**germs <= self.max_nodes:
-            return RuleChoice("tensor", exact)
-        counts = gauss_counts(germs, self.max_nodes)
-        if len(counts) < 3:
-            return sparse_or_random(germs, self.max_nodes)
-        return self._by_trial(counts)
-
-    def _exact_nodes(self) -> int | None:
-        """Gauss nodes per germ that integrate f² exactly: its degree is twice that of f in ξ."""
-        if self.simulator.degree is None or bool(self.scaling.log.any()):
-            return None
-        degree = self.simulator.degree * max(1, self.pattern.order)
-        # With a truncated expansion f Ψ_k is integrated, whose degree is lower.
-        return degree + 1 if self.order is None else (degree + self.order) // 2 + 1
-
-    def _by_trial(self, counts: list[int]) -> RuleChoice:
-        """The smallest tensor rule whose moments at a few trial densities agree with the next one's."""
-        alpha = self._trial_alpha()
-        order, self.order = self.order, None
-        previous: tuple[Tensor, Tensor] | None = None
-        try:
-            for count, smaller in zip(counts, [0, *counts], strict=False):
-                self._set_rule(RuleChoice("tensor", count))
-                with torch.no_grad():
-                    mean, variance = self.moments(alpha)
-                sd = variance.sqrt()
-                if previous is not None:
-                    scale = torch.maximum(mean.abs(), sd).amax(-1, keepdim=True)
-                    change = torch.maximum((mean - previous[0]).abs(), (sd - previous[1]).abs())
-                    if bool((change <= 1e-9 * scale).all()):
-                        return RuleChoice("tensor", smaller)
-                previous = (mean, sd)
-        finally:
-            self.order = order
-        return RuleChoice("tensor", counts[-1])
-
-    def _trial_alpha(self) -> Tensor:
-        """Densities to try a rule on: 3 sd reach a bound, or 1 sd is one unit of scale where there is none."""
-        low, high = self.scaling.bounds(self.free)
-        spread = torch.where(torch.isfinite(low) & torch.isfinite(high), 1 / 3, 1.0).to(torch.float64)
-        generator = torch.Generator().manual_seed(0)
-        first_order = self.pattern.indices[self.pattern.columns].sum(-1) == 1
-        size = torch.where(first_order, 1.0, 0.1).to(torch.float64) * spread[self.pattern.rows]
-        noise = torch.rand(3, self.num_alpha, generator=generator, dtype=torch.float64) * 0.5 + 0.5
-        return noise * size

@@ -1,6 +1,7 @@
 """Frozen results: predict, print, save and load, export."""
 
-from torchcal.results.calibration import AdditiveCalibration, Calibration, MapEstimate
+from torchcal.results.calibration import AdditiveCalibration, Calibration
 from torchcal.results.diagnostics import Diagnostics, Quality
+from torchcal.results.estimate import MapEstimate
 
 __all__ = ["AdditiveCalibration", "Calibration", "Diagnostics", "MapEstimate", "Quality"]

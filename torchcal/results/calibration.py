@@ -23,35 +23,10 @@ from torchcal.prediction import (
 from torchcal.propagation import NISP
 from torchcal.results import storage
 from torchcal.results.diagnostics import Diagnostics, table
+from torchcal.results.estimate import MapEstimate
 from torchcal.simulators import Conditions, Simulator
 
-__all__ = ["AdditiveCalibration", "Calibration", "MapEstimate"]
-
-
-@dataclasses.dataclass(frozen=True)
-class MapEstimate:
-    """The maximum a posteriori.
-
-    Attributes:
-        alpha: MAP α in scaled coordinates, ``(P,)``.
-        mean: E[λ] at it, ``(d,)``, physical units, the free parameters in order.
-        covariance: Cov[λ] at it, ``(d, d)``, physical units.
-        objective: Negative log-likelihood at it, without constants.
-        alpha_names: The names of α.
-        parameters: The names of the free parameters.
-    """
-
-    alpha: Tensor
-    mean: Tensor
-    covariance: Tensor
-    objective: float
-    alpha_names: tuple[str, ...]
-    parameters: tuple[str, ...]
-
-    @property
-    def sd(self) -> Tensor:
-        """Sd[λ], ``(d,)``, physical units."""
-        return self.covariance.diagonal().clamp_min(0).sqrt()
+__all__ = ["AdditiveCalibration", "Calibration"]
 
 
 class _Printing:

@@ -17,6 +17,7 @@ from torchcal.errors import DomainError, MissingDependencyError, TorchcalError
 from torchcal.prediction import AdditivePrediction, Moments, Prediction
 from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results.diagnostics import Diagnostics, Quality
+from torchcal.results.estimate import MapEstimate
 from torchcal.simulators import Scaling, Simulator
 
 if TYPE_CHECKING:
@@ -306,9 +307,7 @@ def _propagation(
     )
 
 
-def _map(groups: Mapping[str, Any], meta: Mapping[str, Any]) -> Any:
-    from torchcal.results.calibration import MapEstimate
-
+def _map(groups: Mapping[str, Any], meta: Mapping[str, Any]) -> MapEstimate:
     values = groups["map"]
     size = len(values["mean"])
     return MapEstimate(

@@ -1,0 +1,143 @@
+"""`calibrate_additive`: the conventional calibration, which stands beside the embedded one."""
+
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from torchcal import likelihoods, models
+from torchcal.data import Recording
+from torchcal.embeddings import PolynomialChaos
+from torchcal.errors import ImproperPosteriorError
+from torchcal.inference.estimate import maximise
+from torchcal.inference.sampling import check_counts, draw
+from torchcal.inference.setup import LeastSquares, check_inputs, least_squares
+from torchcal.inference.summary import diagnose, settings_of, to_result, warn_of_box, warn_of_chains
+from torchcal.models import Problem
+from torchcal.priors import CoefficientPrior, Flat
+from torchcal.propagation import NISP
+from torchcal.results import AdditiveCalibration, MapEstimate
+from torchcal.simulators import Simulator
+
+__all__ = ["calibrate_additive"]
+
+
+def calibrate_additive(
+    simulator: Simulator,
+    recording: Recording,
+    *,
+    fixed: Mapping[str, float] | None = None,
+    num_samples: int = 1000,
+    num_chains: int = 4,
+    num_warmup: int | None = None,
+    num_starts: int = 32,
+    seed: int = 0,
+    device: torch.device | str | None = None,
+    dtype: torch.dtype = torch.float64,
+    sampler: str = "nuts",
+    progress: bool = False,
+) -> AdditiveCalibration:
+    r"""Calibrate the conventional way: λ and ln σ of an additive Gaussian discrepancy (Eqs. 2-4).
+
+    Flat priors on λ (within its bounds) and ln σ. This is the baseline whose push-forward shrinks with more data,
+    however wrong the model is.
+
+    Args:
+        simulator: The model.
+        recording: The data. A known noise sd s adds s² to σ².
+        fixed: Parameters to hold.
+        num_samples: Posterior draws a chain; 0 for the MAP alone.
+        num_chains: Chains.
+        num_warmup: Draws thrown away a chain.
+        num_starts: Starting points of the optimiser.
+        seed: Of every random number.
+        device: Where the tensors live.
+        dtype: Of the sampler's arithmetic; the maximum is always found in float64.
+        sampler: ``"nuts"``, all chains as one batched tensor program; or ``"pyro"``, Pyro's NUTS on the Pyro model,
+            chain after chain, which is the reference.
+        progress: Whether to show a bar.
+
+    Raises:
+        ImproperPosteriorError: If the model fits the data exactly, or has as many parameters as there are data:
+            the likelihood then grows without limit as σ → 0.
+    """
+    num_samples, num_chains, num_warmup = check_counts(num_samples, num_chains, num_warmup, num_starts, sampler)
+    free, _ = check_inputs(simulator, recording, fixed)
+    observed = recording.observed
+    count = int(observed.sum())
+    if count <= len(free):
+        raise ImproperPosteriorError(
+            f"Expected more data than parameters for the additive likelihood. Got N = {count} and d = "
+            f"{len(free)}: the residuals can vanish, and the likelihood grows without limit as σ → 0. Record more, "
+            "hold parameters fixed, or use torchcal.calibrate."
+        )
+    fit = least_squares(simulator, recording, fixed, seed=seed)
+    if fit.relative < 1e-7 and recording.noise_sd is None:
+        raise ImproperPosteriorError(
+            f"Expected residuals for the additive likelihood. Got a fit that is exact to {fit.relative:.1e} of the "
+            "data's spread: the likelihood grows without limit as σ → 0. Give the recording's noise=, or use "
+            "torchcal.calibrate."
+        )
+    y = torch.where(observed, recording.y, torch.zeros_like(recording.y))
+    propagate = NISP(
+        simulator,
+        PolynomialChaos(order=0),
+        recording.x,
+        fixed=fixed,
+        outputs=recording.outputs,
+        scaling=fit.scaling,
+    ).to(device=device)
+    noise = recording.noise_sd
+    problem = Problem(
+        y=y.to(device=device),
+        propagate=propagate,
+        likelihood=likelihoods.Additive(),
+        prior=_additive_prior(propagate, fit, noise),
+        noise=None if noise is None else noise.to(device=device),
+        observed=None if bool(observed.all()) else observed.to(device=device),
+    )
+    estimate = maximise(problem, fit.scaled, starts=None, num_starts=num_starts, seed=seed)
+    draws = None
+    if num_samples:
+        draws = draw(
+            problem, estimate, models.additive, num_samples, num_chains, num_warmup, seed, sampler, dtype, progress
+        )
+    names = (*propagate.pattern.names, "ln sigma")
+    samples = None if draws is None else draws.alpha
+    quality = diagnose(estimate, draws, samples, None, names, None)
+    warn_of_chains(quality)
+    warn_of_box(simulator, propagate, estimate.alpha[:-1])
+    mean = propagate.scaling.physical(estimate.alpha[:-1])
+    return AdditiveCalibration(
+        map=MapEstimate(
+            alpha=to_result(estimate.alpha),
+            mean=to_result(mean),
+            covariance=torch.zeros(len(free), len(free), dtype=torch.float64),
+            objective=estimate.objective,
+            alpha_names=names,
+            parameters=propagate.pattern.names,
+        ),
+        samples=samples,
+        diagnostics=quality,
+        recording=recording,
+        propagate=propagate,
+        settings=settings_of(propagate, fit, "additive", seed, num_warmup),
+    )
+
+
+def _additive_prior(propagate: NISP, fit: LeastSquares, noise: Tensor | None) -> CoefficientPrior:
+    flat = Flat(propagate)
+    like = flat.low
+    size = float(fit.residual.square().mean().sqrt())
+    # With known noise the likelihood no longer falls as σ → 0, and a flat ln σ needs a floor to be proper.
+    floor = -math.inf if noise is None else math.log(1e-3 * float(noise.min()))
+    center = math.log(size) if size > 0 else floor + 1
+    if noise is not None:
+        center = max(center, floor + 1)
+    return CoefficientPrior(
+        torch.cat([flat.low, torch.tensor([floor]).to(like)]),
+        torch.cat([flat.high, torch.tensor([math.inf]).to(like)]),
+        torch.cat([fit.scaled.to(like), torch.tensor([center]).to(like)]),
+        torch.cat([0.3 * torch.ones_like(flat.low), torch.tensor([0.5]).to(like)]),
+    )

@@ -1,0 +1,171 @@
+"""Figures and warnings about a finished calibration."""
+
+import math
+import warnings
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchcal import likelihoods
+from torchcal.errors import ConvergenceWarning, ExtrapolationWarning, ToleranceWarning
+from torchcal.inference import diagnostics as measure
+from torchcal.inference.draws import Draws
+from torchcal.inference.estimate import Estimate
+from torchcal.inference.setup import LeastSquares
+from torchcal.propagation import NISP, PropagationCheck
+from torchcal.results import Diagnostics, Quality
+from torchcal.results.diagnostics import ESS_THRESHOLD, R_HAT_THRESHOLD
+from torchcal.simulators import Simulator
+
+__all__ = [
+    "diagnose",
+    "mean_square",
+    "settings_of",
+    "to_result",
+    "warn_of_box",
+    "warn_of_chains",
+    "warn_of_tolerance",
+]
+
+
+def diagnose(
+    estimate: Estimate,
+    draws: Draws | None,
+    samples: Tensor | None,
+    propagate: NISP | None,
+    names: tuple[str, ...],
+    check: PropagationCheck | None,
+) -> Diagnostics:
+    """Judge starts and chains; the predictive variances are filled in by the caller."""
+    alpha: dict[str, Quality] = {}
+    parameters: dict[str, Quality] = {}
+    problems: list[str] = []
+    converged: bool | None = None
+    if draws is not None and samples is not None:
+        alpha = _quality(samples, names)
+        if propagate is not None:
+            labels, moments = _parameter_draws(propagate, samples)
+            parameters = _quality(moments, labels)
+        everything = {**alpha, **parameters}
+        wanted = min(ESS_THRESHOLD, samples.shape[0] * samples.shape[1] / 4)
+        loud = {name: q for name, q in everything.items() if not q.r_hat <= R_HAT_THRESHOLD}
+        if loud:
+            worst = max(loud, key=lambda name: loud[name].r_hat if loud[name].r_hat == loud[name].r_hat else 9e9)
+            problems.append(
+                f"R-hat of {worst} is {loud[worst].r_hat:.3f} (threshold {R_HAT_THRESHOLD}); {len(loud)} of "
+                f"{len(everything)} quantities are past it"
+            )
+        few = {name: min(q.ess_bulk, q.ess_tail) for name, q in everything.items()}
+        worst = min(few, key=lambda name: few[name])
+        if not few[worst] >= wanted:
+            problems.append(f"effective sample size of {worst} is {few[worst]:.0f} (threshold {wanted:.0f})")
+        if draws.divergences:
+            problems.append(f"{draws.divergences} divergent transitions")
+        converged = not problems
+    return Diagnostics(
+        alpha=alpha,
+        parameters=parameters,
+        divergences=0 if draws is None else draws.divergences,
+        null_directions=to_result(estimate.null_directions),
+        starts=len(estimate.minima.values),
+        agreeing=estimate.agreeing,
+        propagation=check,
+        model_error_variance=math.nan,
+        posterior_variance=math.nan,
+        converged=converged,
+        problems=tuple(problems),
+    )
+
+
+def _quality(draws: Tensor, names: tuple[str, ...]) -> dict[str, Quality]:
+    figures = (measure.r_hat(draws), measure.bulk_ess(draws), measure.tail_ess(draws))
+    return {name: Quality(*(float(figure[i]) for figure in figures)) for i, name in enumerate(names)}
+
+
+def _parameter_draws(propagate: NISP, samples: Tensor) -> tuple[tuple[str, ...], Tensor]:
+    """E[λ] and the lower triangle of Cov[λ] for every draw, with their names."""
+    with torch.no_grad():
+        mean, covariance = propagate.parameter_moments(samples.to(propagate.nodes))
+    names = propagate.pattern.names
+    labels = [f"E[{name}]" for name in names]
+    columns = [mean]
+    embedded = [i for i, name in enumerate(names) if name in propagate.pattern.embedded]
+    for i in embedded:
+        for j in embedded:
+            if j <= i:
+                labels.append(f"Cov[{names[i]}, {names[j]}]" if i != j else f"Var[{names[i]}]")
+                columns.append(covariance[..., i, j, None])
+    return tuple(labels), to_result(torch.cat(columns, dim=-1))
+
+
+def warn_of_chains(quality: Diagnostics) -> None:
+    """Warn where the chains have not converged, with the numbers."""
+    if quality.problems:
+        warnings.warn(
+            "The chains have not converged: " + "; ".join(quality.problems) + ". Draw more, or look at the "
+            "diagnostics before using the posterior.",
+            ConvergenceWarning,
+            stacklevel=3,
+        )
+
+
+def warn_of_tolerance(quality: Diagnostics, likelihood: likelihoods.Likelihood) -> None:
+    """Warn where the tolerance dominates: V[μ] > E[σ²], the paper's own criterion."""
+    if getattr(likelihood, "epsilon", None) is None or not quality.posterior_variance > 0:
+        return
+    if quality.posterior_variance > quality.model_error_variance:
+        warnings.warn(
+            f"The tolerance ε sets the width of the prediction: V[μ] = {quality.posterior_variance:.3g} against "
+            f"E[σ²] = {quality.model_error_variance:.3g}, means over the data. Use a smaller epsilon=, unless the "
+            "model is as good as exact.",
+            ToleranceWarning,
+            stacklevel=3,
+        )
+
+
+def warn_of_box(simulator: Simulator, propagate: NISP, alpha: Tensor) -> None:
+    """Warn where the calibrated density leaves the box that a surrogate was built on."""
+    leaves = getattr(simulator, "leaves_box", None)
+    if leaves is None:
+        return
+    num = 512
+    xi = propagate.draw_germ(num, seed=0)
+    with torch.no_grad():
+        values = propagate.with_held(propagate.parameters_at(alpha.to(propagate.nodes), xi))
+        share = float(leaves(values).to(torch.float64).mean())
+    if share > 0.05:
+        warnings.warn(
+            f"{share:.0%} of the calibrated density of the parameters lies outside the box that the surrogate was "
+            "built on. Build it on a larger box.",
+            ExtrapolationWarning,
+            stacklevel=3,
+        )
+
+
+def settings_of(propagate: NISP, fit: LeastSquares, embedding: str, seed: int, num_warmup: int) -> dict[str, Any]:
+    """What a result stores of how it was made, as plain data."""
+    choice = propagate.rule_choice
+    return {
+        "embedding": embedding,
+        "seed": seed,
+        "num_warmup": num_warmup,
+        "order": propagate.order,
+        "gauss_nodes": choice.size if choice.kind == "tensor" else None,
+        "sd_floor": propagate.sd_floor,
+        "center": fit.scaling.center.tolist(),
+        "scale": fit.scaling.scale.tolist(),
+        "log": fit.scaling.log.tolist(),
+        "fixed": dict(propagate.fixed),
+        "units": {parameter.name: parameter.unit for parameter in propagate.free},
+    }
+
+
+def mean_square(sd: Tensor) -> float:
+    """Mean of squares over the data."""
+    return float(sd.square().mean())
+
+
+def to_result(value: Tensor) -> Tensor:
+    """As numbers in results are: detached, float64, on the CPU."""
+    return value.detach().to(device="cpu", dtype=torch.float64)

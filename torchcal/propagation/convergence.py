@@ -1,0 +1,75 @@
+"""Whether output moments have converged in quadrature nodes and in the order of the expansion."""
+
+import warnings
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchcal.errors import PropagationWarning
+
+if TYPE_CHECKING:
+    from torchcal.propagation.nisp import NISP
+
+__all__ = ["PropagationCheck", "compare", "warn"]
+
+
+@dataclass(frozen=True)
+class PropagationCheck:
+    """How much the moments at some α change with a finer rule and with a longer expansion.
+
+    Attributes:
+        nodes: Number of nodes of the rule in use.
+        finer_nodes: Number of nodes of the rule that it was held against.
+        mean_change: Largest change of a mean, relative to the larger of |mean| and sd over the outputs.
+        sd_change: Largest change of an sd, on the same scale.
+        truncated: Largest share of a variance that lies in terms above ``order``; 0 for the full variance.
+    """
+
+    nodes: int
+    finer_nodes: int
+    mean_change: float
+    sd_change: float
+    truncated: float
+
+
+def compare(propagate: "NISP", alpha: Tensor) -> PropagationCheck:
+    """Moments at α against those of a finer rule, and the expansion against the full variance."""
+    finer = propagate.copy(rule=propagate.rule_choice.finer(propagate.pattern.num_germs))
+    floor = propagate.sd_floor
+    with torch.no_grad():
+        mean, variance = propagate.moments(alpha)
+        other_mean, other_variance = finer.moments(alpha)
+        truncated = 0.0
+        if propagate.order is not None and bool((propagate.weights > 0).all()):
+            whole = propagate.copy(order=None).moments(alpha)[1]
+            lost = 1 - variance / whole.clamp_min(floor**2)
+            truncated = float(torch.where(whole > floor**2, lost, 0 * lost).max())
+    scale = torch.maximum(mean.abs(), variance.sqrt()).amax(-1, keepdim=True).clamp_min(floor)
+    return PropagationCheck(
+        nodes=propagate.num_nodes,
+        finer_nodes=finer.num_nodes,
+        mean_change=float(((mean - other_mean).abs() / scale).max()),
+        sd_change=float(((variance.sqrt() - other_variance.sqrt()).abs() / scale).max()),
+        truncated=truncated,
+    )
+
+
+def warn(result: PropagationCheck, order: int | None, tolerance: float, order_tolerance: float) -> None:
+    """Warn of what has not converged, with the numbers."""
+    if not max(result.mean_change, result.sd_change) <= tolerance:
+        warnings.warn(
+            f"With {result.nodes} quadrature nodes the output's mean is off by {result.mean_change:.2g} and "
+            f"its sd by {result.sd_change:.2g} of the output's scale, against {result.finer_nodes} nodes "
+            f"(tolerance {tolerance:.0e}). Pass a larger rule= or max_nodes=.",
+            PropagationWarning,
+            stacklevel=3,
+        )
+    if result.truncated > order_tolerance:
+        warnings.warn(
+            f"An expansion of order {order} leaves out {result.truncated:.1%} of the output's variance "
+            f"(tolerance {order_tolerance:.0%}). Use order=None for the full variance.",
+            PropagationWarning,
+            stacklevel=3,
+        )
