@@ -1,0 +1,192 @@
+"""The batched sampler against exact targets: distributions, boundaries, kinks and other samplers."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torchcal.errors import ConvergenceError
+from torchcal.inference import diagnostics, nuts_step
+from torchcal.inference.batched import run_batched_nuts
+from torchcal.priors import Bounds
+
+stats = pytest.importorskip("scipy.stats")
+
+INF = math.inf
+
+
+def free(size):
+    return Bounds(torch.full((size,), -INF, dtype=torch.float64), torch.full((size,), INF, dtype=torch.float64))
+
+
+def run(log_density, size, transform=None, **options):
+    defaults = {
+        "loc": torch.zeros(size, dtype=torch.float64),
+        "scale_tril": torch.eye(size, dtype=torch.float64),
+        "num_samples": 200,
+        "num_chains": 32,
+        "num_warmup": 60,
+        "seed": 3,
+    }
+    return run_batched_nuts(log_density, transform or free(size), **{**defaults, **options})
+
+
+def independent(draws, column):
+    """Draws of one coordinate far enough apart to count as independent: tests of fit assume that they are."""
+    ess = float(diagnostics.bulk_ess(draws)[column])
+    every = max(1, math.ceil(2 * draws.shape[0] * draws.shape[1] / ess))
+    return draws[:, ::every, column].flatten().numpy()
+
+
+def test_checkpoint_tables_of_the_iterative_tree():
+    tables = nuts_step.Tables.build(4, torch.device("cpu"))
+    # Leaf 7 = 0b111 closes the subtrees of sizes 2, 4 and 8; leaf 13 = 0b1101 closes one of size 2 only.
+    assert (tables.first[7], tables.last[7]) == (0, 2)
+    assert (tables.first[13], tables.last[13]) == (2, 2)
+    # An even leaf closes nothing: the range of checkpoints is empty.
+    assert bool((tables.first[::2] > tables.last[::2]).all())
+
+
+def test_leapfrog_conserves_energy_to_second_order():
+    def potential(z):
+        return 0.25 * z.pow(4).sum(-1) + 0.5 * z.square().sum(-1), z.pow(3) + z
+
+    tables = nuts_step.Tables.build(10, torch.device("cpu"))
+    errors = []
+    for step_size in (0.02, 0.01):
+        generator = torch.Generator().manual_seed(0)
+        z = torch.full((64, 2), 1.0, dtype=torch.float64)
+        state = nuts_step.init(z, potential, step_size=step_size, tables=tables, generator=generator)
+        start = state.start_energy
+        state, _ = nuts_step.step(state, potential, step_size=step_size, tables=tables, generator=generator)
+        position, momentum, _ = state.cursor.unbind(1)
+        # After the first leaf the cursor is at an end of the tree or at a new subtree's start: use the moved ones.
+        energy = potential(position)[0] + 0.5 * momentum.square().sum(-1)
+        errors.append(float((energy - start).abs().max()))
+    # One leapfrog step errs by O(h^3).
+    assert errors[0] / errors[1] == pytest.approx(8, rel=0.3)
+
+
+def test_correlated_normal_in_the_wrong_coordinates():
+    size = 5
+    generator = torch.Generator().manual_seed(1)
+    factor = torch.randn(size, size, dtype=torch.float64, generator=generator).tril() + 2 * torch.eye(size)
+    precision = torch.linalg.inv(factor @ factor.T)
+    mean = torch.arange(size, dtype=torch.float64)
+    draws = run(lambda u: -0.5 * ((u - mean) @ precision * (u - mean)).sum(-1), size, num_warmup=150).alpha
+    flat = draws.flatten(0, 1)
+    ess = diagnostics.bulk_ess(draws)
+    sd = (factor @ factor.T).diagonal().sqrt()
+    # Five standard errors for five coordinates.
+    assert bool(((flat.mean(0) - mean).abs() < 5 * sd / ess.sqrt()).all())
+    assert float(diagnostics.r_hat(draws).max()) < 1.03
+    for i in range(size):
+        p = stats.kstest(independent(draws, i), "norm", args=(float(mean[i]), float(sd[i]))).pvalue
+        assert p > 1e-3
+
+
+@pytest.mark.parametrize(
+    ("name", "log_density", "distribution"),
+    [
+        ("student", lambda u: -3 * (1 + u.square() / 5).log().sum(-1), stats.t(5)),
+        ("laplace", lambda u: -u.abs().sum(-1), stats.laplace()),
+        ("logistic", lambda u: (-u - 2 * torch.nn.functional.softplus(-u)).sum(-1), stats.logistic()),
+        # Two humps that a trajectory can cross.
+        (
+            "mixture",
+            lambda u: torch.logaddexp(-0.5 * (u - 1.5).square(), -0.5 * (u + 1.5).square()).sum(-1),
+            None,
+        ),
+    ],
+)
+def test_shapes_that_are_not_normal(name, log_density, distribution):
+    draws = run(log_density, 2, num_samples=400).alpha
+    for i in range(2):
+        sample = independent(draws, i)
+        if distribution is not None:
+            p = stats.kstest(sample, distribution.cdf).pvalue
+        else:
+            p = stats.kstest(
+                sample, lambda v: 0.5 * (stats.norm.cdf(v, 1.5) + stats.norm.cdf(v, -1.5))
+            ).pvalue
+        assert p > 1e-3, name
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, INF), (-INF, 0.3), (-0.2, 0.5)])
+def test_a_hard_boundary_cuts_the_density_and_nothing_else(low, high):
+    transform = Bounds(torch.tensor([low], dtype=torch.float64), torch.tensor([high], dtype=torch.float64))
+
+    def log_density(u):
+        return -0.5 * transform.bound(u).square().sum(-1) + transform.log_slope(u)
+
+    draws = run(log_density, 1, transform, num_samples=400).alpha
+    assert float(draws.min()) >= low
+    assert float(draws.max()) <= high
+    exact = stats.truncnorm(low, high)
+    assert stats.kstest(independent(draws, 0), exact.cdf).pvalue > 1e-3
+
+
+def test_the_kink_of_the_residual():
+    """exp(-(σ - |μ|)² / 2ε²) has a concave kink in its exponent at μ = 0, between two humps."""
+    sigma = 0.6
+
+    def log_density(u):
+        return (-0.5 * u.square() - 0.5 * (sigma - (u.square() + 1e-6).sqrt()).square() / 0.3**2).sum(-1)
+
+    draws = run(log_density, 1, num_samples=400).alpha
+    grid = np.linspace(-8, 8, 20001)
+    density = np.exp(log_density(torch.tensor(grid)[:, None]).numpy())
+    cdf = np.cumsum(density) / density.sum()
+    assert stats.kstest(independent(draws, 0), lambda v: np.interp(v, grid, cdf)).pvalue > 1e-3
+
+
+def test_the_same_seed_gives_the_same_draws_and_leaves_the_global_state():
+    torch.manual_seed(5)
+    before = torch.random.get_rng_state()
+    options = {"num_samples": 20, "num_chains": 3, "num_warmup": 20}
+    first = run(lambda u: -0.5 * u.square().sum(-1), 2, **options).alpha
+    second = run(lambda u: -0.5 * u.square().sum(-1), 2, **options).alpha
+    assert torch.equal(first, second)
+    assert first.shape == (3, 20, 2)
+    assert torch.equal(before, torch.random.get_rng_state())
+    assert not torch.equal(first, run(lambda u: -0.5 * u.square().sum(-1), 2, **{**options, "seed": 4}).alpha)
+
+
+def test_a_density_that_is_nowhere_finite():
+    with pytest.raises(ConvergenceError, match="finite posterior"):
+        run(lambda u: u.sum(-1) * math.nan, 2)
+
+
+def test_divergences_are_counted():
+    """A cliff that no step size resolves: the density falls from 1 to 0 within 1e-9."""
+    draws = run(lambda u: -0.5 * u.square().sum(-1) - 1e13 * (u[..., 0] - 0.5).clamp_min(0), 2, num_samples=100)
+    assert draws.divergences > 0
+
+
+def test_r_hat_sees_separate_modes():
+    def two(u):
+        return torch.logaddexp(-0.5 * (u - 12).square(), -0.5 * (u + 12).square()).sum(-1)
+
+    draws = run(two, 1, scale_tril=12 * torch.eye(1, dtype=torch.float64), num_samples=100, num_chains=8).alpha
+    assert float(diagnostics.r_hat(draws)[0]) > 1.5
+
+
+def test_diagnostics_agree_with_arviz():
+    arviz = pytest.importorskip("arviz")
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(4, 500, 3, dtype=torch.float64, generator=generator)
+    draws = noise.clone()
+    for i in range(1, 500):  # autoregressive chains, one of them shifted
+        draws[:, i] = 0.7 * draws[:, i - 1] + noise[:, i]
+    draws[0, :, 2] += 1.0
+    for i in range(3):
+        values = draws[:, :, i].numpy()
+        assert float(diagnostics.r_hat(draws)[i]) == pytest.approx(float(arviz.rhat(values)), abs=2e-3)
+        if i == 2:  # chains that disagree have next to no effective draws by either estimator
+            assert float(diagnostics.bulk_ess(draws)[i]) < 150
+            continue
+        # The two estimators end the sum of autocorrelations by rules of their own.
+        assert float(diagnostics.bulk_ess(draws)[i]) == pytest.approx(float(arviz.ess(values)), rel=0.1)
+        tail = float(arviz.ess(values, method="tail"))
+        assert float(diagnostics.tail_ess(draws)[i]) == pytest.approx(tail, rel=0.2)
