@@ -38,9 +38,28 @@ SMOOTHING = 1e-3
 
 
 def _positive(value: float | Tensor, name: str) -> None:
-    number = torch.as_tensor(value, dtype=torch.float64)
+    try:
+        number = torch.as_tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise DomainError(f"Expected {name} as a positive number or a tensor of them. Got {value!r}.") from error
     if not bool((torch.isfinite(number) & (number > 0)).all()):
         raise DomainError(f"Expected {name} > 0 and finite. Got {value!r}.")
+
+
+def _check_shapes(y: Tensor, **values: Tensor | None) -> None:
+    """Raise where the last dimension is not that of the data, which broadcasting would hide."""
+    if y.ndim != 1:
+        raise ShapeError(f"Expected y of shape (n,). Got {tuple(y.shape)}.")
+    for name, value in values.items():
+        if value is not None and value.shape[-1:] != y.shape:
+            raise ShapeError(f"Expected {name} of shape (..., {len(y)}), as y. Got {tuple(value.shape)}.")
+
+
+def _tolerance(epsilon: float | Tensor, y: Tensor) -> Tensor:
+    value = torch.as_tensor(epsilon, dtype=y.dtype, device=y.device)
+    if value.ndim and value.shape != y.shape:
+        raise ShapeError(f"Expected epsilon as a number or of shape {tuple(y.shape)}. Got {tuple(value.shape)}.")
+    return value
 
 
 def abc_log_prob(
@@ -71,6 +90,7 @@ def abc_log_prob(
 
     Raises:
         DomainError: If ``epsilon`` or ``gamma`` is not positive.
+        ShapeError: If the shapes do not agree.
 
     Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eq. 24.
 
@@ -80,7 +100,8 @@ def abc_log_prob(
     """
     _positive(epsilon, "epsilon")
     _positive(gamma, "gamma")
-    epsilon = torch.as_tensor(epsilon, dtype=y.dtype, device=y.device)
+    _check_shapes(y, mean=mean, sd=sd, noise=noise)
+    epsilon = _tolerance(epsilon, y)
     squared = (mean - y).square()
     unexplained = squared if noise is None else (squared - noise.square()).clamp_min(0)
     wanted = gamma * (unexplained + (SMOOTHING * epsilon).square()).sqrt()
@@ -164,7 +185,8 @@ class ABCMean(Likelihood):
     ) -> Tensor:
         """Log-likelihood up to a constant, ``(*batch,)``. Noise adds its variance to ε²."""
         epsilon = _default_epsilon(y) if self.epsilon is None else self.epsilon
-        epsilon = torch.as_tensor(epsilon, dtype=y.dtype, device=y.device)
+        epsilon = _tolerance(epsilon, y)
+        _check_shapes(y, mean=mean, noise=noise)
         variance = epsilon.square() if noise is None else epsilon.square() + noise.square()
         return -0.5 * ((mean - y).square() / variance).sum(-1)
 
@@ -180,6 +202,7 @@ class GaussianMarginal(Likelihood):
 
     def log_prob(self, y: Tensor, mean: Tensor, sd: Tensor, noise: Tensor | None = None) -> Tensor:
         """Normalised log-likelihood, ``(*batch,)``."""
+        _check_shapes(y, mean=mean, sd=sd, noise=noise)
         variance = sd.square() if noise is None else sd.square() + noise.square()
         return _normal_log_prob(y, mean, variance)
 
@@ -195,6 +218,7 @@ class Additive(Likelihood):
         self, y: Tensor, mean: Tensor, log_sigma: Tensor, noise: Tensor | None = None
     ) -> Tensor:
         """Normalised log-likelihood, ``(*batch,)``, of λ and ln σ, ``(*batch,)``."""
+        _check_shapes(y, mean=mean, noise=noise)
         variance = (2 * log_sigma).exp().unsqueeze(-1).expand(mean.shape)
         return _normal_log_prob(y, mean, variance if noise is None else variance + noise.square())
 
@@ -219,6 +243,7 @@ class Marginal(Likelihood):
 
     def log_prob(self, y: Tensor, samples: Tensor, noise: Tensor | None = None) -> Tensor:
         """Log-likelihood, ``(*batch,)``, from samples ``(*batch, S, n)``."""
+        _check_shapes(y, samples=samples, noise=noise)
         count = samples.shape[-2]
         relative = self.bandwidth or (4 / (3 * count)) ** 0.2
         variance = samples.var(-2, keepdim=True) * relative**2 + _TINY_VARIANCE
@@ -268,6 +293,7 @@ class Full(Likelihood):
 
     def log_prob(self, y: Tensor, samples: Tensor, noise: Tensor | None = None) -> Tensor:
         """Log-likelihood, ``(*batch,)``, from samples ``(*batch, S, n)``."""
+        _check_shapes(y, samples=samples, noise=noise)
         count, n = samples.shape[-2:]
         relative = self.bandwidth or (4 / (count * (n + 2))) ** (1 / (n + 4))
         offset = samples - samples.mean(-2, keepdim=True)
@@ -317,8 +343,6 @@ def get(likelihood: str | Likelihood) -> Likelihood:
 
 
 def _normal_log_prob(y: Tensor, mean: Tensor, variance: Tensor) -> Tensor:
-    if mean.shape[-1:] != y.shape:
-        raise ShapeError(f"Expected moments (*batch, {len(y)}) to match y. Got {tuple(mean.shape)}.")
     return -0.5 * ((mean - y).square() / variance + (2 * math.pi * variance).log()).sum(-1)
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchcal import polychaos
-from torchcal.errors import ShapeError
+from torchcal.errors import DomainError, ShapeError
 from torchcal.propagation import NISP
 
 __all__ = [
@@ -92,7 +92,7 @@ def embedded_prediction(propagate: NISP, alpha_map: Tensor, draws: Tensor | None
         at_map = _moments(propagate, alpha_map.to(like))
         if draws is None:
             return Prediction(propagate.x, at_map.mean, at_map.sd, at_map.sd, None, at_map, None, None)
-        mean, variance = propagate.moments(draws.to(like))
+        mean, variance = _mean_and_variance(propagate, draws.to(like))
         posterior_mean = mean.mean(0)
         model_error = variance.mean(0)
         parameter = mean.var(0, unbiased=False)
@@ -137,11 +137,16 @@ def additive_prediction(
     )
 
 
+def _mean_and_variance(propagate: NISP, alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """Moments of the outputs; without model error the variance is zero."""
+    if propagate.pattern.num_germs:
+        return propagate.moments(alpha)
+    mean = propagate.mean(alpha)
+    return mean, torch.zeros_like(mean)
+
+
 def _moments(propagate: NISP, alpha: Tensor) -> Moments:
-    if propagate.pattern.num_germs == 0:
-        mean = propagate.mean(alpha)
-        return Moments(_result(mean), _result(0 * mean))
-    mean, variance = propagate.moments(alpha)
+    mean, variance = _mean_and_variance(propagate, alpha)
     return Moments(_result(mean), _result(variance.sqrt()))
 
 
@@ -165,6 +170,10 @@ def parameter_density(propagate: NISP, alpha: Tensor, points: Tensor, *, seed: i
 
     Returns:
         ``(M,)``, per unit of the product of the parameters' units.
+
+    Raises:
+        ShapeError: If the points do not have one column for each free parameter.
+        DomainError: If a parameter has one value only, and therefore no density.
     """
     if points.ndim != 2 or points.shape[1] != len(propagate.free):
         raise ShapeError(
@@ -204,9 +213,18 @@ def kernel_density(draws: Tensor, points: Tensor) -> Tensor:
 
     Returns:
         ``(M,)``.
+
+    Raises:
+        DomainError: If a column is constant.
     """
     count, size = draws.shape
-    center, scale = draws.mean(0), draws.std(0).clamp_min(1e-300)
+    center, scale = draws.mean(0), draws.std(0)
+    still = scale <= 1e-12 * center.abs()  # equal numbers, but for the rounding of their mean
+    if bool(still.any()):
+        raise DomainError(
+            f"Expected draws that vary in every column. Got the value {float(center[still][0]):.6g} alone in column "
+            f"{int(still.nonzero()[0])}: a parameter without spread has no density."
+        )
     z = (draws - center) / scale
     covariance = z.T @ z / (count - 1) + 1e-10 * torch.eye(size, dtype=draws.dtype)
     factor = torch.linalg.cholesky(covariance) * (4 / (count * (size + 2))) ** (1 / (size + 4))
@@ -241,10 +259,21 @@ def scores(y: Tensor, moments: Moments, *, noise: Tensor | None = None, level: f
         y: The data.
         moments: Predicted mean and sd.
         noise: Sd of the measurement noise, added in square.
-        level: Nominal coverage.
+        level: Nominal coverage, between 0 and 1.
+
+    Raises:
+        ShapeError: If data and moments differ in shape.
+        DomainError: If the level is not between 0 and 1, or neither moments nor noise have a spread.
     """
+    y = torch.as_tensor(y, dtype=torch.float64)
+    if y.shape != moments.mean.shape:
+        raise ShapeError(f"Expected y of shape {tuple(moments.mean.shape)}, as the mean. Got {tuple(y.shape)}.")
+    if not 0 < level < 1:
+        raise DomainError(f"Expected level between 0 and 1. Got {level!r}.")
     error = y - moments.mean
     sd = moments.sd if noise is None else (moments.sd.square() + noise.square()).sqrt()
+    if not bool((sd > 0).all()):
+        raise DomainError("Expected sd > 0 for a log score. Got 0. Give noise=, or compare the means by themselves.")
     quantile = math.sqrt(2) * float(torch.erfinv(torch.tensor(level, dtype=torch.float64)))
     z = error / sd
     log_score = (-0.5 * z.square() - sd.log()).mean() - 0.5 * math.log(2 * math.pi)

@@ -75,7 +75,8 @@ class Bounds(Transform):
             return alpha
         low, high = self._low.to(alpha), self._high.to(alpha)
         both, only_low, only_high = self._cases(alpha)
-        share = ((alpha - low) / torch.where(both, high - low, torch.ones_like(low))).clamp(1e-9, 1 - 1e-9)
+        inside = max(1e-9, torch.finfo(alpha.dtype).eps)
+        share = ((alpha - low) / torch.where(both, high - low, torch.ones_like(low))).clamp(inside, 1 - inside)
         value = torch.where(both, share.logit(), alpha)
         value = torch.where(only_low, _inverse_softplus((alpha - low).clamp_min(1e-9)), value)
         return torch.where(only_high, -_inverse_softplus((high - alpha).clamp_min(1e-9)), value)
@@ -244,6 +245,12 @@ class Uniform(CoefficientPrior):
         high = torch.where(torch.isfinite(high), high, torch.maximum(width, low + 2 * width))
         super().__init__(low, high, center, scale)
 
+    def sample(self, sample_shape: _Shape = ()) -> Tensor:
+        """Draws, ``(*sample_shape, P)``."""
+        shape = self._extended_shape(torch.Size(sample_shape))
+        uniform = torch.rand(shape, dtype=self.low.dtype, device=self.low.device)
+        return self.low + uniform * (self.high - self.low)
+
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density, ``(*batch,)``."""
         return super().log_prob(value) - (self.high - self.low).log().sum()
@@ -270,10 +277,21 @@ class Normal(CoefficientPrior):
                 f"Expected loc and scale as numbers or of shape {tuple(low.shape)}. Got "
                 f"{tuple(torch.as_tensor(loc).shape)} and {tuple(torch.as_tensor(scale).shape)}."
             ) from error
+        if not bool(torch.isfinite(self.loc).all()):
+            raise DomainError(f"Expected a finite loc. Got {loc!r}.")
         if not bool((torch.isfinite(self.scale) & (self.scale > 0)).all()):
             raise DomainError(f"Expected scale > 0 and finite. Got {scale!r}.")
         super().__init__(low, high, self.loc, self.scale)
         self.symmetric = bool((self.loc[~propagate.pattern.leading.to(low.device)] == 0).all())
+
+    def sample(self, sample_shape: _Shape = ()) -> Tensor:
+        """Draws, ``(*sample_shape, P)``."""
+        shape = self._extended_shape(torch.Size(sample_shape))
+        uniform = torch.rand(shape, dtype=torch.float64, device=self.low.device)
+        ends = torch.stack([self.low, self.high])
+        below, above = torch.special.ndtr(((ends - self.loc) / self.scale).double())
+        z = torch.special.ndtri((below + uniform * (above - below)).clamp(1e-300, 1 - 1e-16)).to(self.low)
+        return torch.maximum(torch.minimum(self.loc + self.scale * z, self.high), self.low)
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density up to the constant of the cut, ``(*batch,)``."""

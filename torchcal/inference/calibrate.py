@@ -27,6 +27,7 @@ from torchcal.inference.summary import (
 )
 from torchcal.prediction import embedded_prediction
 from torchcal.priors import Flat
+from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results import Calibration, MapEstimate
 from torchcal.simulators import Simulator
 
@@ -117,7 +118,6 @@ def calibrate(
     )
     estimate = maximise(problem, fit.scaled, starts=starts, num_starts=num_starts, seed=seed)
     propagate = problem.propagate
-    check = propagate.check(estimate.alpha) if propagate.pattern.num_germs else None
     draws: Draws | None = None
     samples: Tensor | None = None
     if num_samples:
@@ -127,13 +127,15 @@ def calibrate(
         samples = draws.alpha
         if problem.prior.symmetric:
             samples = propagate.pattern.flip(samples, estimate.alpha.to(samples))
+    check = _check_propagation(propagate, estimate.alpha, samples)
     prediction = embedded_prediction(propagate, estimate.alpha, None if samples is None else samples.flatten(0, 1))
     quality = diagnose(estimate, draws, samples, propagate, propagate.alpha_names, check)
     posterior = math.nan if prediction.sd_posterior is None else mean_square(prediction.sd_posterior)
     quality = dataclasses.replace(
         quality, model_error_variance=mean_square(prediction.sd_model_error), posterior_variance=posterior
     )
-    warn_of_tolerance(quality, problem.likelihood)
+    if propagate.pattern.num_germs:
+        warn_of_tolerance(quality, problem.likelihood)
     warn_of_box(simulator, propagate, estimate.alpha)
     warn_of_chains(quality)
     mean, covariance = propagate.parameter_moments(estimate.alpha)
@@ -154,3 +156,13 @@ def calibrate(
         propagate=propagate,
         settings=settings_of(propagate, fit, type(embedding).__name__, seed, num_warmup),
     )
+
+
+def _check_propagation(propagate: NISP, alpha: Tensor, samples: Tensor | None) -> PropagationCheck | None:
+    """Convergence of the moments at the MAP and at a few draws."""
+    if propagate.pattern.num_germs == 0:
+        return None
+    points = alpha[None]
+    if samples is not None:
+        points = torch.cat([points, samples[:8, -1].to(points)])
+    return propagate.check(points)

@@ -20,6 +20,9 @@ behind the Hessian are good to about 1e-9 of its largest entry."""
 AGREEMENT = 1e-6
 """Relative difference of objectives up to which two starts count as the same maximum."""
 
+SAME_MEANS = 1e-3
+"""Difference of scaled means up to which two starts ended at one maximum."""
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -29,8 +32,9 @@ class Estimate:
         alpha: MAP, ``(P,)``.
         objective: Negative log-likelihood there.
         posterior_objective: Negative log-posterior there, what was minimised.
-        minima: All starts.
+        starts: Number of starts.
         agreeing: Number of starts that reached the best objective.
+        ties: Number of different densities of λ that reach it: a symmetry of model and data makes more than one.
         null_directions: Unit vectors in α along which the log-posterior does not change, ``(k, P)``.
         curvature: Hessian of the negative log-posterior in α, ``(P, P)``.
     """
@@ -38,8 +42,9 @@ class Estimate:
     alpha: Tensor
     objective: float
     posterior_objective: float
-    minima: Minima
+    starts: int
     agreeing: int
+    ties: int
     null_directions: Tensor
     curvature: Tensor
 
@@ -89,18 +94,19 @@ def maximise(
             f"Expected a finite posterior at some starting point. Got none at {len(starts)}. Check the "
             "simulator over the parameters' ranges, or pass starts=."
         )
-    if problem.propagate.pattern.num_germs and problem.propagate.refine(
-        transform.bound(found.points[:1])[..., : problem.propagate.num_alpha]
-    ):
-        found = minimise(objective, found.points[: max(4, len(found.points) // 4)])
-    best = transform.bound(found.points[0])
-    scale = 1 + float(found.values[0].abs())
-    agreeing = int((found.values - found.values[0] <= AGREEMENT * scale).sum())
-    if agreeing < 2 <= len(found.values):
-        runner_up = float(found.values[1])
+    agreeing = _agreeing(found)
+    total = len(found.values)
+    if problem.propagate.pattern.num_germs:
+        for _ in range(4):  # a maximum found with too few nodes may move with more of them
+            best = transform.bound(found.points[:1])[..., : problem.propagate.num_alpha]
+            if not problem.propagate.refine(best):
+                break
+            found = minimise(objective, found.points[: max(4, total // 4)])
+    best, ties = _first_of_the_tied(problem, found)
+    if agreeing < 2 <= total:
         warnings.warn(
-            f"Only 1 of {len(found.values)} starts reached the best objective {float(found.values[0]):.6g}; the "
-            f"next ended at {runner_up:.6g}. The maximum may not be the global one. Raise num_starts=.",
+            f"Only 1 of {total} starts reached the best objective {float(found.values[0]):.6g}; the next ended at "
+            f"{float(found.values[1]):.6g}. The maximum may not be the global one. Raise num_starts=.",
             ConvergenceWarning,
             stacklevel=3,
         )
@@ -113,11 +119,36 @@ def maximise(
         alpha=best,
         objective=-likelihood,
         posterior_objective=float(found.values[0]),
-        minima=Minima(transform.bound(found.points), found.values, found.converged, found.iterations),
+        starts=total,
         agreeing=agreeing,
+        ties=ties,
         null_directions=null,
         curvature=curvature,
     )
+
+
+def _agreeing(found: Minima) -> int:
+    scale = 1 + float(found.values[0].abs())
+    return int((found.values - found.values[0] <= AGREEMENT * scale).sum())
+
+
+def _first_of_the_tied(problem: Problem, found: Minima) -> tuple[Tensor, int]:
+    """One of the densities that tie for the best objective, the same from any seed, and how many there are.
+
+    The tie is broken by the larger mean of the first parameter in which they differ.
+    """
+    propagate = problem.propagate
+    tied = found.points[found.values - found.values[0] <= 1e-9 * (1 + found.values[0].abs())]
+    alpha = problem.prior.transform.bound(tied)
+    means = alpha[:, : propagate.num_alpha][:, propagate.pattern.leading]
+    best, different = 0, [0]
+    for i in range(1, len(means)):
+        if all(bool(((means[i] - means[j]).abs() > SAME_MEANS).any()) for j in different):
+            different.append(i)
+        apart = ((means[i] - means[best]).abs() > SAME_MEANS).nonzero()
+        if len(apart) and bool(means[i, apart[0, 0]] > means[best, apart[0, 0]]):
+            best = i
+    return alpha[best], len(different)
 
 
 def _inside(problem: Problem, alpha: Tensor) -> Tensor:

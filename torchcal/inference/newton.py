@@ -25,13 +25,11 @@ class Minima:
     Attributes:
         points: ``(S, P)``.
         values: Objective there, ``(S,)``; +inf where it was never finite.
-        converged: Whether the start stopped by itself, ``(S,)`` bool.
         iterations: Iterations of the longest run.
     """
 
     points: Tensor
     values: Tensor
-    converged: Tensor
     iterations: int
 
 
@@ -126,9 +124,9 @@ def minimise(
             progress(iteration, values)
     for _ in range(len(points)):  # a leader may itself have joined another
         leader = leader[leader]
-    points, values, active = points[leader], values[leader], active[leader]
+    points, values = points[leader], values[leader]
     order = values.argsort(stable=True)
-    return Minima(points[order], values[order], ~active[order] & torch.isfinite(values[order]), iteration)
+    return Minima(points[order], values[order], iteration)
 
 
 def _join(values: Tensor, active: Tensor, leader: Tensor) -> None:

@@ -210,6 +210,7 @@ def embedded_problem(
         scaling=fit.scaling,
         order=order,
         rule=rule,
+        trial_spread=0.2,  # enough to start with: the rule is refined at the maximum
     )
     germs = propagate.pattern.num_germs
     if germs == 0 and likelihood.needs != "mean":

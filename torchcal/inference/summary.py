@@ -15,7 +15,7 @@ from torchcal.inference.estimate import Estimate
 from torchcal.inference.setup import LeastSquares
 from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results import Diagnostics, Quality
-from torchcal.results.diagnostics import ESS_THRESHOLD, R_HAT_THRESHOLD
+from torchcal.results.diagnostics import ESS_THRESHOLD, r_hat_threshold
 from torchcal.simulators import Simulator
 
 __all__ = [
@@ -49,11 +49,12 @@ def diagnose(
             parameters = _quality(moments, labels)
         everything = {**alpha, **parameters}
         wanted = min(ESS_THRESHOLD, samples.shape[0] * samples.shape[1] / 4)
-        loud = {name: q for name, q in everything.items() if not q.r_hat <= R_HAT_THRESHOLD}
+        limit = r_hat_threshold(samples.shape[1])
+        loud = {name: q for name, q in everything.items() if not q.r_hat <= limit}
         if loud:
             worst = max(loud, key=lambda name: loud[name].r_hat if loud[name].r_hat == loud[name].r_hat else 9e9)
             problems.append(
-                f"R-hat of {worst} is {loud[worst].r_hat:.3f} (threshold {R_HAT_THRESHOLD}); {len(loud)} of "
+                f"R-hat of {worst} is {loud[worst].r_hat:.3f} (threshold {limit:.3f}); {len(loud)} of "
                 f"{len(everything)} quantities are past it"
             )
         few = {name: min(q.ess_bulk, q.ess_tail) for name, q in everything.items()}
@@ -68,8 +69,9 @@ def diagnose(
         parameters=parameters,
         divergences=0 if draws is None else draws.divergences,
         null_directions=to_result(estimate.null_directions),
-        starts=len(estimate.minima.values),
+        starts=estimate.starts,
         agreeing=estimate.agreeing,
+        ties=estimate.ties,
         propagation=check,
         model_error_variance=math.nan,
         posterior_variance=math.nan,

@@ -105,7 +105,7 @@ def surface(
     ax.set_zlabel(style.label(shown[2], units, labels))
     ax.tick_params(labelsize="small", pad=1)
     for axis in (ax.xaxis, ax.yaxis, ax.zaxis):
-        axis.set_major_locator(MaxNLocator(5))
+        axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
         axis.pane.set_visible(False)
         axis._axinfo["grid"].update(linewidth=0.3, color="0.8")
     ax.view_init(elev=22, azim=-55)

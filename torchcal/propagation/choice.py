@@ -76,11 +76,12 @@ def _by_trial(propagate: "NISP", counts: list[int]) -> RuleChoice:
 
 
 def _trial_alpha(propagate: "NISP") -> Tensor:
-    """Densities to try a rule on: 3 sd reach a bound, or 1 sd is one unit of scale where there is none."""
+    """Densities to try a rule on; for a trial spread of 1, 3 sd reach a bound, or 1 sd is one unit of scale."""
     low, high = propagate.scaling.bounds(propagate.free)
     spread = torch.where(torch.isfinite(low) & torch.isfinite(high), 1 / 3, 1.0).to(torch.float64)
     generator = torch.Generator().manual_seed(0)
     first_order = propagate.pattern.indices[propagate.pattern.columns].sum(-1) == 1
     size = torch.where(first_order, 1.0, 0.1).to(torch.float64) * spread[propagate.pattern.rows]
+    size = propagate.trial_spread * size
     noise = torch.rand(3, propagate.num_alpha, generator=generator, dtype=torch.float64) * 0.5 + 0.5
     return noise * size

@@ -43,6 +43,8 @@ class NISP(nn.Module):
         rule: Quadrature nodes and weights; a number of Gauss nodes per germ; or None to find enough by itself
             (exact where the simulator is a polynomial of known degree).
         max_nodes: Most nodes that are chosen by itself.
+        trial_spread: Width of the densities on which enough nodes are found: with 1, three sd of a parameter reach
+            its bounds, or one sd is one unit of scale where it has none.
         sd_floor: δ in :math:`\sqrt{\sigma^2 + \delta^2}`, which keeps the gradient finite at zero spread; in
             the outputs' unit. The default is below any figure a user reads.
         max_elements: Batch × nodes × outputs evaluated at once. Larger work is cut into pieces, whose
@@ -80,6 +82,7 @@ class NISP(nn.Module):
         order: int | None = None,
         rule: polychaos.Rule | RuleChoice | int | None = None,
         max_nodes: int = 4096,
+        trial_spread: float = 1.0,
         sd_floor: float = 1e-8,
         max_elements: int = 2**24,
     ) -> None:
@@ -97,6 +100,7 @@ class NISP(nn.Module):
         self.outputs = None if outputs is None else tuple(outputs)
         self.order = order
         self.max_nodes = max_nodes
+        self.trial_spread = trial_spread
         self.sd_floor = float(sd_floor)
         self.max_elements = int(max_elements)
         self._x_names = tuple(x) if isinstance(x, Mapping) else None
@@ -264,6 +268,7 @@ class NISP(nn.Module):
             "order": self.order,
             "rule": self._choice,
             "max_nodes": self.max_nodes,
+            "trial_spread": self.trial_spread,
             "sd_floor": self.sd_floor,
             "max_elements": self.max_elements,
         }
@@ -292,7 +297,7 @@ class NISP(nn.Module):
             convergence.warn(result, self.order, tolerance, order_tolerance)
         return result
 
-    def refine(self, alpha: Tensor, *, tolerance: float = 1e-9) -> bool:
+    def refine(self, alpha: Tensor, *, tolerance: float = 1e-7) -> bool:
         """Take more nodes until the moments at α settle. Returns whether the rule has changed."""
         changed = False
         germs = self.pattern.num_germs

@@ -81,7 +81,8 @@ class Calibration(_Printing):
 
         Args:
             x: Conditions, ``(n,)`` or a dict of them, arrays of any kind; the data's by default.
-            function: ``function(x, p)`` of the same parameters, for another quantity of interest.
+            function: ``function(x, p)`` of the same parameters, for another quantity of interest; its conditions
+                may have other names than the data's.
             max_draws: At most this many draws, evenly spaced, are averaged over.
         """
         if self.propagate is None:
@@ -105,10 +106,12 @@ class Calibration(_Printing):
             )
         if x is None and function is None:
             return self.propagate
-        where = self.propagate.x if x is None else conditions(x, self.recording)
+        where = self.propagate.x if x is None else conditions(x, None if function else self.recording)
         if function is None:
             return self.propagate.at(where)
-        return self.propagate.at(where, simulator=Simulator(function, self.propagate.simulator.parameters))
+        other = self.propagate.at(where, simulator=Simulator(function, self.propagate.simulator.parameters))
+        other.refine(self.map.alpha.to(other.nodes))
+        return other
 
     def sample_outputs(self, num: int, x: Any = None, *, kind: str = "posterior", seed: int = 0) -> Tensor:
         """Draws from the output's predictive distribution, ``(num, n)``.
@@ -267,7 +270,7 @@ class AdditiveCalibration(_Printing):
             return self.stored
         propagate = self._propagation()
         if x is not None or function is not None:
-            where = propagate.x if x is None else conditions(x, self.recording)
+            where = propagate.x if x is None else conditions(x, None if function else self.recording)
             other = None if function is None else Simulator(function, propagate.simulator.parameters)
             propagate = propagate.at(where, simulator=other)
         return additive_prediction(
@@ -336,9 +339,12 @@ def thin(draws: Tensor | None, most: int) -> Tensor | None:
     return draws[torch.linspace(0, len(draws) - 1, most).round().long()]
 
 
-def conditions(x: Any, recording: Recording) -> Conditions:
-    """New conditions as float64 tensors, with the names of the recording's."""
-    wanted = tuple(recording.x) if isinstance(recording.x, Mapping) else None
+def conditions(x: Any, recording: Recording | None) -> Conditions:
+    """New conditions as float64 tensors, with the names of the recording's where there is one."""
+    if recording is None:
+        wanted = tuple(x) if isinstance(x, Mapping) else None
+    else:
+        wanted = tuple(recording.x) if isinstance(recording.x, Mapping) else None
     if wanted is None:
         if isinstance(x, Mapping):
             raise DomainError(f"Expected conditions as one array, as in the recording. Got a dict {list(x)}.")
@@ -355,13 +361,15 @@ def conditions(x: Any, recording: Recording) -> Conditions:
 
 
 def _vector(value: Any, name: str) -> Tensor:
-    array = torch.as_tensor(value, dtype=torch.float64).detach()
+    try:
+        array = torch.as_tensor(value, dtype=torch.float64).detach()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise DomainError(f"Expected condition {name!r} as numbers of shape (n,). Got {value!r}.") from error
     if array.ndim == 0:
         array = array[None]
     if array.ndim != 1 or not bool(torch.isfinite(array).all()):
-        raise DomainError(
-            f"Expected condition {name!r} as finite numbers of shape (n,). Got shape {tuple(array.shape)}."
-        )
+        what = f"shape {tuple(array.shape)}" if array.ndim != 1 else "values that are not finite"
+        raise DomainError(f"Expected condition {name!r} as finite numbers of shape (n,). Got {what}.")
     return array
 
 

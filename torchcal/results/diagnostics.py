@@ -7,10 +7,10 @@ from torch import Tensor
 
 from torchcal.propagation import PropagationCheck
 
-__all__ = ["ESS_THRESHOLD", "R_HAT_THRESHOLD", "Diagnostics", "Quality", "table"]
+__all__ = ["ESS_THRESHOLD", "R_HAT_THRESHOLD", "Diagnostics", "Quality", "r_hat_threshold", "table"]
 
 R_HAT_THRESHOLD = 1.01
-"""Largest R-hat that passes (Vehtari et al. 2021)."""
+"""Largest R-hat that passes for chains of 400 draws or more (Vehtari et al. 2021)."""
 
 ESS_THRESHOLD = 400.0
 """Smallest effective sample size that passes: 100 a chain for four chains (Vehtari et al. 2021). Fewer draws than
@@ -43,6 +43,7 @@ class Diagnostics:
         null_directions: Unit vectors in α that the data do not see, ``(k, P)``.
         starts: Number of optimiser starts.
         agreeing: Number of them that reached the best objective.
+        ties: Number of different densities of λ that reach it; more than one where model and data have a symmetry.
         propagation: How far quadrature and expansion have converged at the MAP.
         model_error_variance: E[σ²], mean over the data (Eq. 32).
         posterior_variance: V[μ], mean over the data; NaN without draws.
@@ -56,6 +57,7 @@ class Diagnostics:
     null_directions: Tensor
     starts: int
     agreeing: int
+    ties: int
     propagation: PropagationCheck | None
     model_error_variance: float
     posterior_variance: float
@@ -78,6 +80,8 @@ class Diagnostics:
 
     def __str__(self) -> str:
         lines = [f"starts that agree: {self.agreeing} of {self.starts}"]
+        if self.ties > 1:
+            lines.append(f"different maxima of the same objective: {self.ties}")
         if len(self.null_directions):
             lines.append(f"directions that the data do not see: {len(self.null_directions)}")
         if self.alpha:
@@ -89,6 +93,18 @@ class Diagnostics:
             lines.append(f"divergences: {self.divergences}")
         lines.extend(f"problem: {problem}" for problem in self.problems)
         return "\n".join(lines)
+
+
+def r_hat_threshold(num_draws: int) -> float:
+    """Largest R-hat that passes.
+
+    Chains of n independent draws have, split in halves, an R-hat of about √(1 + 2/n) by chance alone; twice that
+    variance is allowed for the worst of many quantities where chains are short.
+
+    >>> r_hat_threshold(1000)
+    1.01
+    """
+    return max(R_HAT_THRESHOLD, (1 + 4 / max(num_draws, 1)) ** 0.5)
 
 
 def table(header: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
