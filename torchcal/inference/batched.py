@@ -40,7 +40,8 @@ class _DualAveraging:
         self.count += 1
         share = 1 / (self.count + 10)
         self.error = (1 - share) * self.error + share * (self.target - accept)
-        self.log_step = self.center - math.sqrt(self.count) / 0.05 * self.error
+        wanted = self.center - math.sqrt(self.count) / 0.05 * self.error
+        self.log_step += min(max(wanted - self.log_step, -0.7), 0.7)
         decay = self.count**-0.75
         self.averaged = decay * self.log_step + (1 - decay) * self.averaged
 
@@ -133,7 +134,10 @@ def run_batched_nuts(
     try:
         for number, share in enumerate(_WINDOWS):
             length = max(4, round(share * num_warmup))
-            pooled, z = _adapt(space, z, averaging, length, tables, generator, bar)
+            # Short trees at first: a step size that starts far too small must not cost thousands of gradients.
+            depth = min(max_tree_depth, 6) if number == 0 else max_tree_depth
+            window = nuts_step.Tables.build(depth, device)
+            pooled, z = _adapt(space, z, averaging, length, window, generator, bar)
             if number < len(_WINDOWS) - 1:
                 other, _ = space.refined(pooled)
                 z = space.moved(z, other)
@@ -203,6 +207,8 @@ def _adapt(
     )
     finished = shown = 0
     pooled: list[Tensor] = []
+    accepted: list[Tensor] = []
+    waiting = 0
     while finished < length * chains:
         state, outcome = nuts_step.step(
             state, space.potential, step_size=averaging.step_size, tables=tables, generator=generator
@@ -211,7 +217,14 @@ def _adapt(
         if not count:
             continue
         finished += count
-        averaging.update(float(outcome.accept[outcome.done].mean()))
+        waiting += count
+        accepted.append(outcome.accept[outcome.done])
+        # One update for every half of the crowd: a step size is judged by trajectories that used it, not by those
+        # still on the way from before, and short ones do not count more than long ones.
+        if 2 * waiting >= chains:
+            averaging.update(float(torch.cat(accepted).mean()))
+            accepted.clear()
+            waiting = 0
         if finished > length * chains // 2:
             pooled.append(outcome.position[outcome.done])
         bar.update(finished // chains - shown)

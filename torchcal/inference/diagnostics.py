@@ -46,6 +46,7 @@ def _ess(draws: Tensor, values: Tensor) -> Tensor:
     split = torch.cat([values[:, :half], values[:, -half:]])
     total = float(draws.shape[0] * draws.shape[1])
     found = torch.nan_to_num(effective_sample_size(split), nan=total, posinf=total)
+    found = found.clamp_min(1.0)  # the estimate from a few draws can be negative
     return _where_varying(draws, found, total)
 
 

@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcal import embeddings, likelihoods
+from torchcal import embeddings, likelihoods, polychaos
 from torchcal.data import Recording
-from torchcal.errors import DomainError, MissingDependencyError, TorchcalError
+from torchcal.errors import DomainError, EmbeddingError, MissingDependencyError, TorchcalError
 from torchcal.prediction import AdditivePrediction, Moments, Prediction
-from torchcal.propagation import NISP, PropagationCheck
+from torchcal.propagation import NISP, PropagationCheck, RuleChoice
 from torchcal.results.diagnostics import Diagnostics, Quality
 from torchcal.results.estimate import MapEstimate
 from torchcal.simulators import Scaling, Simulator
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 __all__ = ["additive_tree", "calibration_tree", "read_additive", "read_calibration", "to_arviz", "write"]
 
 FORMAT = 1
+
+_NAME = "torchcal_name"
+"""Attribute of a variable that could not be stored under its own name."""
 
 
 def _xarray() -> Any:
@@ -165,6 +168,17 @@ def _dataset(values: Mapping[str, tuple[Any, Tensor]]) -> Any:
     return _xarray().Dataset({name: (dims, value.numpy()) for name, (dims, value) in values.items()})
 
 
+def _named_dataset(dimension: str, values: Mapping[str, Tensor]) -> Any:
+    """A dataset of variables with a user's names, changed where a file cannot have them."""
+    variables: dict[str, Any] = {}
+    for name, value in values.items():
+        key = name.replace("/", "|")
+        while key == dimension or key in variables or (key != name and key in values):
+            key += "_"
+        variables[key] = (dimension, value.numpy(), {} if key == name else {_NAME: name})
+    return _xarray().Dataset(variables)
+
+
 def _common_groups(result: Any) -> dict[str, Any]:
     xarray = _xarray()
     estimate = result.map
@@ -190,9 +204,9 @@ def _common_groups(result: Any) -> dict[str, Any]:
     recording = result.recording
     count = recording.n
     outputs = recording.split(recording.y)
-    groups["observed_data"] = _dataset({name: ("condition", value) for name, value in outputs.items()})
+    groups["observed_data"] = _named_dataset("condition", outputs)
     x = recording.x if isinstance(recording.x, Mapping) else {"x": recording.x}
-    groups["constant_data"] = _dataset({name: ("condition", value) for name, value in x.items()})
+    groups["constant_data"] = _named_dataset("condition", x)
     if isinstance(recording.noise, Tensor):
         groups["noise"] = _dataset({"sd": ("datum", recording.noise)})
     if len(result.diagnostics.null_directions):
@@ -208,10 +222,13 @@ def _tree(groups: dict[str, Any], result: Any, extra: Mapping[str, Any]) -> Any:
     diagnostics = asdict(result.diagnostics)
     del diagnostics["null_directions"]
     recording = result.recording
+    settings = dict(result.settings)
+    if result.propagate is not None and result.propagate.rule_choice.kind != "tensor":
+        settings["rule"] = _rule_fields(result.propagate.rule_choice)
     meta = {
         **extra,
         "format": FORMAT,
-        "settings": dict(result.settings),
+        "settings": settings,
         "diagnostics": diagnostics,
         "recording": {
             "named": isinstance(recording.x, Mapping),
@@ -223,6 +240,13 @@ def _tree(groups: dict[str, Any], result: Any, extra: Mapping[str, Any]) -> Any:
     tree = _xarray().DataTree.from_dict({f"/{name}": group for name, group in groups.items()})
     tree.attrs["torchcal"] = json.dumps(meta)
     return tree
+
+
+def _rule_fields(choice: RuleChoice) -> dict[str, Any]:
+    spec: dict[str, Any] = {"kind": choice.kind, "size": choice.size, "seed": choice.seed}
+    if choice.given is not None:
+        spec |= {"nodes": choice.given.nodes.tolist(), "weights": choice.given.weights.tolist()}
+    return spec
 
 
 def _plain_fields(item: Any) -> dict[str, Any]:
@@ -249,7 +273,7 @@ def _read(path: str | os.PathLike[str], kind: str) -> tuple[dict[str, dict[str, 
         meta = json.loads(tree.attrs["torchcal"])
         groups = {
             name: {
-                key: torch.from_numpy(np.array(value.values, dtype=np.float64))
+                str(value.attrs.get(_NAME, key)): torch.from_numpy(np.array(value.values, dtype=np.float64))
                 for key, value in node.data_vars.items()
             }
             for name, node in tree.children.items()
@@ -294,7 +318,7 @@ def _propagation(
         torch.tensor(settings["scale"], dtype=torch.float64),
         torch.tensor(settings["log"]),
     )
-    return NISP(
+    propagate = NISP(
         simulator,
         embedding,
         recording.x,
@@ -303,8 +327,22 @@ def _propagation(
         scaling=scaling,
         order=settings["order"],
         sd_floor=settings["sd_floor"],
-        rule=settings["gauss_nodes"],
+        rule=_rule(settings["rule"]) if "rule" in settings else settings["gauss_nodes"],
     )
+    if propagate.pattern.names != tuple(meta["parameter_names"]):
+        raise EmbeddingError(
+            f"Expected the simulator of this calibration, with the free parameters {meta['parameter_names']}. Got "
+            f"{list(propagate.pattern.names)}."
+        )
+    return propagate
+
+
+def _rule(spec: Mapping[str, Any]) -> RuleChoice:
+    given = None
+    if "nodes" in spec:
+        nodes, weights = (torch.tensor(spec[key], dtype=torch.float64) for key in ("nodes", "weights"))
+        given = polychaos.Rule(nodes, weights, bool((weights > 0).all()))
+    return RuleChoice(spec["kind"], spec["size"], spec["seed"], given)
 
 
 def _map(groups: Mapping[str, Any], meta: Mapping[str, Any]) -> MapEstimate:
