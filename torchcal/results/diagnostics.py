@@ -91,6 +91,11 @@ class Diagnostics:
             ]
             lines.append(table(("", "R-hat", "ESS bulk", "ESS tail"), rows))
             lines.append(f"divergences: {self.divergences}")
+        if self.posterior_variance > 0 and self.model_error_variance > 0:
+            lines.append(
+                f"predictive variance, mean over the data: {self.model_error_variance:.3g} from model error, "
+                f"{self.posterior_variance:.3g} from the posterior of alpha"
+            )
         lines.extend(f"problem: {problem}" for problem in self.problems)
         return "\n".join(lines)
 
