@@ -11,6 +11,7 @@ __all__ = [
     "DomainError",
     "EmbeddingError",
     "ExtrapolationWarning",
+    "IdentifiabilityWarning",
     "ImproperPosteriorError",
     "MissingDependencyError",
     "PropagationWarning",
@@ -78,6 +79,10 @@ class ConvergenceWarning(TorchcalWarning):
 
 class PropagationWarning(TorchcalWarning):
     """Output moments still change when quadrature nodes or expansion terms are added."""
+
+
+class IdentifiabilityWarning(TorchcalWarning):
+    """The data say nothing about the value of a parameter."""
 
 
 class ToleranceWarning(TorchcalWarning):

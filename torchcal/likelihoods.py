@@ -38,11 +38,15 @@ SMOOTHING = 1e-3
 
 
 def _positive(value: float | Tensor, name: str) -> None:
-    try:
-        number = torch.as_tensor(value, dtype=torch.float64)
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise DomainError(f"Expected {name} as a positive number or a tensor of them. Got {value!r}.") from error
-    if not bool((torch.isfinite(number) & (number > 0)).all()):
+    if isinstance(value, float | int):  # the fast way: this is called at every step of a sampler
+        good = math.isfinite(value) and value > 0
+    else:
+        try:
+            number = torch.as_tensor(value, dtype=torch.float64)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise DomainError(f"Expected {name} as a positive number or a tensor of them. Got {value!r}.") from error
+        good = bool((torch.isfinite(number) & (number > 0)).all())
+    if not good:
         raise DomainError(f"Expected {name} > 0 and finite. Got {value!r}.")
 
 

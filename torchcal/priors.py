@@ -82,7 +82,7 @@ class Bounds(Transform):
         return torch.where(only_high, -_inverse_softplus((high - alpha).clamp_min(1e-9)), value)
 
     def log_slope(self, u: Tensor) -> Tensor:
-        """Σ log |dα/du|, ``(*batch,)``."""
+        """Σ log ``|dα/du|``, ``(*batch,)``."""
         if self.free:
             return torch.zeros_like(u[..., 0])
         both, only_low, only_high = self._cases(u)
@@ -107,7 +107,7 @@ class Bounds(Transform):
         return torch.linalg.solve_triangular(self.scale_tril.to(u), offset, upper=False).squeeze(-1)
 
     def log_abs_det_jacobian(self, x: Tensor, y: Tensor) -> Tensor:
-        """log |dα/dz|, ``(*batch,)``."""
+        """log ``|dα/dz|``, ``(*batch,)``."""
         value = self.log_slope(self.unwhiten(x))
         if self.scale_tril is not None:
             value = value + self.scale_tril.diagonal().log().sum().to(x)

@@ -11,8 +11,9 @@ from torchcal.data import Recording
 from torchcal.embeddings import PolynomialChaos
 from torchcal.errors import ImproperPosteriorError
 from torchcal.inference.estimate import maximise
+from torchcal.inference.fitting import LeastSquares, least_squares
 from torchcal.inference.sampling import check_counts, draw
-from torchcal.inference.setup import LeastSquares, check_inputs, least_squares
+from torchcal.inference.setup import check_inputs, check_run
 from torchcal.inference.summary import diagnose, settings_of, to_result, warn_of_box, warn_of_chains
 from torchcal.models import Problem
 from torchcal.priors import CoefficientPrior, Flat
@@ -63,6 +64,7 @@ def calibrate_additive(
             the likelihood then grows without limit as σ → 0.
     """
     num_samples, num_chains, num_warmup = check_counts(num_samples, num_chains, num_warmup, num_starts, sampler)
+    check_run(seed, device, dtype)
     free, _ = check_inputs(simulator, recording, fixed)
     observed = recording.observed
     count = int(observed.sum())

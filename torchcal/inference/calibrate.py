@@ -13,9 +13,10 @@ from torchcal.data import Recording
 from torchcal.embeddings import Embedding, Gaussian
 from torchcal.errors import DomainError
 from torchcal.inference.draws import Draws
-from torchcal.inference.estimate import maximise
+from torchcal.inference.estimate import check_starts, maximise
+from torchcal.inference.fitting import least_squares
 from torchcal.inference.sampling import check_counts, draw
-from torchcal.inference.setup import PriorMaker, check_inputs, embedded_problem, least_squares
+from torchcal.inference.setup import PriorMaker, check_inputs, check_run, embedded_problem
 from torchcal.inference.summary import (
     diagnose,
     mean_square,
@@ -25,11 +26,12 @@ from torchcal.inference.summary import (
     warn_of_chains,
     warn_of_tolerance,
 )
+from torchcal.models import Problem
 from torchcal.prediction import embedded_prediction
 from torchcal.priors import Flat
 from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results import Calibration, MapEstimate
-from torchcal.simulators import Simulator
+from torchcal.simulators import Scaling, Simulator
 
 __all__ = ["calibrate"]
 
@@ -100,22 +102,27 @@ def calibrate(
     embedding = Gaussian() if embedding is None else embedding
     if not isinstance(embedding, Embedding):
         raise DomainError(f"Expected one of torchcal.embeddings. Got {type(embedding).__name__}.")
-    likelihood = likelihoods.get(likelihood)
+    check_run(seed, device, dtype)
     free, _ = check_inputs(simulator, recording, fixed)
-    embedding.bind([parameter.name for parameter in free])
+
+    def build(scaling: Scaling, rule: Any) -> Problem:
+        return embedded_problem(
+            simulator,
+            recording,
+            embedding,
+            likelihoods.get(likelihood),
+            prior,
+            scaling,
+            fixed=fixed,
+            order=order,
+            rule=rule,
+            device=device,
+        )
+
+    # Once with one node, which calls no simulator, so that what cannot work is told at once.
+    check_starts(build(Scaling.from_parameters(free), 1 if rule is None else rule), starts)
     fit = least_squares(simulator, recording, fixed, seed=seed)
-    problem = embedded_problem(
-        simulator,
-        recording,
-        embedding,
-        likelihood,
-        prior,
-        fit,
-        fixed=fixed,
-        order=order,
-        rule=rule,
-        device=device,
-    )
+    problem = build(fit.scaling, rule)
     estimate = maximise(problem, fit.scaled, starts=starts, num_starts=num_starts, seed=seed)
     propagate = problem.propagate
     draws: Draws | None = None
@@ -132,7 +139,10 @@ def calibrate(
     quality = diagnose(estimate, draws, samples, propagate, propagate.alpha_names, check)
     posterior = math.nan if prediction.sd_posterior is None else mean_square(prediction.sd_posterior)
     quality = dataclasses.replace(
-        quality, model_error_variance=mean_square(prediction.sd_model_error), posterior_variance=posterior
+        quality,
+        model_error_variance=mean_square(prediction.sd_model_error),
+        posterior_variance=posterior,
+        map_variance=mean_square(prediction.map.sd),
     )
     if propagate.pattern.num_germs:
         warn_of_tolerance(quality, problem.likelihood)

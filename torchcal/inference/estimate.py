@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchcal.errors import ConvergenceError, ConvergenceWarning, ShapeError
+from torchcal.errors import ConvergenceError, ConvergenceWarning, IdentifiabilityWarning, ShapeError
 from torchcal.inference.newton import Minima, hessian, minimise
-from torchcal.inference.setup import preserve_random_state
+from torchcal.inference.randomness import preserve_random_state
 from torchcal.models import Problem
 
-__all__ = ["Estimate", "Laplace", "laplace", "maximise"]
+__all__ = ["Estimate", "Laplace", "check_starts", "laplace", "maximise"]
 
 NULL_CURVATURE = 1e-7
 """Curvature, relative to the largest, below which a direction counts as not seen by the data. The differences
@@ -77,12 +77,8 @@ def maximise(
     """
     like = problem.propagate.nodes
     transform = problem.prior.transform
-    size = problem.prior.low.shape[0]
-    if starts is not None:
-        starts = torch.as_tensor(starts).to(like)
-        if starts.ndim != 2 or starts.shape[1] != size:
-            raise ShapeError(f"Expected starts of shape (S, {size}). Got {tuple(starts.shape)}.")
-    else:
+    starts = check_starts(problem, starts)
+    if starts is None:
         starts = _starting_points(problem, leading.to(like), num_starts, seed)
 
     def objective(u: Tensor) -> Tensor:
@@ -113,6 +109,7 @@ def maximise(
     curvature = hessian(lambda a: -problem.log_prob(a), _inside(problem, best)[None])[0]
     values, vectors = torch.linalg.eigh(torch.nan_to_num(curvature))
     null = vectors.T[values.abs() <= NULL_CURVATURE * values.abs().max().clamp_min(1e-300)]
+    _warn_of_unseen(problem, null)
     with torch.no_grad():
         likelihood = float(problem.log_likelihood(best))
     return Estimate(
@@ -125,6 +122,35 @@ def maximise(
         null_directions=null,
         curvature=curvature,
     )
+
+
+def _warn_of_unseen(problem: Problem, null: Tensor) -> None:
+    """Tell of parameters whose mean can change at no cost; spreads that can are a matter of the diagnostics."""
+    pattern = problem.propagate.pattern
+    leading = null[:, : pattern.num_alpha][:, pattern.leading].abs()
+    unseen = [name for name, part in zip(pattern.names, leading.T, strict=True) if bool((part > 0.1).any())]
+    if unseen:
+        warnings.warn(
+            f"The data do not determine {', '.join(unseen)}: the posterior does not change along "
+            f"{len(null)} direction(s) of α in which they move. Hold a parameter with fixed=, give a proper prior, or "
+            "record conditions in which it matters.",
+            IdentifiabilityWarning,
+            stacklevel=4,
+        )
+
+
+def check_starts(problem: Problem, starts: Tensor | None) -> Tensor | None:
+    """A user's starting points as a tensor of the problem's kind, or an error."""
+    if starts is None:
+        return None
+    size = problem.prior.low.shape[0]
+    try:
+        points = torch.as_tensor(starts).to(problem.propagate.nodes)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ShapeError(f"Expected starts as a tensor of shape (S, {size}). Got {starts!r}.") from error
+    if points.ndim != 2 or points.shape[1] != size or not len(points):
+        raise ShapeError(f"Expected starts of shape (S, {size}), one column an α. Got {tuple(points.shape)}.")
+    return points
 
 
 def _agreeing(found: Minima) -> int:

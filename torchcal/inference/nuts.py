@@ -11,7 +11,7 @@ from tqdm.auto import tqdm
 
 from torchcal.errors import ConvergenceError, ConvergenceWarning
 from torchcal.inference.draws import Draws
-from torchcal.inference.setup import preserve_random_state
+from torchcal.inference.randomness import preserve_random_state
 from torchcal.priors import CoefficientPrior
 
 __all__ = ["run_nuts"]

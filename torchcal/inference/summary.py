@@ -12,7 +12,7 @@ from torchcal.errors import ConvergenceWarning, ExtrapolationWarning, ToleranceW
 from torchcal.inference import diagnostics as measure
 from torchcal.inference.draws import Draws
 from torchcal.inference.estimate import Estimate
-from torchcal.inference.setup import LeastSquares
+from torchcal.inference.fitting import LeastSquares
 from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results import Diagnostics, Quality
 from torchcal.results.diagnostics import ESS_THRESHOLD, r_hat_threshold
@@ -75,6 +75,7 @@ def diagnose(
         propagation=check,
         model_error_variance=math.nan,
         posterior_variance=math.nan,
+        map_variance=math.nan,
         converged=converged,
         problems=tuple(problems),
     )
@@ -113,14 +114,19 @@ def warn_of_chains(quality: Diagnostics) -> None:
 
 
 def warn_of_tolerance(quality: Diagnostics, likelihood: likelihoods.Likelihood) -> None:
-    """Warn where the tolerance dominates: V[μ] > E[σ²], the paper's own criterion."""
+    """Warn where ε rather than the model error sets the width of the prediction: the paper's own criterion.
+
+    The posterior predictive variance E[σ²] + V[μ] then exceeds the MAP's σ² by far, because both its terms grow with
+    ε and the MAP's does not (Figs. 10 and 12).
+    """
     if getattr(likelihood, "epsilon", None) is None or not quality.posterior_variance > 0:
         return
-    if quality.posterior_variance > quality.model_error_variance:
+    total = quality.model_error_variance + quality.posterior_variance
+    if total > 2 * quality.map_variance:
         warnings.warn(
-            f"The tolerance ε sets the width of the prediction: V[μ] = {quality.posterior_variance:.3g} against "
-            f"E[σ²] = {quality.model_error_variance:.3g}, means over the data. Use a smaller epsilon=, unless the "
-            "model is as good as exact.",
+            f"The tolerance ε sets the width of the prediction: E[σ²] = {quality.model_error_variance:.3g} and V[μ] = "
+            f"{quality.posterior_variance:.3g} against σ² = {quality.map_variance:.3g} at the MAP, means over the "
+            "data. Use a smaller epsilon=, unless the model is as good as exact.",
             ToleranceWarning,
             stacklevel=3,
         )

@@ -22,7 +22,7 @@ class PropagationCheck:
     Attributes:
         nodes: Number of nodes of the rule in use.
         finer_nodes: Number of nodes of the rule that it was held against.
-        mean_change: Largest change of a mean, relative to the larger of |mean| and sd over the outputs.
+        mean_change: Largest change of a mean, relative to the larger of ``|mean|`` and sd over the outputs.
         sd_change: Largest change of an sd, on the same scale.
         truncated: Largest share of a variance that lies in terms above ``order``; 0 for the full variance.
     """
@@ -43,7 +43,9 @@ def compare(propagate: "NISP", alpha: Tensor) -> PropagationCheck:
         other_mean, other_variance = finer.moments(alpha)
         truncated = 0.0
         if propagate.order is not None and bool((propagate.weights > 0).all()):
-            whole = propagate.copy(order=None).moments(alpha)[1]
+            full = propagate.copy(order=None, rule=None)
+            full.refine(alpha)
+            whole = full.moments(alpha)[1]
             lost = 1 - variance / whole.clamp_min(floor**2)
             truncated = float(torch.where(whole > floor**2, lost, 0 * lost).max())
     scale = torch.maximum(mean.abs(), variance.sqrt()).amax(-1, keepdim=True).clamp_min(floor)

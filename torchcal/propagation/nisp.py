@@ -115,6 +115,7 @@ class NISP(nn.Module):
             "_places", torch.tensor([i for i, name in enumerate(simulator.names) if name in position])
         )
         self._evaluate: Callable[[Tensor], Tensor] | None = None
+        self._wanted_rule = rule
         self.set_rule(choice.choose(self, rule))
 
     # --- what it is --------------------------------------------------------------------------------------
@@ -195,8 +196,7 @@ class NISP(nn.Module):
         """
         self._check_alpha(alpha)
         if order is None:
-            carried = self._choice.carried_order or max(1, self._choice.size - 1)
-            order = self.order if self.order is not None else carried
+            order = self.order or self._choice.expansion_order(self.pattern.num_germs)
         indices = polychaos.multi_indices(self.pattern.num_germs, order)
         matrix = polychaos.evaluate(self.pattern.basis, indices, self.nodes) * self.weights[:, None]
         matrix = matrix / polychaos.norms(self.pattern.basis, indices).to(matrix)
@@ -254,7 +254,7 @@ class NISP(nn.Module):
         """
         if simulator is None:
             return self.copy(x=x)
-        return self.copy(x=x, simulator=simulator, outputs=None)
+        return self.copy(x=x, simulator=simulator, outputs=None, rule=self._wanted_rule)
 
     def copy(self, **changes: Any) -> "NISP":
         """The same propagation with some of its constructor's arguments changed."""
@@ -328,8 +328,7 @@ class NISP(nn.Module):
 
     def _outputs(self, alpha: Tensor, psi: Tensor) -> Tensor:
         """Outputs ``(*batch, S, n)`` at rows of Ψ, ``(S, K)``."""
-        scaled = torch.einsum("...dk,sk->...sd", self.pattern.matrix(alpha), psi)
-        return self._simulate(self.scaling.physical(scaled))
+        return self._simulate(self.scaling.physical(psi @ self.pattern.matrix(alpha).transpose(-1, -2)))
 
     def _simulate(self, values: Tensor) -> Tensor:
         """Outputs ``(*batch, n)`` at values of the free parameters ``(*batch, d)``."""
@@ -354,16 +353,16 @@ class NISP(nn.Module):
         pieces = self._node_pieces(alpha)
         if len(pieces) == 1:
             outputs = self._outputs(alpha, self._psi)
-            mean = torch.einsum("q,...qn->...n", self.weights, outputs)
+            mean = self.weights @ outputs
             offset = outputs - mean.unsqueeze(-2)
-            return mean, torch.einsum("q,...qn->...n", self.weights, offset.square())
+            return mean, self.weights @ offset.square()
         with torch.no_grad():  # a shift near the mean keeps the sum of squares from cancelling
             shift = self._weighted(alpha.detach(), self.weights[:, None])
         first = second = alpha.new_zeros(())
         for piece in pieces:
             offset = self._outputs(alpha, self._psi[piece]) - shift
-            first = first + torch.einsum("q,...qn->...n", self.weights[piece], offset)
-            second = second + torch.einsum("q,...qn->...n", self.weights[piece], offset.square())
+            first = first + self.weights[piece] @ offset
+            second = second + self.weights[piece] @ offset.square()
         return shift[..., 0, :] + first, (second - first.square()).clamp_min(0)
 
     def _node_pieces(self, alpha: Tensor) -> list[slice]:

@@ -49,6 +49,15 @@ class RuleChoice:
             return replace(self, size=2 * self.size, seed=self.seed + 1)
         return replace(self, size=max(self.size + 2, math.ceil(1.3 * self.size)))
 
+    def expansion_order(self, germs: int) -> int:
+        """The highest total degree of an expansion that the rule projects on without much aliasing."""
+        if self.kind == "smolyak":
+            return self.size
+        if self.kind == "tensor":
+            return max(1, self.size - 1)
+        # A user's own or random points: as a tensor grid of as many, and no more than they resolve by far.
+        return max(1, min(10, math.floor(self.size ** (1 / max(1, germs)) + 1e-9) - 1))
+
     @property
     def carried_order(self) -> int | None:
         """The total degree of the expansion that a sparse grid can carry; None where weights are positive."""

@@ -163,6 +163,8 @@ class Calibration(_Printing):
         return kind
 
     def _joint_draws(self, propagate: NISP, num: int, kind: str, seed: int) -> tuple[Tensor, Tensor]:
+        if isinstance(num, bool) or not isinstance(num, int) or num < 0:
+            raise DomainError(f"Expected num as a non-negative integer. Got {num!r}.")
         like = propagate.nodes
         xi = propagate.draw_germ(num, seed=seed)
         draws = self.draws
@@ -334,6 +336,8 @@ class AdditiveCalibration(_Printing):
 
 def thin(draws: Tensor | None, most: int) -> Tensor | None:
     """At most ``most`` draws, evenly spaced."""
+    if isinstance(most, bool) or not isinstance(most, int) or most < 1:
+        raise DomainError(f"Expected max_draws as a positive integer. Got {most!r}.")
     if draws is None or len(draws) <= most:
         return draws
     return draws[torch.linspace(0, len(draws) - 1, most).round().long()]
@@ -367,8 +371,8 @@ def _vector(value: Any, name: str) -> Tensor:
         raise DomainError(f"Expected condition {name!r} as numbers of shape (n,). Got {value!r}.") from error
     if array.ndim == 0:
         array = array[None]
-    if array.ndim != 1 or not bool(torch.isfinite(array).all()):
-        what = f"shape {tuple(array.shape)}" if array.ndim != 1 else "values that are not finite"
+    if array.ndim != 1 or not len(array) or not bool(torch.isfinite(array).all()):
+        what = f"shape {tuple(array.shape)}" if array.ndim != 1 or not len(array) else "values that are not finite"
         raise DomainError(f"Expected condition {name!r} as finite numbers of shape (n,). Got {what}.")
     return array
 

@@ -47,6 +47,7 @@ class Diagnostics:
         propagation: How far quadrature and expansion have converged at the MAP.
         model_error_variance: E[σ²], mean over the data (Eq. 32).
         posterior_variance: V[μ], mean over the data; NaN without draws.
+        map_variance: σ² at the MAP, mean over the data.
         converged: Whether every figure is within its threshold; None without draws.
         problems: What is not, in words.
     """
@@ -61,6 +62,7 @@ class Diagnostics:
     propagation: PropagationCheck | None
     model_error_variance: float
     posterior_variance: float
+    map_variance: float
     converged: bool | None
     problems: tuple[str, ...] = field(default=())
 
@@ -93,8 +95,8 @@ class Diagnostics:
             lines.append(f"divergences: {self.divergences}")
         if self.posterior_variance > 0 and self.model_error_variance > 0:
             lines.append(
-                f"predictive variance, mean over the data: {self.model_error_variance:.3g} from model error, "
-                f"{self.posterior_variance:.3g} from the posterior of alpha"
+                f"mean predictive variance: {self.model_error_variance:.3g} of model error, "
+                f"{self.posterior_variance:.3g} of the posterior ({self.map_variance:.3g} at the MAP)"
             )
         lines.extend(f"problem: {problem}" for problem in self.problems)
         return "\n".join(lines)

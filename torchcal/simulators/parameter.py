@@ -104,6 +104,8 @@ def free_parameters(
         EmbeddingError: If ``fixed`` names a parameter that does not exist, or nothing is left free.
         DomainError: If a fixed value is not finite.
     """
+    if fixed is not None and not isinstance(fixed, Mapping):
+        raise DomainError(f"Expected fixed as a dict from parameter names to values. Got {fixed!r}.")
     fixed = dict(fixed or {})
     names = [parameter.name for parameter in parameters]
     unknown = sorted(set(fixed) - set(names))
@@ -111,7 +113,10 @@ def free_parameters(
         raise EmbeddingError(f"Expected fixed parameters among {names}. Got {unknown}. Check the spelling.")
     held: dict[str, float] = {}
     for name, value in fixed.items():
-        number = float(value)
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            number = math.nan
         if not math.isfinite(number):
             raise DomainError(f"Expected a finite value for the fixed parameter {name!r}. Got {value!r}.")
         held[name] = number

@@ -100,13 +100,13 @@ class Simulator:
                     f"It was called with conditions {_describe(x)} and parameters of shape "
                     f"{(*values.shape[:-1], 1)} ({', '.join(self.names)})."
                 ) from error
-            return self._flatten(result, values.shape[:-1], n, outputs)
+            return self._flatten(result, values, n, outputs)
 
         return evaluate
 
-    def _flatten(self, result: Any, batch: torch.Size, n: int, outputs: Sequence[str] | None) -> Tensor:
+    def _flatten(self, result: Any, values: Tensor, n: int, outputs: Sequence[str] | None) -> Tensor:
         if not isinstance(result, Mapping):
-            return _output(result, batch, n, "the simulator's result")
+            return _output(result, values, n, "the simulator's result")
         if not result:
             raise SimulatorError("Expected at least one output. Got an empty dict from the simulator.")
         wanted = tuple(outputs) if outputs is not None else tuple(result)
@@ -116,7 +116,7 @@ class Simulator:
                 f"Expected outputs {list(wanted)} from the simulator. Got {list(result)}: {missing} missing. "
                 "Use the same names in the recording and in the simulator's result."
             )
-        return torch.cat([_output(result[name], batch, n, f"output {name!r}") for name in wanted], dim=-1)
+        return torch.cat([_output(result[name], values, n, f"output {name!r}") for name in wanted], dim=-1)
 
     def check(self, x: Conditions, values: Tensor, outputs: Sequence[str] | None = None) -> int:
         """Call the simulator once, before any long work, and look hard at what it returns.
@@ -179,7 +179,8 @@ def _describe(x: Conditions) -> str:
     return str(tuple(x.shape))
 
 
-def _output(result: Any, batch: torch.Size, n: int, what: str) -> Tensor:
+def _output(result: Any, values: Tensor, n: int, what: str) -> Tensor:
+    batch = values.shape[:-1]
     if not isinstance(result, Tensor):
         raise SimulatorError(
             f"Expected {what} as a torch tensor. Got {type(result).__name__}. Use torch functions, or wrap "
@@ -187,6 +188,11 @@ def _output(result: Any, batch: torch.Size, n: int, what: str) -> Tensor:
         )
     if result.is_complex() or not result.is_floating_point():
         raise SimulatorError(f"Expected {what} to be real floating-point numbers. Got {result.dtype}.")
+    if result.dtype != values.dtype:
+        raise SimulatorError(
+            f"Expected {what} in the dtype of the parameters, {values.dtype}. Got {result.dtype}, which loses "
+            "precision or mixes dtypes. Make constants with dtype=p[name].dtype."
+        )
     shape = (*batch, n)
     if result.shape == shape:
         return result

@@ -1,0 +1,289 @@
+"""Bad input: each case is a torchcal error that says what was expected, what came and what to do, before long work."""
+
+import math
+import re
+
+import numpy as np
+import pytest
+import torch
+
+import torchcal as tc
+from torchcal.errors import (
+    ConvergenceError,
+    DegenerateLikelihoodError,
+    DomainError,
+    EmbeddingError,
+    ImproperPosteriorError,
+    RecordingError,
+    ShapeError,
+    SimulatorError,
+    TorchcalError,
+)
+
+X = torch.linspace(-1.0, 1.0, 6, dtype=torch.float64)
+Y = 1 + X + X**2
+AB = [tc.Parameter("a"), tc.Parameter("b")]
+MOST_CALLS = 8
+"""A check of the simulator takes three calls and the choice of nodes a few more, a least-squares fit a hundred."""
+
+
+def with_value(index, value):
+    y = Y.clone()
+    y[index] = value
+    return y
+
+
+def says_what_to_do(error):
+    """Expected ... Got ..., in words and not in a traceback of a library's."""
+    text = str(error)
+    assert isinstance(error, TorchcalError)
+    assert re.search(r"Expected|expected", text), text
+    assert re.search(r"Got|got|raised|Expected .* that", text), text
+    assert len(text) > 40, text
+
+
+# --- recordings -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        pytest.param({"x": X, "y": with_value(2, math.nan)}, RecordingError, id="nan"),
+        pytest.param({"x": X, "y": with_value(2, math.inf)}, RecordingError, id="inf"),
+        pytest.param({"x": X, "y": with_value(2, math.inf), "missing": True}, RecordingError, id="inf, missing"),
+        pytest.param({"x": with_value(0, math.nan), "y": Y, "missing": True}, RecordingError, id="nan in x"),
+        pytest.param({"x": X, "y": torch.full_like(Y, math.nan), "missing": True}, RecordingError, id="all missing"),
+        pytest.param({"x": X, "y": Y[:-1]}, RecordingError, id="length"),
+        pytest.param({"x": X[:, None], "y": Y}, ShapeError, id="matrix x"),
+        pytest.param({"x": X, "y": Y[:, None]}, ShapeError, id="matrix y"),
+        pytest.param({"x": X, "y": Y.to(torch.complex128)}, RecordingError, id="complex"),
+        pytest.param({"x": X, "y": ["a"] * 6}, RecordingError, id="text"),
+        pytest.param({"x": X, "y": np.array([None] * 6)}, RecordingError, id="objects"),
+        pytest.param({"x": X[:1], "y": Y[:1]}, RecordingError, id="one point"),
+        pytest.param({"x": X[:0], "y": Y[:0]}, RecordingError, id="no point"),
+        pytest.param({"x": X}, RecordingError, id="no y"),
+        pytest.param({"y": Y}, RecordingError, id="no x"),
+        pytest.param({"x": X, "y": Y, "noise": 0.0}, DomainError, id="zero noise"),
+        pytest.param({"x": X, "y": Y, "noise": -1.0}, DomainError, id="negative noise"),
+        pytest.param({"x": X, "y": Y, "noise": math.nan}, DomainError, id="nan noise"),
+        pytest.param({"x": X, "y": Y, "noise": X}, DomainError, id="noise of both signs"),
+        pytest.param({"x": X, "y": Y, "noise": torch.ones(5)}, ShapeError, id="length of noise"),
+        pytest.param({"x": X, "y": Y, "noise": "some"}, TorchcalError, id="noise in words"),
+    ],
+)
+def test_recordings(arguments, error):
+    with pytest.raises(error) as caught:
+        tc.Recording(**arguments)
+    says_what_to_do(caught.value)
+
+
+def test_zero_noise_is_told_how_to_say_that_there_is_none():
+    with pytest.raises(DomainError, match=r"noise=['\"]none['\"]|'none'"):
+        tc.Recording(x=X, y=Y, noise=0.0)
+
+
+# --- parameters and embeddings --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("make", "error"),
+    [
+        pytest.param(lambda: tc.Parameter("a", low=2.0, high=1.0), DomainError, id="reversed bounds"),
+        pytest.param(lambda: tc.Parameter("a", low=math.nan), DomainError, id="nan bound"),
+        pytest.param(lambda: tc.Parameter("a", low=0.0, transform="log"), DomainError, id="log of zero"),
+        pytest.param(lambda: tc.Simulator(lambda x, p: x, [AB[0], AB[0]]), DomainError, id="named twice"),
+        pytest.param(lambda: tc.likelihoods.ABC(epsilon=0.0), DomainError, id="zero epsilon"),
+        pytest.param(lambda: tc.likelihoods.ABC(epsilon=-0.1), DomainError, id="negative epsilon"),
+        pytest.param(lambda: tc.likelihoods.ABC(epsilon=0.1, gamma=0.0), DomainError, id="zero gamma"),
+        pytest.param(lambda: tc.likelihoods.ABC(epsilon=0.1, gamma=-1.0), DomainError, id="negative gamma"),
+        pytest.param(lambda: tc.likelihoods.ABCMean(epsilon=math.nan), DomainError, id="nan epsilon"),
+    ],
+)
+def test_pieces(make, error):
+    with pytest.raises(error) as caught:
+        make()
+    says = str(caught.value)
+    assert "Expected" in says
+    assert "Got" in says
+
+
+# --- calibrations ---------------------------------------------------------------------------------
+
+
+class Counted:
+    """A simulator's function that counts its calls and their evaluations."""
+
+    def __init__(self, function):
+        self.function, self.calls = function, 0
+
+    def __call__(self, x, p):
+        self.calls += 1
+        return self.function(x, p)
+
+
+def line(x, p):
+    return p["a"] + p["b"] * x
+
+
+def broken(x, p):
+    raise RuntimeError("no convergence in cell 7")
+
+
+SIMULATORS = [
+    pytest.param(broken, "no convergence in cell 7", id="raises"),
+    pytest.param(lambda x, p: line(x, p) * math.nan, "finite", id="nan"),
+    pytest.param(lambda x, p: line(x, p) / 0, "finite", id="inf"),
+    pytest.param(lambda x, p: torch.complex(line(x, p), 0 * line(x, p)), "real", id="complex"),
+    pytest.param(lambda x, p: line(x, p).to(torch.int64), "real", id="integers"),
+    pytest.param(lambda x, p: line(x, p)[..., 1:], "shape", id="short"),
+    pytest.param(lambda x, p: line(x, p).mean(-1), "shape", id="reduced"),
+    pytest.param(lambda x, p: line(x, p).sum(), "shape", id="scalar"),
+    pytest.param(lambda x, p: line(x, p)[..., None], "shape", id="an axis too many"),
+    pytest.param(lambda x, p: line(x, p).detach().numpy(), "tensor", id="numpy"),
+    pytest.param(lambda x, p: line(x, p).tolist(), "tensor", id="list"),
+    pytest.param(lambda x, p: None, "tensor", id="nothing"),
+    pytest.param(lambda x, p: {"z": line(x, p)}, "missing", id="other output"),
+    pytest.param(lambda x, p: {}, "at least one output", id="no output"),
+    pytest.param(lambda x, p: line(x, p).detach(), "gradient", id="no gradient"),
+    pytest.param(lambda x, p: p["c"] * x, "KeyError", id="unknown parameter"),
+    pytest.param(lambda x, p: line(x, p) + torch.rand_like(x), "random numbers", id="random"),
+    pytest.param(
+        lambda x, p: line(x, p).to(torch.float32),
+        "float32|dtype|precision",
+        id="float32",
+    ),
+]
+
+
+@pytest.mark.parametrize("calibrate", [tc.calibrate, tc.calibrate_additive])
+@pytest.mark.parametrize(("function", "message"), SIMULATORS)
+def test_simulators(function, message, calibrate):
+    counted = Counted(function)
+    with pytest.raises(SimulatorError, match=message) as caught:
+        calibrate(tc.Simulator(counted, AB), tc.Recording(x=X, y=Y))
+    says_what_to_do(caught.value)
+    assert counted.calls <= MOST_CALLS
+
+
+def attempt(*, x=X, y=Y, function=line, calibrate=tc.calibrate, **options):
+    counted = Counted(function)
+    recording = tc.Recording(x=x, y=y)
+    try:
+        calibrate(tc.Simulator(counted, AB), recording, num_starts=4, **{"num_samples": 0, **options})
+    finally:
+        attempt.calls = counted.calls
+
+
+EXACT_Y = 1 + 2 * X
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        pytest.param({"embedding": tc.embeddings.Gaussian(("z",))}, EmbeddingError, id="embedding of nothing"),
+        pytest.param({"embedding": tc.embeddings.Gaussian(("a", "a"))}, EmbeddingError, id="embedded twice"),
+        pytest.param(
+            {"embedding": tc.embeddings.Gaussian(("a",)), "fixed": {"a": 1.0}}, EmbeddingError, id="embedded and fixed"
+        ),
+        pytest.param({"embedding": "gaussian"}, DomainError, id="embedding in words"),
+        pytest.param({"embedding": tc.embeddings.Gaussian}, DomainError, id="embedding class"),
+        pytest.param({"likelihood": "least squares"}, DomainError, id="unknown likelihood"),
+        pytest.param({"likelihood": tc.likelihoods.ABC}, DomainError, id="likelihood class"),
+        pytest.param({"fixed": {"z": 1.0}}, EmbeddingError, id="fixed nothing"),
+        pytest.param({"fixed": {"a": 1.0, "b": 1.0}}, EmbeddingError, id="fixed all"),
+        pytest.param({"fixed": {"a": math.nan}}, DomainError, id="fixed at nan"),
+        pytest.param({"num_samples": -1}, DomainError, id="negative draws"),
+        pytest.param({"num_samples": 10.0}, DomainError, id="draws as float"),
+        pytest.param({"num_samples": 10, "num_chains": 0}, DomainError, id="no chains"),
+        pytest.param({"sampler": "gibbs"}, DomainError, id="unknown sampler"),
+        pytest.param({"likelihood": "additive"}, EmbeddingError, id="additive, embedded"),
+        pytest.param({"likelihood": "full"}, DegenerateLikelihoodError, id="N > d"),
+        pytest.param({"likelihood": "abc_mean"}, ImproperPosteriorError, id="improper"),
+        pytest.param({"embedding": tc.embeddings.PolynomialChaos(order=0)}, EmbeddingError, id="no sd"),
+        pytest.param({"order": 0}, DomainError, id="order 0"),
+        pytest.param({"rule": "gauss"}, DomainError, id="rule in words"),
+        pytest.param({"likelihood": tc.likelihoods.ABC(epsilon=torch.ones(3))}, TorchcalError, id="epsilon"),
+        pytest.param({"prior": lambda module: "flat"}, DomainError, id="prior of the wrong kind"),
+        pytest.param({"starts": torch.zeros(3, 4)}, ShapeError, id="shape of starts"),
+        pytest.param({"calibrate": tc.calibrate_additive, "x": X[:2], "y": Y[:2]}, ImproperPosteriorError, id="N = d"),
+    ],
+)
+def test_options(options, error):
+    with pytest.raises(error) as caught:
+        attempt(**options)
+    says_what_to_do(caught.value)
+    assert attempt.calls <= MOST_CALLS
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param({"prior": "flat"}, id="prior in words"),
+        pytest.param({"fixed": {"a": "one"}}, id="fixed in words"),
+        pytest.param({"fixed": {"a": None}}, id="fixed at nothing"),
+        pytest.param({"fixed": ["a"]}, id="fixed as a list"),
+        pytest.param({"seed": 1.5}, id="seed as float"),
+        pytest.param({"seed": -1}, id="negative seed"),
+        pytest.param({"starts": "here"}, id="starts in words"),
+        pytest.param({"device": "abacus"}, id="unknown device"),
+        pytest.param({"num_samples": 2, "dtype": torch.int64}, id="integer dtype"),
+    ],
+)
+def test_options_that_fall_through(options):
+    with pytest.raises(TorchcalError):
+        attempt(**options)
+
+
+def test_a_prior_that_is_already_made_is_refused():
+    """`prior=Flat(propagate)` for `prior=Flat` is an easy mistake."""
+    module = tc.NISP(tc.Simulator(line, AB), tc.embeddings.Gaussian(), X)
+    with pytest.raises((TorchcalError, TypeError)):
+        attempt(prior=tc.priors.Flat(module))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error"),
+    [
+        pytest.param((line, tc.Recording(x=X, y=Y)), DomainError, id="a function for a simulator"),
+        pytest.param((tc.Simulator(line, AB), (X, Y)), RecordingError, id="a tuple for a recording"),
+    ],
+)
+@pytest.mark.parametrize("calibrate", [tc.calibrate, tc.calibrate_additive])
+def test_what_is_not_a_simulator_or_a_recording(arguments, error, calibrate):
+    with pytest.raises(error) as caught:
+        calibrate(*arguments)
+    says_what_to_do(caught.value)
+
+
+def test_additive_where_the_residuals_vanish():
+    with pytest.raises(ImproperPosteriorError, match=r"noise=|calibrate"):
+        attempt(calibrate=tc.calibrate_additive, y=EXACT_Y)
+
+
+def test_starts_where_nothing_is_finite():
+    with pytest.raises(ConvergenceError, match="starts="):
+        attempt(starts=torch.full((4, 5), math.nan))
+
+
+def test_a_recording_of_other_outputs():
+    simulator = tc.Simulator(lambda x, p: {"u": line(x, p), "v": line(x, p)}, AB)
+    with pytest.raises(SimulatorError, match=r"\['w'\] missing"):
+        tc.calibrate(simulator, tc.Recording(x=X, y={"u": Y, "w": Y}))
+    with pytest.raises(SimulatorError, match=r"Expected 12 output values.*2\s*outputs.*Got 6"):
+        tc.calibrate(tc.Simulator(line, AB), tc.Recording(x=X, y={"u": Y, "w": Y}))
+
+
+def test_other_conditions_than_the_simulator_reads():
+    simulator = tc.Simulator(lambda x, p: line(x["t"], p), AB)
+    with pytest.raises(SimulatorError, match=r"KeyError.*'t'.*conditions"):
+        tc.calibrate(simulator, tc.Recording(x={"s": X}, y=Y))
+    with pytest.raises(SimulatorError, match=r"conditions"):
+        tc.calibrate(simulator, tc.Recording(x=X, y=Y))
+
+
+def test_errors_have_one_base_and_fit_pythons():
+    for name in tc.errors.__all__:
+        kind = getattr(tc.errors, name)
+        assert issubclass(kind, TorchcalError | tc.TorchcalWarning)
+    assert issubclass(DomainError, ValueError)
+    assert issubclass(SimulatorError, RuntimeError)

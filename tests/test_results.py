@@ -1,0 +1,456 @@
+"""Results: reading, printing, freezing, saving and loading, export."""
+
+import dataclasses
+import math
+import os
+import subprocess
+import sys
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+import torchcal as tc
+from torchcal.errors import DomainError, TorchcalError
+from torchcal.results import AdditiveCalibration, Calibration
+
+xarray = pytest.importorskip("xarray")
+
+N = 6
+T = torch.linspace(0.0, 1.0, N, dtype=torch.float64)
+SHORT = {"num_samples": 12, "num_warmup": 10, "num_chains": 2, "num_starts": 4}
+
+
+def model(x, p):
+    return {"u": p["a"] + p["b"] * x["t"] + p["m"], "v<w>": p["b"] * x["t"] ** 2 * p["s"]}
+
+
+SIMULATOR = tc.Simulator(
+    model,
+    [
+        tc.Parameter("a", unit="m"),
+        tc.Parameter("b", low=0.0),
+        tc.Parameter("s"),
+        tc.Parameter("m", neutral=0.0),
+    ],
+)
+
+
+def recording():
+    u = 1 + 2 * T + 0.5 * T**2
+    v = 2 * T**2 + 0.1 * torch.sin(7 * T)
+    v[2] = math.nan
+    return tc.Recording(
+        x={"t": T, "unused": T + 1},
+        y={"u": u, "v<w>": v},
+        noise={"u": 0.05, "v<w>": 0.02},
+        missing=True,
+        units={"u": "m"},
+    )
+
+
+def quietly(function, *arguments, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", tc.errors.ConvergenceWarning)
+        warnings.simplefilter("ignore", tc.errors.ToleranceWarning)
+        return function(*arguments, **options)
+
+
+@pytest.fixture(scope="module")
+def sampled():
+    return quietly(
+        tc.calibrate,
+        SIMULATOR,
+        recording(),
+        embedding=tc.embeddings.Gaussian(parameters=("a",)),
+        likelihood=tc.likelihoods.ABC(epsilon=0.1),
+        fixed={"s": 1.0},
+        **SHORT,
+    )
+
+
+@pytest.fixture(scope="module")
+def point():
+    return quietly(tc.calibrate, SIMULATOR, recording(), fixed={"s": 1.0}, num_samples=0, num_starts=4)
+
+
+@pytest.fixture(scope="module")
+def additive():
+    return quietly(tc.calibrate_additive, SIMULATOR, recording(), fixed={"s": 1.0}, **SHORT)
+
+
+RESULTS = ["sampled", "point", "additive"]
+
+
+# --- what they hold -------------------------------------------------------------------------------
+
+
+def tensors(value, seen=None):
+    """All tensors of a result, but for those of its propagation."""
+    if isinstance(value, torch.Tensor):
+        yield value
+    elif dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            yield from tensors(getattr(value, field.name))
+    elif isinstance(value, dict):
+        for item in value.values():
+            yield from tensors(item)
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_numbers_are_detached_float64(name, request):
+    result = request.getfixturevalue(name)
+    found = list(tensors(result))
+    assert len(found) > 5
+    for value in found:
+        assert value.dtype in (torch.float64, torch.bool)
+        assert not value.requires_grad
+        assert value.device.type == "cpu"
+
+
+def test_shapes_are_as_documented(sampled, additive, point):
+    assert sampled.samples.shape == (2, 12, 3)
+    assert sampled.alpha_names == ("a[0]", "a[xi1]", "b[0]")
+    assert sampled.draws.shape == (24, 3)
+    assert sampled.map.mean.shape == (2,)
+    assert sampled.map.covariance.shape == (2, 2)
+    assert sampled.map.sd[1] == 0
+    assert isinstance(sampled.map.objective, float)
+    assert additive.samples.shape == (2, 12, 3)
+    assert additive.alpha_names == ("a", "b", "ln sigma")
+    assert additive.parameters.shape == (24, 2)
+    assert (additive.parameters[:, 1] >= 0).all()
+    assert (additive.sigma > 0).all()
+    assert point.samples is None
+    assert point.draws is None
+    assert sampled.predict().mean.shape == (2 * N,)
+
+
+def test_map_moments_are_those_of_the_propagation(sampled):
+    mean, covariance = sampled.propagate.parameter_moments(sampled.map.alpha)
+    torch.testing.assert_close(sampled.map.mean, mean, rtol=0, atol=0)
+    torch.testing.assert_close(sampled.map.covariance, covariance, rtol=0, atol=0)
+    prediction = sampled.predict()
+    y, observed = recording().y, recording().observed
+    value = sampled.likelihood.log_prob(
+        y[observed], prediction.map.mean[observed], prediction.map.sd[observed], recording().noise_sd[observed]
+    )
+    # The prediction lacks the floor of 1e-3 ε under the sd, which moves the objective by less than 1e-3.
+    assert -float(value) == pytest.approx(sampled.map.objective, abs=1e-2)
+
+
+def test_thinning_takes_draws_evenly(sampled):
+    few = sampled.predict(max_draws=2)
+    ends = sampled.draws[[0, -1]]
+    mean = sampled.propagate.mean(ends).mean(0)
+    torch.testing.assert_close(few.mean, mean, rtol=1e-12, atol=1e-12)
+
+
+# --- draws of outputs and parameters --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["posterior", "map"])
+def test_sampled_outputs_have_the_predicted_moments(sampled, kind):
+    count = 4000
+    outputs = sampled.sample_outputs(count, kind=kind, seed=1)
+    assert outputs.shape == (count, 2 * N)
+    prediction = sampled.predict()
+    moments = prediction.map if kind == "map" else prediction.posterior
+    # Five standard errors.
+    assert ((outputs.mean(0) - moments.mean).abs() <= 5 * moments.sd / math.sqrt(count) + 1e-9).all()
+    error = (((outputs - moments.mean) ** 4).mean(0) - moments.sd**4).clamp_min(0).div(count).sqrt()
+    assert ((outputs.var(0) - moments.sd**2).abs() <= 5 * error + 1e-9).all()
+    torch.testing.assert_close(sampled.sample_outputs(count, kind=kind, seed=1), outputs, rtol=0, atol=0)
+
+
+def test_sampled_parameters_have_their_moments(sampled):
+    count = 4000
+    parameters = sampled.sample_parameters(count, kind="map", seed=2)
+    assert parameters.shape == (count, 2)
+    assert ((parameters.mean(0) - sampled.map.mean).abs() <= 5 * sampled.map.sd / math.sqrt(count) + 1e-9).all()
+    assert (parameters[:, 1] - sampled.map.mean[1]).abs().max() < 1e-12
+
+
+def test_posterior_figures_need_draws(point):
+    for call in (
+        lambda: point.sample_outputs(3),
+        lambda: point.sample_parameters(3),
+        lambda: point.parameter_density(torch.ones(1, 2)),
+    ):
+        with pytest.raises(DomainError, match=r"num_samples=0.*kind='map'"):
+            call()
+    with pytest.raises(DomainError, match="'posterior' or 'map'"):
+        point.sample_outputs(3, kind="prior")
+    assert point.sample_outputs(3, kind="map").shape == (3, 2 * N)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda r: r.predict(max_draws=0), "max_draws"),
+        (lambda r: r.sample_outputs(-1), "num"),
+        (lambda r: r.sample_parameters(1.5), "num"),
+        (lambda r: r.predict({"t": [], "unused": []}), "condition 't'"),
+    ],
+)
+def test_bad_numbers_are_refused(sampled, call, message):
+    with pytest.raises(DomainError, match=message):
+        call(sampled)
+
+
+def test_relabelling_keeps_predictions_and_makes_the_last_row_positive(sampled, point):
+    again = sampled.relabelled()
+    assert (again.samples[..., 1] >= 0).all()
+    assert again.map.alpha[1] >= 0
+    torch.testing.assert_close(again.predict().sd, sampled.predict().sd, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(again.predict().map.sd, sampled.predict().map.sd, rtol=1e-12, atol=1e-12)
+    assert point.relabelled().samples is None
+
+
+# --- frozen and readable --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_results_are_frozen(name, request):
+    result = request.getfixturevalue(name)
+    for owner, field in ((result, "samples"), (result.map, "mean"), (result.diagnostics, "divergences")):
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(owner, field, None)
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_results_print_themselves(name, request):
+    result = request.getfixturevalue(name)
+    text = str(result)
+    assert repr(result) == text
+    assert "a [m]" in text
+    assert "6 conditions, outputs u, v<w>" in text
+    assert f"{float(result.map.mean[0]):.6g}" in text
+    assert ("R-hat" in text) == (name != "point")
+    assert max(len(line) for line in text.splitlines() if not line.strip().startswith("problem")) <= 120
+    html = result._repr_html_()
+    assert "v&lt;w&gt;" in html
+    assert "<w>" not in html
+
+
+def test_diagnostics_hold_alpha_and_moments(sampled):
+    diagnostics = sampled.diagnostics
+    assert tuple(diagnostics.alpha) == sampled.alpha_names
+    assert tuple(diagnostics.parameters) == ("E[a]", "E[b]", "Var[a]")
+    assert diagnostics.starts == 4
+    assert 1 <= diagnostics.agreeing <= 4
+    assert diagnostics.null_directions.shape[1] == 3
+    qualities = [*diagnostics.alpha.values(), *diagnostics.parameters.values()]
+    assert diagnostics.r_hat == max(q.r_hat for q in qualities)
+    assert diagnostics.ess == min(min(q.ess_bulk, q.ess_tail) for q in qualities)
+    assert diagnostics.converged == (not diagnostics.problems)
+    prediction = sampled.predict()
+    assert diagnostics.model_error_variance == pytest.approx(float(prediction.sd_model_error.square().mean()), rel=1e-9)
+    assert diagnostics.posterior_variance == pytest.approx(float(prediction.sd_posterior.square().mean()), rel=1e-9)
+
+
+def test_without_draws_diagnostics_say_so(point):
+    assert point.diagnostics.converged is None
+    assert math.isnan(point.diagnostics.r_hat)
+    assert math.isnan(point.diagnostics.ess)
+    assert math.isnan(point.diagnostics.posterior_variance)
+
+
+# --- files ----------------------------------------------------------------------------------------
+
+
+def same(one, other, path=""):
+    """Whether two results hold the same, NaN equal to NaN."""
+    if isinstance(one, torch.Tensor):
+        assert isinstance(other, torch.Tensor), path
+        torch.testing.assert_close(one, other, rtol=0, atol=0, equal_nan=True, msg=path)
+    elif dataclasses.is_dataclass(one):
+        assert type(one) is type(other), path
+        for field in dataclasses.fields(one):
+            same(getattr(one, field.name), getattr(other, field.name), f"{path}.{field.name}")
+    elif isinstance(one, dict):
+        assert set(one) == set(other), path
+        for key in one:
+            same(one[key], other[key], f"{path}[{key!r}]")
+    elif isinstance(one, float) and math.isnan(one):
+        assert math.isnan(other), path
+    elif isinstance(one, tuple | list):
+        assert list(one) == list(other), path
+    else:
+        assert one == other, path
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_a_round_trip_without_a_simulator_keeps_everything_but_the_code(name, request, tmp_path):
+    result = request.getfixturevalue(name)
+    path = tmp_path / "result.nc"
+    result.save(path)
+    loaded = type(result).load(path)
+    for field in ("map", "samples", "diagnostics", "recording", "settings"):
+        same(getattr(result, field), getattr(loaded, field), field)
+    if name != "additive":
+        same(result.embedding, loaded.embedding)
+        same(result.likelihood, loaded.likelihood)
+    assert loaded.propagate is None
+    before, after = result.predict(), loaded.predict()
+    same(dataclasses.replace(before, x=None), dataclasses.replace(after, x=None), "prediction")
+    same(recording().x, dict(after.x))
+    assert "E[λ]" in str(loaded) or "MAP" in str(loaded)
+    with pytest.raises(DomainError, match=r"load\(path, simulator=\.\.\.\)"):
+        loaded.predict({"t": [0.5], "unused": [1.0]})
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_a_round_trip_with_the_simulator_predicts_elsewhere(name, request, tmp_path):
+    result = request.getfixturevalue(name)
+    result.save(tmp_path / "result.nc")
+    loaded = type(result).load(tmp_path / "result.nc", simulator=SIMULATOR)
+    for x in (None, {"t": [0.25, 2.0], "unused": [0.0, 0.0]}):
+        before, after = result.predict(x), loaded.predict(x)
+        for kind in ("posterior", "map"):
+            if getattr(before, kind) is None:
+                continue
+            torch.testing.assert_close(getattr(after, kind).mean, getattr(before, kind).mean, rtol=1e-12, atol=1e-14)
+            torch.testing.assert_close(getattr(after, kind).sd, getattr(before, kind).sd, rtol=1e-12, atol=1e-14)
+    assert str(loaded) == str(result)
+    loaded.save(tmp_path / "again.nc")
+    same(type(result).load(tmp_path / "again.nc").map, result.map)
+
+
+@pytest.mark.parametrize("likelihood", ["abc", "gausmarg", tc.likelihoods.Marginal(num_samples=16, bandwidth=0.5)])
+@pytest.mark.parametrize(
+    "embedding",
+    [tc.embeddings.Uniform(), tc.embeddings.PolynomialChaos(("a",), order=2, germ="legendre", triangular=False)],
+)
+def test_choices_survive_a_round_trip(likelihood, embedding, tmp_path):
+    simulator = tc.Simulator(lambda x, p: p["a"] * x, [tc.Parameter("a", low=0.1, high=9.0, transform="log")])
+    data = tc.Recording(x=T + 1, y=(T + 1) ** 2, noise=0.1)
+    result = quietly(
+        tc.calibrate, simulator, data, likelihood=likelihood, embedding=embedding, num_samples=0, num_starts=4, order=2
+    )
+    result.save(tmp_path / "result.nc")
+    loaded = Calibration.load(tmp_path / "result.nc", simulator=simulator)
+    assert type(loaded.embedding) is type(embedding)
+    same(loaded.embedding, result.embedding)
+    same(loaded.likelihood, result.likelihood)
+    torch.testing.assert_close(loaded.predict([3.0]).sd, result.predict([3.0]).sd, rtol=1e-12, atol=0)
+
+
+def test_a_rule_of_ones_own_survives_a_round_trip(tmp_path):
+    simulator = tc.Simulator(lambda x, p: torch.exp(p["a"] * x), [tc.Parameter("a", low=0.0, high=2.0)])
+    data = tc.Recording(x=T + 1, y=1 + (T + 1) ** 2)
+    rule = tc.polychaos.qmc_rule(tc.polychaos.HERMITE, 1, 64, seed=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", tc.errors.TorchcalWarning)
+        result = tc.calibrate(simulator, data, rule=rule, num_samples=0, num_starts=4)
+    result.save(tmp_path / "result.nc")
+    loaded = Calibration.load(tmp_path / "result.nc", simulator=simulator)
+    torch.testing.assert_close(loaded.predict([1.5]).sd, result.predict([1.5]).sd, rtol=1e-10, atol=0)
+
+
+def test_the_tree_has_its_groups(sampled, additive, point):
+    tree = sampled.to_datatree()
+    assert isinstance(tree, xarray.DataTree)
+    assert {"posterior", "map", "prediction", "observed_data", "constant_data"} <= set(tree.children)
+    alpha = tree["posterior"]["alpha"]
+    assert alpha.dims == ("chain", "draw", "coefficient")
+    assert list(alpha.coords["coefficient"].values) == list(sampled.alpha_names)
+    np.testing.assert_array_equal(alpha.sel(coefficient="b[0]").values, sampled.samples[..., 2].numpy())
+    np.testing.assert_array_equal(tree["observed_data"]["u"].values, recording().split(recording().y)["u"].numpy())
+    np.testing.assert_array_equal(tree["constant_data"]["t"].values, T.numpy())
+    assert "posterior" not in point.to_datatree().children
+    assert {"push_forward_sd", "posterior_sd", "map_sd"} <= set(additive.to_datatree()["prediction"].data_vars)
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_arviz_reads_the_tree(name, request):
+    pytest.importorskip("arviz")
+    result = request.getfixturevalue(name)
+    data = result.to_arviz()
+    if name == "point":
+        return
+    posterior = data.posterior if hasattr(data, "posterior") else data["posterior"]
+    assert posterior["alpha"].shape == (2, 12, 3)
+    import arviz
+
+    table = arviz.summary(data, kind="stats")
+    assert len(table) == 3
+    assert float(table["mean"].iloc[0]) == pytest.approx(float(result.draws[:, 0].mean()), abs=6e-3)  # rounded
+
+
+def test_no_pickle_is_read_or_written(sampled, tmp_path):
+    path = tmp_path / "result.nc"
+    sampled.save(path)
+    assert path.read_bytes()[:8] == b"\x89HDF\r\n\x1a\n"
+    code = (
+        "import sys, pickle\n"
+        "def forbidden(*a, **k): raise RuntimeError('pickle')\n"
+        "import torchcal as tc\n"
+        "pickle.loads = pickle.load = pickle.Unpickler = forbidden\n"
+        f"print(tc.results.Calibration.load({str(path)!r}).samples.shape)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert "torch.Size([2, 12, 3])" in done.stdout, done.stderr
+
+
+def test_a_file_is_written_whole_or_not_at_all(sampled, tmp_path, monkeypatch):
+    path = tmp_path / "result.nc"
+    path.write_text("precious")
+
+    def break_down(self, where, **options):
+        with open(where, "wb") as file:
+            file.write(b"half")
+        raise OSError("disk full")
+
+    monkeypatch.setattr(xarray.DataTree, "to_netcdf", break_down)
+    with pytest.raises(OSError, match="disk full"):
+        sampled.save(path)
+    assert path.read_text() == "precious"
+    assert os.listdir(tmp_path) == ["result.nc"]
+    monkeypatch.undo()
+    sampled.save(path)
+    assert Calibration.load(path).alpha_names == sampled.alpha_names
+    assert os.listdir(tmp_path) == ["result.nc"]
+
+
+def test_what_torchcal_did_not_write_is_refused(sampled, additive, tmp_path):
+    missing, text, other = tmp_path / "none.nc", tmp_path / "text.nc", tmp_path / "other.nc"
+    text.write_text("not netCDF")
+    xarray.Dataset({"a": ("n", np.arange(3.0))}).to_netcdf(other, engine="h5netcdf")
+    for path in (missing, text, other):
+        with pytest.raises(TorchcalError, match=r"netCDF file that torchcal wrote"):
+            Calibration.load(path)
+    sampled.save(tmp_path / "embedded.nc")
+    additive.save(tmp_path / "additive.nc")
+    with pytest.raises(TorchcalError, match="other class"):
+        AdditiveCalibration.load(tmp_path / "embedded.nc")
+    with pytest.raises(TorchcalError, match="other class"):
+        Calibration.load(tmp_path / "additive.nc")
+
+
+def test_another_simulator_is_refused(sampled, tmp_path):
+    sampled.save(tmp_path / "result.nc")
+    other = tc.Simulator(lambda x, p: p["q"] * x["t"], [tc.Parameter("q"), tc.Parameter("a"), tc.Parameter("s")])
+    with pytest.raises(TorchcalError, match=r"\['a', 'b'\]"):
+        Calibration.load(tmp_path / "result.nc", simulator=other)
+
+
+@pytest.mark.parametrize("name", ["condition", "datum", "x", "chain"])
+def test_names_of_the_files_own_dimensions_are_taken(name, tmp_path):
+    """A condition or an output may be called what a dimension of the file is called."""
+    simulator = tc.Simulator(
+        lambda x, p: {name + "_": p["a"] * x[name], "datum_": p["a"] + x[name]}, [tc.Parameter("a")]
+    )
+    data = tc.Recording(x={name: T}, y={name + "_": T + 1, "datum_": T**2})
+    result = quietly(tc.calibrate, simulator, data, num_samples=0, num_starts=4)
+    result.save(tmp_path / "result.nc")
+    same(Calibration.load(tmp_path / "result.nc").recording, result.recording)
+
+
+def test_names_with_a_slash_are_taken(tmp_path):
+    simulator = tc.Simulator(lambda x, p: {"p/q": p["a/b"] * x["m/s"], "r": p["a/b"] + x["m/s"]}, [tc.Parameter("a/b")])
+    data = tc.Recording(x={"m/s": T}, y={"p/q": T + 1, "r": T**2})
+    result = quietly(tc.calibrate, simulator, data, num_samples=0, num_starts=4)
+    result.save(tmp_path / "result.nc")
+    same(Calibration.load(tmp_path / "result.nc").recording, result.recording)

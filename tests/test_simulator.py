@@ -1,0 +1,225 @@
+"""Parameters, scalings and static simulators."""
+
+import math
+
+import pytest
+import torch
+
+import torchcal as tc
+from torchcal.errors import DomainError, EmbeddingError, ShapeError, SimulatorError
+from torchcal.simulators import Scaling, free_parameters
+
+X = torch.linspace(0.0, 2.0, 5, dtype=torch.float64)
+AB = [tc.Parameter("a"), tc.Parameter("b")]
+
+# Different orders of the same float64 sums differ by a few units in the last place.
+ROUNDING = 1e-13
+
+
+def values(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+# --- parameters -----------------------------------------------------------------------------------
+
+
+def test_parameter_keeps_what_it_was_given_as_floats():
+    parameter = tc.Parameter("k", unit="1/s", low=1, high=torch.tensor(3), initial=2)
+    assert (parameter.low, parameter.high, parameter.initial) == (1.0, 3.0, 2.0)
+    assert all(type(v) is float for v in (parameter.low, parameter.high, parameter.initial))
+    assert parameter.contains(1.0)
+    assert parameter.contains(3.0)
+    assert not parameter.contains(3.1)
+    with pytest.raises(AttributeError):
+        parameter.low = 0.0
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ({"name": ""}, "non-empty string"),
+        ({"name": 3}, "non-empty string"),
+        ({"low": math.nan}, "finite number for low"),
+        ({"high": math.inf}, "finite number for high"),
+        ({"initial": "guess"}, "finite number for initial"),
+        ({"neutral": [1.0, 2.0]}, "finite number for neutral"),
+        ({"low": 2.0, "high": 1.0}, "low < high"),
+        ({"low": 1.0, "high": 1.0}, "low < high"),
+        ({"low": 0.0, "initial": -1.0}, "between its bounds"),
+        ({"high": 0.0, "initial": 1.0}, "between its bounds"),
+        ({"transform": "sqrt"}, "None or 'log'"),
+        ({"transform": "log", "low": 0.0}, "positive low"),
+        ({"transform": "log", "initial": -2.0}, "positive initial"),
+        ({"transform": "log", "neutral": 0.0}, "positive neutral"),
+    ],
+)
+def test_bad_parameter_is_refused(bad, message):
+    with pytest.raises(DomainError, match=message):
+        tc.Parameter(**{"name": "k", **bad})
+
+
+def test_free_parameters_are_those_neither_fixed_nor_dormant():
+    parameters = [tc.Parameter("a"), tc.Parameter("b"), tc.Parameter("m", neutral=1.0), tc.Parameter("c")]
+    free, held = free_parameters(parameters, {"b": 2})
+    assert [p.name for p in free] == ["a", "c"]
+    assert held == {"b": 2.0, "m": 1.0}
+    _, held = free_parameters(parameters, {"m": 5.0})
+    assert held == {"m": 5.0}
+
+
+def test_free_parameters_refuses_what_it_cannot_hold():
+    with pytest.raises(EmbeddingError, match=r"Got \['z'\]"):
+        free_parameters(AB, {"z": 1.0})
+    with pytest.raises(EmbeddingError, match="at least one free parameter"):
+        free_parameters(AB, {"a": 1.0, "b": 1.0})
+    with pytest.raises(DomainError, match="finite value"):
+        free_parameters(AB, {"a": math.inf})
+
+
+# --- scaling --------------------------------------------------------------------------------------
+
+SCALED = [
+    tc.Parameter("both", low=10.0, high=20.0),
+    tc.Parameter("low", low=1.0),
+    tc.Parameter("log", low=1e-3, high=1e3, transform="log"),
+    tc.Parameter("guess", initial=-4.0),
+    tc.Parameter("plain"),
+]
+
+
+def test_two_bounds_become_minus_one_and_one():
+    """Eq. 40 of the paper."""
+    scaling = Scaling.from_parameters(SCALED)
+    low, high = scaling.bounds(SCALED)
+    # The scaled bounds come from one subtraction and one division.
+    torch.testing.assert_close(low[[0, 2]], -torch.ones(2, dtype=torch.float64), rtol=0, atol=1e-15)
+    torch.testing.assert_close(high[[0, 2]], torch.ones(2, dtype=torch.float64), rtol=0, atol=1e-15)
+    assert low.tolist()[1] == 1.0
+    assert high.tolist()[1] == math.inf
+    assert (low[3:] == -math.inf).all()
+    assert (high[3:] == math.inf).all()
+    ends = scaling.physical(torch.stack([low, high]).nan_to_num(posinf=0.0, neginf=0.0))
+    torch.testing.assert_close(ends[:, 2], torch.tensor([1e-3, 1e3], dtype=torch.float64), rtol=1e-13, atol=0)
+
+
+def test_a_first_guess_centres_and_scales():
+    scaling = Scaling.from_parameters(SCALED)
+    assert (scaling.center[3], scaling.scale[3]) == (-4.0, 4.0)
+    assert (scaling.center[4], scaling.scale[4]) == (0.0, 1.0)
+
+
+def test_scaling_and_back_is_the_identity():
+    scaling = Scaling.from_parameters(SCALED)
+    scaled = values(3, 2, 5)
+    torch.testing.assert_close(scaling.scaled(scaling.physical(scaled)), scaled, rtol=1e-12, atol=1e-12)
+    assert torch.autograd.gradcheck(scaling.physical, scaled.requires_grad_())
+
+
+def test_scaling_refuses_unequal_lengths():
+    with pytest.raises(ShapeError, match="one shape"):
+        Scaling(torch.zeros(2), torch.ones(3), torch.zeros(2, dtype=torch.bool))
+
+
+# --- simulators -----------------------------------------------------------------------------------
+
+
+def line(x, p):
+    return p["a"] + p["b"] * x
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (4, 3), (0,)])
+def test_batches_of_parameters_go_through_elementwise_code(batch):
+    simulate = tc.Simulator(line, AB).at(X)
+    points = values(*batch, 2)
+    result = simulate(points)
+    assert result.shape == (*batch, 5)
+    torch.testing.assert_close(result, points[..., :1] + points[..., 1:] * X, rtol=ROUNDING, atol=ROUNDING)
+
+
+def test_named_conditions_and_several_outputs_come_one_after_another():
+    simulator = tc.Simulator(lambda x, p: {"u": p["a"] * x["t"], "v": p["b"] * x["s"], "w": p["a"]}, AB)
+    conditions = {"t": X, "s": X**2}
+    points = values(3, 2)
+    result = simulator.at(conditions, ["w", "v"])(points)
+    expected = torch.cat([points[:, :1].expand(3, 5), points[:, 1:] * X**2], dim=-1)
+    torch.testing.assert_close(result, expected, rtol=0, atol=0)
+    assert simulator.at(conditions)(points).shape == (3, 15)
+
+
+def test_an_output_that_ignores_the_conditions_is_spread_over_them():
+    result = tc.Simulator(lambda x, p: p["a"] * p["b"], AB).at(X)(values(3, 2))
+    assert result.shape == (3, 5)
+    assert (result == result[:, :1]).all()
+
+
+def test_one_condition_only():
+    result = tc.Simulator(line, AB).at(X[:1])(values(3, 2))
+    assert result.shape == (3, 1)
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda x, p: 1 / 0, "ZeroDivisionError"),
+        (lambda x, p: p["c"] * x, "KeyError"),
+        (lambda x, p: (p["a"] * x).detach().numpy(), "torch tensor. Got ndarray"),
+        (lambda x, p: None, "torch tensor. Got NoneType"),
+        (lambda x, p: torch.complex(p["a"] * x, x), "real floating-point"),
+        (lambda x, p: (p["a"] * x).long(), "real floating-point"),
+        (lambda x, p: (p["a"] * x)[..., :-1], "of shape"),
+        (lambda x, p: (p["a"] * x).sum(), "of shape"),
+        (lambda x, p: (p["a"] * x).sum(-1), "of shape"),
+        (lambda x, p: (p["a"] * x).unsqueeze(-1), "of shape"),
+        (lambda x, p: (p["a"] * x).transpose(0, -1), "of shape"),
+        (lambda x, p: {}, "at least one output"),
+    ],
+)
+def test_a_result_of_the_wrong_kind_is_named(function, message):
+    with pytest.raises(SimulatorError, match=message):
+        tc.Simulator(function, AB).at(X)(values(3, 2))
+
+
+def test_a_missing_output_is_named():
+    with pytest.raises(SimulatorError, match=r"\['y'\] missing"):
+        tc.Simulator(lambda x, p: {"z": p["a"] * x}, AB).at(X, ["y"])(values(2, 2))
+
+
+@pytest.mark.parametrize(
+    ("function", "message"),
+    [
+        (lambda x, p: line(x, p).detach(), "without a gradient"),
+        (lambda x, p: x + 0 * x, "without a gradient"),
+        (lambda x, p: line(x, p) + torch.rand(()), "in a batch as one at a time"),
+        (lambda x, p: line(x, p) - line(x, p).mean(), "in a batch as one at a time"),
+        (lambda x, p: line(x, p) * math.nan, "Expected finite outputs. Got nan"),
+        (lambda x, p: line(x, p) / 0, "Expected finite outputs. Got -?inf"),
+    ],
+)
+def test_check_finds_what_a_single_call_does_not_show(function, message):
+    with pytest.raises(SimulatorError, match=message):
+        tc.Simulator(function, AB).check(X, values(8, 2))
+
+
+def test_check_passes_where_one_point_of_many_is_finite():
+    simulator = tc.Simulator(lambda x, p: p["a"].sqrt() * x + p["b"], AB)
+    assert simulator.check(X, torch.tensor([[-1.0, 0.0], [1.0, 0.0]], dtype=torch.float64)) == 5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((3, AB), "callable"),
+        ((line, []), "at least one parameter"),
+        ((line, ["a", "b"]), "Parameter objects"),
+        ((line, [*AB, tc.Parameter("a")]), r"\['a'\] more than once"),
+    ],
+)
+def test_bad_simulator_is_refused(arguments, message):
+    with pytest.raises(DomainError, match=message):
+        tc.Simulator(*arguments)
+
+
+@pytest.mark.parametrize("degree", [-1, 1.5, True, "two"])
+def test_bad_degree_is_refused(degree):
+    with pytest.raises(DomainError, match="degree"):
+        tc.Simulator(line, AB, degree=degree)

@@ -1,0 +1,119 @@
+"""The best single parameter vector, and the coordinates that it suggests."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcal.data import Recording
+from torchcal.embeddings import PolynomialChaos
+from torchcal.errors import SimulatorError
+from torchcal.inference.newton import minimise
+from torchcal.inference.randomness import preserve_random_state
+from torchcal.priors import Flat
+from torchcal.propagation import NISP
+from torchcal.simulators import Scaling, Simulator, free_parameters
+
+__all__ = ["LeastSquares", "least_squares"]
+
+_LEAST_SQUARES_STARTS = 64
+
+
+@dataclass(frozen=True)
+class LeastSquares:
+    """The best single parameter vector, which sets coordinates and starting points.
+
+    Attributes:
+        scaling: Coordinates of the free parameters.
+        scaled: The estimate in them, ``(d,)``.
+        residual: y − f(x; λ) over the observed data.
+        relative: RMS residual relative to the spread of the data.
+    """
+
+    scaling: Scaling
+    scaled: Tensor
+    residual: Tensor
+    relative: float
+
+
+def least_squares(
+    simulator: Simulator, recording: Recording, fixed: Mapping[str, float] | None, *, seed: int
+) -> LeastSquares:
+    """Fit one parameter vector from many starts, and scale parameters without two bounds by the fit.
+
+    The scale of such a parameter is the shift that moves the outputs by the spread of the data.
+    """
+    free, _ = free_parameters(simulator.parameters, fixed)
+    observed, y, spread = recording.observed, recording.y, recording.spread
+    y = torch.where(observed, y, torch.zeros_like(y))
+
+    def residual(propagate: NISP, scaled: Tensor) -> Tensor:
+        return ((propagate.mean(scaled) - y) / spread)[..., observed]
+
+    def build(scaling: Scaling) -> tuple[NISP, Flat]:
+        propagate = NISP(
+            simulator,
+            PolynomialChaos(order=0),
+            recording.x,
+            fixed=fixed,
+            outputs=recording.outputs,
+            scaling=scaling,
+        )
+        return propagate, Flat(propagate)
+
+    scaling = Scaling.from_parameters(free)
+    with preserve_random_state(seed):
+        propagate, prior = build(scaling)
+        reach = 10 ** (torch.rand(_LEAST_SQUARES_STARTS, 1, dtype=torch.float64) * 2.5 - 1)
+        unbounded = ~torch.isfinite(prior.low - prior.high)
+        starts = prior.sample((_LEAST_SQUARES_STARTS,))
+        starts = torch.where(unbounded, starts * reach, starts)
+        starts[0] = 0
+    best = _fit(propagate, prior, residual, prior.transform.unbound(starts))
+    for _ in range(2):  # once more in the coordinates that the first fit suggests
+        slope = _sensitivity(propagate, best, residual)
+        center = propagate.scaling.scaled(propagate.scaling.physical(best))
+        natural = propagate.scaling.center + propagate.scaling.scale * center
+        size = propagate.scaling.scale / slope
+        fallback = torch.maximum(natural.abs(), torch.ones_like(natural))
+        scale = torch.where(torch.isfinite(size) & (size > 0), size, fallback)
+        physical = propagate.scaling.physical(best)
+        scaling = Scaling.from_parameters(free, center=natural, scale=scale)
+        propagate, prior = build(scaling)
+        near = scaling.scaled(physical)
+        starts = near + 0.1 * torch.randn(
+            8, len(near), dtype=torch.float64, generator=torch.Generator().manual_seed(seed)
+        )
+        starts[0] = near
+        best = _fit(propagate, prior, residual, prior.transform.unbound(starts))
+    with torch.no_grad():
+        relative = residual(propagate, best)
+    return LeastSquares(
+        scaling, best, relative * spread[observed], float(relative.square().mean().sqrt())
+    )
+
+
+def _fit(
+    propagate: NISP, prior: Flat, residual: Callable[[NISP, Tensor], Tensor], starts: Tensor
+) -> Tensor:
+    def objective(u: Tensor) -> Tensor:
+        return 0.5 * residual(propagate, prior.transform.bound(u)).square().mean(-1)
+
+    found = minimise(objective, starts, tolerance=1e-13)
+    if not math.isfinite(float(found.values[0])):
+        raise SimulatorError(
+            "Expected finite outputs for some parameter values. Got none from any of "
+            f"{len(starts)} starting points. Give the parameters bounds or initial=."
+        )
+    return prior.transform.bound(found.points[0])
+
+
+def _sensitivity(propagate: NISP, point: Tensor, residual: Callable[[NISP, Tensor], Tensor]) -> Tensor:
+    """RMS over the data of ∂(output / spread)/∂λ̃, by central differences, ``(d,)``."""
+    step = 1e-5
+    shift = step * torch.eye(len(point), dtype=point.dtype)
+    with torch.no_grad():
+        change = residual(propagate, point + shift) - residual(propagate, point - shift)
+    return (change / (2 * step)).square().mean(-1).sqrt()
