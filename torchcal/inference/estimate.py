@@ -36,6 +36,7 @@ class Estimate:
         agreeing: Number of starts that reached the best objective.
         ties: Number of different densities of λ that reach it: a symmetry of model and data makes more than one.
         null_directions: Unit vectors in α along which the log-posterior does not change, ``(k, P)``.
+        unseen: Names of parameters whose means the data do not determine.
         curvature: Hessian of the negative log-posterior in α, ``(P, P)``.
     """
 
@@ -46,6 +47,7 @@ class Estimate:
     agreeing: int
     ties: int
     null_directions: Tensor
+    unseen: tuple[str, ...]
     curvature: Tensor
 
 
@@ -109,7 +111,14 @@ def maximise(
     curvature = hessian(lambda a: -problem.log_prob(a), _inside(problem, best)[None])[0]
     values, vectors = torch.linalg.eigh(torch.nan_to_num(curvature))
     null = vectors.T[values.abs() <= NULL_CURVATURE * values.abs().max().clamp_min(1e-300)]
-    _warn_of_unseen(problem, null)
+    unseen = _unseen_means(problem, best, curvature)
+    if unseen:
+        warnings.warn(
+            f"The data do not determine {', '.join(unseen)}. Hold a parameter with fixed=, give a proper prior, or "
+            "record conditions in which it matters.",
+            IdentifiabilityWarning,
+            stacklevel=3,
+        )
     with torch.no_grad():
         likelihood = float(problem.log_likelihood(best))
     return Estimate(
@@ -120,23 +129,30 @@ def maximise(
         agreeing=agreeing,
         ties=ties,
         null_directions=null,
+        unseen=unseen,
         curvature=curvature,
     )
 
 
-def _warn_of_unseen(problem: Problem, null: Tensor) -> None:
-    """Tell of parameters whose mean can change at no cost; spreads that can are a matter of the diagnostics."""
+def _unseen_means(problem: Problem, alpha: Tensor, curvature: Tensor) -> tuple[str, ...]:
+    """Parameters whose means can move by one scaled unit at no cost.
+
+    Curvatures alone would not do: at a spike of the density every other direction looks flat beside it.
+    """
     pattern = problem.propagate.pattern
-    leading = null[:, : pattern.num_alpha][:, pattern.leading].abs()
-    unseen = [name for name, part in zip(pattern.names, leading.T, strict=True) if bool((part > 0.1).any())]
-    if unseen:
-        warnings.warn(
-            f"The data do not determine {', '.join(unseen)}: the posterior does not change along "
-            f"{len(null)} direction(s) of α in which they move. Hold a parameter with fixed=, give a proper prior, or "
-            "record conditions in which it matters.",
-            IdentifiabilityWarning,
-            stacklevel=4,
-        )
+    rows = pattern.leading.nonzero()[:, 0].to(alpha.device)
+    values, vectors = torch.linalg.eigh(torch.nan_to_num(curvature)[rows][:, rows])
+    flat = vectors.T[values.abs() <= NULL_CURVATURE * values.abs().max().clamp_min(1e-300)]
+    names: list[str] = []
+    with torch.no_grad():
+        here = problem.log_likelihood(alpha)
+        for direction in flat:
+            step = torch.zeros_like(alpha)
+            step[rows] = direction
+            there = problem.log_likelihood(torch.stack([alpha + step, alpha - step, alpha + 10 * step]))
+            if bool(((there - here).abs() <= 1e-6 * (1 + here.abs())).all()):
+                names += [name for name, part in zip(pattern.names, direction.abs(), strict=True) if part > 0.1]
+    return tuple(dict.fromkeys(names))
 
 
 def check_starts(problem: Problem, starts: Tensor | None) -> Tensor | None:

@@ -1,7 +1,8 @@
 """The best single parameter vector, and the coordinates that it suggests."""
 
 import math
-from collections.abc import Callable, Mapping
+import warnings
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -9,12 +10,12 @@ from torch import Tensor
 
 from torchcal.data import Recording
 from torchcal.embeddings import PolynomialChaos
-from torchcal.errors import SimulatorError
+from torchcal.errors import ConvergenceWarning, SimulatorError
 from torchcal.inference.newton import minimise
 from torchcal.inference.randomness import preserve_random_state
 from torchcal.priors import Flat
 from torchcal.propagation import NISP
-from torchcal.simulators import Scaling, Simulator, free_parameters
+from torchcal.simulators import Parameter, Scaling, Simulator, free_parameters
 
 __all__ = ["LeastSquares", "least_squares"]
 
@@ -66,11 +67,14 @@ def least_squares(
     scaling = Scaling.from_parameters(free)
     with preserve_random_state(seed):
         propagate, prior = build(scaling)
-        reach = 10 ** (torch.rand(_LEAST_SQUARES_STARTS, 1, dtype=torch.float64) * 2.5 - 1)
-        unbounded = ~torch.isfinite(prior.low - prior.high)
         starts = prior.sample((_LEAST_SQUARES_STARTS,))
-        starts = torch.where(unbounded, starts * reach, starts)
-        starts[0] = 0
+        # Without two bounds the size is unknown: decades up to that of the data, parameter by parameter.
+        decades = max(1.5, 1 + float(y[observed].abs().max().clamp_min(1.0).log10()))
+        reach = 10 ** (torch.rand(starts.shape, dtype=torch.float64) * (decades + 1) - 1)
+        reach[::2] = 10 ** (torch.rand(len(starts[::2]), 1, dtype=torch.float64) * 2.5 - 1)
+    unbounded = ~torch.isfinite(prior.high - prior.low)
+    starts = torch.where(unbounded, starts * reach, starts)
+    starts[0] = _first_guess(free, scaling)
     best = _fit(propagate, prior, residual, prior.transform.unbound(starts))
     for _ in range(2):  # once more in the coordinates that the first fit suggests
         slope = _sensitivity(propagate, best, residual)
@@ -90,9 +94,23 @@ def least_squares(
         best = _fit(propagate, prior, residual, prior.transform.unbound(starts))
     with torch.no_grad():
         relative = residual(propagate, best)
-    return LeastSquares(
-        scaling, best, relative * spread[observed], float(relative.square().mean().sqrt())
-    )
+    left = float(relative.square().mean().sqrt())
+    guessed = [p.name for p in free if p.initial is None and (p.low is None or p.high is None)]
+    if left > 1 and guessed:
+        warnings.warn(
+            f"The best single parameter vector leaves residuals of {left:.3g} times the spread of the data, so it fits "
+            f"no better than a constant. If a better one exists, give {', '.join(guessed)} initial= or bounds.",
+            ConvergenceWarning,
+            stacklevel=3,
+        )
+    return LeastSquares(scaling, best, relative * spread[observed], left)
+
+
+def _first_guess(free: Sequence[Parameter], scaling: Scaling) -> Tensor:
+    """The user's ``initial`` values, and the centre of the others, in scaled coordinates."""
+    center = scaling.physical(torch.zeros(len(free), dtype=torch.float64))
+    guess = [float(center[i]) if p.initial is None else p.initial for i, p in enumerate(free)]
+    return scaling.scaled(torch.tensor(guess, dtype=torch.float64))
 
 
 def _fit(
@@ -112,8 +130,8 @@ def _fit(
 
 def _sensitivity(propagate: NISP, point: Tensor, residual: Callable[[NISP, Tensor], Tensor]) -> Tensor:
     """RMS over the data of ∂(output / spread)/∂λ̃, by central differences, ``(d,)``."""
-    step = 1e-5
-    shift = step * torch.eye(len(point), dtype=point.dtype)
+    step = 1e-5 * point.abs().clamp_min(1.0)
+    shift = torch.diag(step)
     with torch.no_grad():
         change = residual(propagate, point + shift) - residual(propagate, point - shift)
-    return (change / (2 * step)).square().mean(-1).sqrt()
+    return (change / (2 * step[:, None])).square().mean(-1).sqrt()

@@ -47,11 +47,12 @@ def gradient(objective: Objective, points: Tensor) -> tuple[Tensor, Tensor]:
 def hessian(objective: Objective, points: Tensor, *, step: float = _STEP) -> Tensor:
     """Hessians ``(B, P, P)`` by central differences of the gradient, all of them in one batch."""
     batch, size = points.shape
-    shift = step * torch.eye(size, dtype=points.dtype, device=points.device)
+    length = step * points.abs().clamp_min(1.0)  # coordinates that are not scaled yet may be large
+    shift = torch.diag_embed(length)
     both = torch.stack([points[:, None] + shift, points[:, None] - shift])  # (2, B, P, P)
     _, slopes = gradient(objective, both.reshape(-1, size))
     slopes = slopes.reshape(2, batch, size, size)
-    result = (slopes[0] - slopes[1]) / (2 * step)
+    result = (slopes[0] - slopes[1]) / (2 * length[..., None])
     return 0.5 * (result + result.transpose(-1, -2))
 
 

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from torchcal import models
-from torchcal.errors import ConvergenceWarning, DomainError
+from torchcal.errors import ConvergenceWarning, DomainError, ImproperPosteriorError
 from torchcal.inference.batched import run_batched_nuts
 from torchcal.inference.draws import Draws
 from torchcal.inference.estimate import Estimate, Laplace, laplace
@@ -29,6 +29,12 @@ def draw(
     progress: bool,
 ) -> Draws:
     """Draw from the posterior of a problem, in coordinates whitened at its mode, with arithmetic in ``dtype``."""
+    if estimate.unseen and not problem.prior.proper:
+        raise ImproperPosteriorError(
+            "Expected a proper posterior to draw from. Got one that does not change with "
+            f"{', '.join(estimate.unseen)}, under a flat prior. Hold a parameter with fixed=, give it bounds and a "
+            "Uniform prior, or use num_samples=0 for the maximum alone."
+        )
     approximation = laplace(problem, estimate)
     _warn_of_rounding(estimate, dtype)
     problem = problem.cast(dtype)

@@ -143,6 +143,13 @@ def embedded_problem(
             "do not constrain all coefficients, and the density at the data grows without limit as the spread "
             "vanishes. Use a Uniform or Normal prior, or ABC()."
         )
+    flat = int((~torch.isfinite(distribution.high - distribution.low)).sum())
+    if likelihood.name in ("marginal", "gaussian_marginal") and not distribution.proper and int(observed.sum()) <= flat:
+        raise ImproperPosteriorError(
+            f"Expected more data than flat coefficients for the {likelihood.name} likelihood. Got N = "
+            f"{int(observed.sum())} and {flat}: far out the likelihood falls with the spread to the power of -N only, "
+            "and the posterior has no finite integral. Use a Uniform or Normal prior, ABC(), or more data."
+        )
     if likelihood.needs == "mean" and germs and not distribution.proper:
         raise ImproperPosteriorError(
             "Expected a proper prior with the mean-only ABC likelihood. Got a flat one: the likelihood does not "

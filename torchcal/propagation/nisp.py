@@ -87,6 +87,10 @@ class NISP(nn.Module):
         max_elements: int = 2**24,
     ) -> None:
         super().__init__()
+        if not isinstance(simulator, Simulator):
+            raise DomainError(f"Expected a torchcal.Simulator. Got {type(simulator).__name__}. Wrap the function.")
+        if not isinstance(embedding, Embedding):
+            raise DomainError(f"Expected one of torchcal.embeddings, such as Gaussian(). Got {embedding!r}.")
         if order is not None and (isinstance(order, bool) or not isinstance(order, int) or order < 1):
             raise DomainError(f"Expected order as a positive integer or None. Got {order!r}.")
         if not (math.isfinite(sd_floor) and sd_floor > 0):
@@ -315,6 +319,8 @@ class NISP(nn.Module):
     # --- inside ------------------------------------------------------------------------------------------
 
     def _check_alpha(self, alpha: Tensor) -> None:
+        if not isinstance(alpha, Tensor):
+            raise ShapeError(f"Expected alpha as a tensor (*batch, {self.num_alpha}). Got {type(alpha).__name__}.")
         if alpha.ndim < 1 or alpha.shape[-1] != self.num_alpha:
             raise ShapeError(
                 f"Expected alpha of shape (*batch, {self.num_alpha}): {', '.join(self.alpha_names)}. "

@@ -69,11 +69,13 @@ class Parameter:
             raise DomainError(
                 f"Expected transform None or 'log' for parameter {self.name!r}. Got {self.transform!r}."
             )
-        if self.initial is not None and not self.contains(self.initial):
-            raise DomainError(
-                f"Expected initial of parameter {self.name!r} between its bounds "
-                f"[{self.low}, {self.high}]. Got {self.initial}."
-            )
+        for field in ("initial", "neutral"):
+            value = getattr(self, field)
+            if value is not None and not self.contains(value):
+                raise DomainError(
+                    f"Expected {field} of parameter {self.name!r} between its bounds [{self.low}, {self.high}]. "
+                    f"Got {value}. Move the bounds or the value."
+                )
         if self.transform == "log":
             for field in ("low", "high", "initial", "neutral"):
                 value = getattr(self, field)
@@ -119,6 +121,10 @@ def free_parameters(
             number = math.nan
         if not math.isfinite(number):
             raise DomainError(f"Expected a finite value for the fixed parameter {name!r}. Got {value!r}.")
+        parameter = parameters[names.index(name)]
+        if not parameter.contains(number) or (parameter.transform == "log" and number <= 0):
+            bounds = "positive values" if parameter.transform == "log" else f"[{parameter.low}, {parameter.high}]"
+            raise DomainError(f"Expected the fixed parameter {name!r} within {bounds}. Got {number}.")
         held[name] = number
     for parameter in parameters:
         if parameter.neutral is not None and parameter.name not in held:
