@@ -55,8 +55,9 @@ class NISP(nn.Module):
 
     Shapes: ``forward`` maps α ``(*batch, P)`` to mean and sd, ``(*batch, n)`` each, in the outputs' units.
 
-    >>> line = Simulator(lambda x, p: p["a"] * x, [Parameter("a")])
     >>> from torchcal.embeddings import Gaussian
+    >>> from torchcal.simulators import Parameter
+    >>> line = Simulator(lambda x, p: p["a"] * x, [Parameter("a")])
     >>> mean, sd = NISP(line, Gaussian(), torch.tensor([2.0]).double())(torch.tensor([3.0, 0.5]).double())
     >>> print(f"{float(mean):.3f} {float(sd):.3f}")
     6.000 1.000
