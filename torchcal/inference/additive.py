@@ -12,7 +12,7 @@ from torchcal.embeddings import PolynomialChaos
 from torchcal.errors import ImproperPosteriorError
 from torchcal.inference.estimate import maximise
 from torchcal.inference.fitting import LeastSquares, least_squares
-from torchcal.inference.sampling import check_counts, draw
+from torchcal.inference.sampling import Plan, draw
 from torchcal.inference.setup import check_inputs, check_run
 from torchcal.inference.summary import diagnose, settings_of, to_result, warn_of_box, warn_of_chains
 from torchcal.models import Problem
@@ -37,6 +37,7 @@ def calibrate_additive(
     device: torch.device | str | None = None,
     dtype: torch.dtype = torch.float64,
     sampler: str = "nuts",
+    target_accept: float | None = None,
     progress: bool = False,
 ) -> AdditiveCalibration:
     r"""Calibrate the conventional way: λ and ln σ of an additive Gaussian discrepancy (Eqs. 2-4).
@@ -57,14 +58,16 @@ def calibrate_additive(
         dtype: Of the sampler's arithmetic; the maximum is always found in float64.
         sampler: ``"nuts"``, all chains as one batched tensor program; or ``"pyro"``, Pyro's NUTS on the Pyro model,
             chain after chain, which is the reference.
+        target_accept: Mean acceptance that the step size aims at, between 0 and 1; by default 0.8, and more where
+            trajectories diverge.
         progress: Whether to show a bar.
 
     Raises:
         ImproperPosteriorError: If the model fits the data exactly, or has as many parameters as there are data:
             the likelihood then grows without limit as σ → 0.
     """
-    num_samples, num_chains, num_warmup = check_counts(num_samples, num_chains, num_warmup, num_starts, sampler)
-    check_run(seed, device, dtype)
+    plan = Plan(num_samples, num_chains, num_warmup, sampler, seed, dtype, target_accept, progress)
+    check_run(num_starts, device)
     free, _ = check_inputs(simulator, recording, fixed)
     observed = recording.observed
     count = int(observed.sum())
@@ -102,9 +105,7 @@ def calibrate_additive(
     estimate = maximise(problem, fit.scaled, starts=None, num_starts=num_starts, seed=seed)
     draws = None
     if num_samples:
-        draws = draw(
-            problem, estimate, models.additive, num_samples, num_chains, num_warmup, seed, sampler, dtype, progress
-        )
+        draws = draw(problem, estimate, models.additive, plan)
     names = (*propagate.pattern.names, "ln sigma")
     samples = None if draws is None else draws.alpha
     quality = diagnose(estimate, draws, samples, None, names, None)
@@ -124,7 +125,7 @@ def calibrate_additive(
         diagnostics=quality,
         recording=recording,
         propagate=propagate,
-        settings=settings_of(propagate, fit, "additive", seed, num_warmup),
+        settings=settings_of(propagate, fit, "additive", seed, plan.warmup),
     )
 
 

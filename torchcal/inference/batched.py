@@ -19,6 +19,9 @@ __all__ = ["run_batched_nuts"]
 _WINDOWS = (0.3, 0.3, 0.4)
 """Shares of the warm-up: two windows that end in new coordinates, and one that sets the step size for good."""
 
+DIVERGING = 5e-4
+"""Share of divergent transitions at the end of the warm-up from which on smaller steps are tried."""
+
 _WARM_UP_CHAINS = 64
 """Chains that adapt together: pooled draws make the covariance reliable after a few transitions each."""
 
@@ -97,7 +100,7 @@ def run_batched_nuts(
     num_warmup: int,
     seed: int,
     cost: int = 1,
-    target_accept: float = 0.8,
+    target_accept: float | None = None,
     max_tree_depth: int = 10,
     progress: bool = False,
 ) -> Draws:
@@ -113,7 +116,8 @@ def run_batched_nuts(
         num_warmup: Transitions of a chain that are thrown away.
         seed: Of every random number.
         cost: Numbers that one evaluation of one chain handles; dear densities warm up with fewer chains.
-        target_accept: Mean acceptance that the step size aims at.
+        target_accept: Mean acceptance that the step size aims at; by default 0.8, and more where trajectories
+            diverge at the end of the warm-up: a curved ridge needs smaller steps than its width suggests.
         max_tree_depth: Largest depth of a trajectory, 2**depth steps.
         progress: Whether to show a bar.
 
@@ -126,7 +130,8 @@ def run_batched_nuts(
     crowd = max(num_chains, min(_WARM_UP_CHAINS, max(4, 2**22 // max(1, cost))))
     space = _Whitened(log_density, loc, scale_tril)
     z = _starting_points(space, crowd, generator)
-    averaging = _DualAveraging(math.log(0.5), target_accept)
+    accept = 0.8 if target_accept is None else target_accept
+    averaging = _DualAveraging(math.log(0.5), accept)
     bar = tqdm(total=num_warmup + num_samples, desc="NUTS", disable=not progress, leave=False)
     stored = torch.full((num_samples, num_chains, len(loc)), torch.nan, dtype=loc.dtype, device=device)
     filled = torch.zeros(num_chains, dtype=torch.long, device=device)
@@ -137,12 +142,16 @@ def run_batched_nuts(
             # Short trees at first: a step size that starts far too small must not cost thousands of gradients.
             depth = min(max_tree_depth, 6) if number == 0 else max_tree_depth
             window = nuts_step.Tables.build(depth, device)
-            pooled, z = _adapt(space, z, averaging, length, window, generator, bar)
+            pooled, z, diverging = _adapt(space, z, averaging, length, window, generator, bar)
             if number < len(_WINDOWS) - 1:
                 other, _ = space.refined(pooled)
                 z = space.moved(z, other)
                 space = other
-                averaging = _DualAveraging(averaging.averaged, target_accept)
+                averaging = _DualAveraging(averaging.averaged, accept)
+        while target_accept is None and diverging > DIVERGING and accept < 0.98:
+            accept = 0.5 * (1 + accept)
+            averaging = _DualAveraging(averaging.averaged, accept)
+            _, z, diverging = _adapt(space, z, averaging, length, window, generator, bar)
         step_size = math.exp(averaging.averaged)
         state = nuts_step.init(
             z[:num_chains], space.potential, step_size=step_size, tables=tables, generator=generator
@@ -199,8 +208,8 @@ def _adapt(
     tables: nuts_step.Tables,
     generator: torch.Generator,
     bar: tqdm,
-) -> tuple[Tensor, Tensor]:
-    """One warm-up window. Returns the draws of its second half, and where every chain is."""
+) -> tuple[Tensor, Tensor, float]:
+    """One warm-up window: the draws of its second half, where every chain is, and the share that diverged in it."""
     chains = len(z)
     state = nuts_step.init(
         z, space.potential, step_size=averaging.step_size, tables=tables, generator=generator
@@ -208,7 +217,7 @@ def _adapt(
     finished = shown = 0
     pooled: list[Tensor] = []
     accepted: list[Tensor] = []
-    waiting = 0
+    waiting = diverged = 0
     while finished < length * chains:
         state, outcome = nuts_step.step(
             state, space.potential, step_size=averaging.step_size, tables=tables, generator=generator
@@ -227,6 +236,8 @@ def _adapt(
             waiting = 0
         if finished > length * chains // 2:
             pooled.append(outcome.position[outcome.done])
+            diverged += int(outcome.divergent.sum())
         bar.update(finished // chains - shown)
         shown = finished // chains
-    return torch.cat(pooled), state.proposal[:, 0]
+    draws = torch.cat(pooled)
+    return draws, state.proposal[:, 0], diverged / len(draws)

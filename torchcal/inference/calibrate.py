@@ -15,7 +15,7 @@ from torchcal.errors import DomainError
 from torchcal.inference.draws import Draws
 from torchcal.inference.estimate import check_starts, maximise
 from torchcal.inference.fitting import least_squares
-from torchcal.inference.sampling import check_counts, draw
+from torchcal.inference.sampling import Plan, draw
 from torchcal.inference.setup import PriorMaker, check_inputs, check_run, embedded_problem
 from torchcal.inference.summary import (
     diagnose,
@@ -55,6 +55,7 @@ def calibrate(
     device: torch.device | str | None = None,
     dtype: torch.dtype = torch.float64,
     sampler: str = "nuts",
+    target_accept: float | None = None,
     progress: bool = False,
 ) -> Calibration:
     r"""Calibrate a simulator whose model error is embedded in its parameters.
@@ -82,6 +83,8 @@ def calibrate(
         dtype: Of the sampler's arithmetic; the maximum is always found in float64.
         sampler: ``"nuts"``, all chains as one batched tensor program; or ``"pyro"``, Pyro's NUTS on the Pyro model,
             chain after chain, which is the reference.
+        target_accept: Mean acceptance that the step size aims at, between 0 and 1; by default 0.8, and more where
+            trajectories diverge.
         progress: Whether to show a bar.
 
     Returns:
@@ -98,11 +101,11 @@ def calibrate(
 
     Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276.
     """
-    num_samples, num_chains, num_warmup = check_counts(num_samples, num_chains, num_warmup, num_starts, sampler)
+    plan = Plan(num_samples, num_chains, num_warmup, sampler, seed, dtype, target_accept, progress)
+    check_run(num_starts, device)
     embedding = Gaussian() if embedding is None else embedding
     if not isinstance(embedding, Embedding):
         raise DomainError(f"Expected one of torchcal.embeddings. Got {type(embedding).__name__}.")
-    check_run(seed, device, dtype)
     free, _ = check_inputs(simulator, recording, fixed)
 
     def build(scaling: Scaling, rule: Any) -> Problem:
@@ -128,9 +131,7 @@ def calibrate(
     draws: Draws | None = None
     samples: Tensor | None = None
     if num_samples:
-        draws = draw(
-            problem, estimate, models.embedded, num_samples, num_chains, num_warmup, seed, sampler, dtype, progress
-        )
+        draws = draw(problem, estimate, models.embedded, plan)
         samples = draws.alpha
         if problem.prior.symmetric:
             samples = propagate.pattern.flip(samples, estimate.alpha.to(samples))
@@ -164,7 +165,7 @@ def calibrate(
         embedding=embedding,
         likelihood=problem.likelihood,
         propagate=propagate,
-        settings=settings_of(propagate, fit, type(embedding).__name__, seed, num_warmup),
+        settings=settings_of(propagate, fit, type(embedding).__name__, seed, plan.warmup),
     )
 
 

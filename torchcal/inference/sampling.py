@@ -1,6 +1,7 @@
 """Which sampler draws, from where, and how much."""
 
 import warnings
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -13,22 +14,58 @@ from torchcal.inference.estimate import Estimate, Laplace, laplace
 from torchcal.inference.nuts import run_nuts
 from torchcal.models import Problem
 
-__all__ = ["check_counts", "draw"]
+__all__ = ["Plan", "draw"]
 
 
-def draw(
-    problem: Problem,
-    estimate: Estimate,
-    model: Any,
-    num_samples: int,
-    num_chains: int,
-    num_warmup: int,
-    seed: int,
-    sampler: str,
-    dtype: torch.dtype,
-    progress: bool,
-) -> Draws:
-    """Draw from the posterior of a problem, in coordinates whitened at its mode, with arithmetic in ``dtype``."""
+@dataclass(frozen=True)
+class Plan:
+    """How much to draw, how, and with which seed. Checked when it is made.
+
+    Attributes:
+        num_samples: Draws a chain; 0 for none.
+        num_chains: Chains.
+        num_warmup: Draws thrown away a chain; None for the sampler's default.
+        sampler: ``"nuts"`` or ``"pyro"``.
+        seed: Of every random number.
+        dtype: Of the sampler's arithmetic.
+        target_accept: Mean acceptance that the step size aims at; None to choose.
+        progress: Whether to show a bar.
+    """
+
+    num_samples: int
+    num_chains: int
+    num_warmup: int | None
+    sampler: str
+    seed: int
+    dtype: torch.dtype
+    target_accept: float | None
+    progress: bool
+
+    def __post_init__(self) -> None:
+        if self.sampler not in ("nuts", "pyro"):
+            raise DomainError(f"Expected sampler 'nuts' or 'pyro'. Got {self.sampler!r}.")
+        for name, least in (("num_samples", 0), ("num_chains", 1), ("num_warmup", 1), ("seed", 0)):
+            value = getattr(self, name)
+            if name == "num_warmup" and value is None:
+                continue
+            if isinstance(value, bool) or not isinstance(value, int) or value < least:
+                raise DomainError(f"Expected {name} as an integer of at least {least}. Got {value!r}.")
+        if self.dtype not in (torch.float32, torch.float64):
+            raise DomainError(f"Expected dtype torch.float64 or torch.float32. Got {self.dtype!r}.")
+        accept = self.target_accept
+        if accept is not None and not (isinstance(accept, float) and 0 < accept < 1):
+            raise DomainError(f"Expected target_accept between 0 and 1, or None. Got {accept!r}.")
+
+    @property
+    def warmup(self) -> int:
+        """Draws thrown away a chain. Pooled over a crowd, adaptation needs fewer of each than chain by chain."""
+        if self.num_warmup is not None:
+            return self.num_warmup
+        return 100 if self.sampler == "nuts" else max(300, self.num_samples // 2)
+
+
+def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
+    """Draw from the posterior of a problem, in coordinates whitened at its mode, as planned."""
     if estimate.unseen and not problem.prior.proper:
         raise ImproperPosteriorError(
             "Expected a proper posterior to draw from. Got one that does not change with "
@@ -36,22 +73,23 @@ def draw(
             "Uniform prior, or use num_samples=0 for the maximum alone."
         )
     approximation = laplace(problem, estimate)
-    _warn_of_rounding(estimate, dtype)
-    problem = problem.cast(dtype)
-    approximation = Laplace(approximation.loc.to(dtype), approximation.scale_tril.to(dtype))
-    if sampler == "nuts":
+    _warn_of_rounding(estimate, plan.dtype)
+    problem = problem.cast(plan.dtype)
+    approximation = Laplace(approximation.loc.to(plan.dtype), approximation.scale_tril.to(plan.dtype))
+    if plan.sampler == "nuts":
         transform = problem.prior.transform
         return run_batched_nuts(
             lambda u: problem.log_prob(transform.bound(u)) + transform.log_slope(u),
             transform,
             loc=approximation.loc,
             scale_tril=approximation.scale_tril,
-            num_samples=num_samples,
-            num_chains=num_chains,
-            num_warmup=num_warmup,
-            seed=seed,
+            num_samples=plan.num_samples,
+            num_chains=plan.num_chains,
+            num_warmup=plan.warmup,
+            seed=plan.seed,
             cost=problem.propagate.num_nodes * len(problem.y),
-            progress=progress,
+            target_accept=plan.target_accept,
+            progress=plan.progress,
         )
     prior = problem.prior.whitened(approximation.loc, approximation.scale_tril)
     arguments: tuple[Any, ...] = (problem.y, problem.propagate)
@@ -63,11 +101,12 @@ def draw(
         model,
         arguments,
         prior,
-        num_samples=num_samples,
-        num_chains=num_chains,
-        num_warmup=num_warmup,
-        seed=seed,
-        progress=progress,
+        num_samples=plan.num_samples,
+        num_chains=plan.num_chains,
+        num_warmup=plan.warmup,
+        seed=plan.seed,
+        target_accept=0.8 if plan.target_accept is None else plan.target_accept,
+        progress=plan.progress,
     )
 
 
@@ -81,23 +120,3 @@ def _warn_of_rounding(estimate: Estimate, dtype: torch.dtype) -> None:
             ConvergenceWarning,
             stacklevel=4,
         )
-
-
-def check_counts(
-    num_samples: int, num_chains: int, num_warmup: int | None, num_starts: int, sampler: str
-) -> tuple[int, int, int]:
-    """Raise for numbers that make no sense; fill in the default warm-up."""
-    if sampler not in ("nuts", "pyro"):
-        raise DomainError(f"Expected sampler 'nuts' or 'pyro'. Got {sampler!r}.")
-    # Pooled over a crowd of chains, adaptation needs fewer transitions of each than chain by chain.
-    default = 100 if sampler == "nuts" else max(300, num_samples // 2)
-    warmup = default if num_warmup is None else num_warmup
-    for name, value, least in (
-        ("num_samples", num_samples, 0),
-        ("num_chains", num_chains, 1),
-        ("num_warmup", warmup, 1),
-        ("num_starts", num_starts, 1),
-    ):
-        if isinstance(value, bool) or not isinstance(value, int) or value < least:
-            raise DomainError(f"Expected {name} as an integer of at least {least}. Got {value!r}.")
-    return num_samples, num_chains, warmup

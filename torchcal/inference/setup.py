@@ -54,12 +54,10 @@ def check_inputs(
     return free, held
 
 
-def check_run(seed: int, device: torch.device | str | None, dtype: torch.dtype) -> None:
-    """Raise for a seed, device or dtype that cannot be used."""
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise DomainError(f"Expected seed as a non-negative integer. Got {seed!r}.")
-    if dtype not in (torch.float32, torch.float64):
-        raise DomainError(f"Expected dtype torch.float64 or torch.float32. Got {dtype!r}.")
+def check_run(num_starts: int, device: torch.device | str | None) -> None:
+    """Raise for a number of starts or a device that cannot be used."""
+    if isinstance(num_starts, bool) or not isinstance(num_starts, int) or num_starts < 1:
+        raise DomainError(f"Expected num_starts as an integer of at least 1. Got {num_starts!r}.")
     if device is None:
         return
     try:
