@@ -97,7 +97,6 @@ def expected_error(likelihood, embedding, prior, count):
     return None
 
 
-IMPROPER = pytest.mark.xfail(reason="a flat prior with the full likelihood is let through")
 
 
 def combinations():

@@ -8,10 +8,9 @@ from torch import Tensor
 
 from torchcal import likelihoods, models
 from torchcal.data import Recording
-from torchcal.embeddings import PolynomialChaos
 from torchcal.errors import ImproperPosteriorError
 from torchcal.inference.estimate import maximise
-from torchcal.inference.fitting import LeastSquares, least_squares
+from torchcal.inference.fitting import LeastSquares, least_squares, plain_propagation
 from torchcal.inference.sampling import Plan, draw
 from torchcal.inference.setup import check_inputs, check_run
 from torchcal.inference.summary import diagnose, settings_of, to_result, warn_of_box, warn_of_chains
@@ -85,14 +84,7 @@ def calibrate_additive(
             "torchcal.calibrate."
         )
     y = torch.where(observed, recording.y, torch.zeros_like(recording.y))
-    propagate = NISP(
-        simulator,
-        PolynomialChaos(order=0),
-        recording.x,
-        fixed=fixed,
-        outputs=recording.outputs,
-        scaling=fit.scaling,
-    ).to(device=device)
+    propagate = plain_propagation(simulator, recording, fixed, fit.scaling).to(device=device)
     noise = recording.noise_sd
     problem = Problem(
         y=y.to(device=device),

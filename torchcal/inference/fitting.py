@@ -17,7 +17,7 @@ from torchcal.priors import Flat
 from torchcal.propagation import NISP
 from torchcal.simulators import Parameter, Scaling, Simulator, free_parameters
 
-__all__ = ["LeastSquares", "least_squares"]
+__all__ = ["LeastSquares", "least_squares", "plain_propagation"]
 
 _LEAST_SQUARES_STARTS = 64
 
@@ -54,14 +54,7 @@ def least_squares(
         return ((propagate.mean(scaled) - y) / spread)[..., observed]
 
     def build(scaling: Scaling) -> tuple[NISP, Flat]:
-        propagate = NISP(
-            simulator,
-            PolynomialChaos(order=0),
-            recording.x,
-            fixed=fixed,
-            outputs=recording.outputs,
-            scaling=scaling,
-        )
+        propagate = plain_propagation(simulator, recording, fixed, scaling)
         return propagate, Flat(propagate)
 
     scaling = Scaling.from_parameters(free)
@@ -104,6 +97,20 @@ def least_squares(
             stacklevel=3,
         )
     return LeastSquares(scaling, best, relative * spread[observed], left)
+
+
+def plain_propagation(
+    simulator: Simulator, recording: Recording, fixed: Mapping[str, float] | None, scaling: Scaling
+) -> NISP:
+    """The simulator itself, without model error, at a recording's conditions."""
+    return NISP(
+        simulator,
+        PolynomialChaos(order=0),
+        recording.x,
+        fixed=fixed,
+        outputs=recording.outputs,
+        scaling=scaling,
+    )
 
 
 def _first_guess(free: Sequence[Parameter], scaling: Scaling) -> Tensor:

@@ -1,6 +1,7 @@
 """Frozen results: predict, print, save and load, export."""
 
-from torchcal.results.calibration import AdditiveCalibration, Calibration
+from torchcal.results.additive import AdditiveCalibration
+from torchcal.results.calibration import Calibration
 from torchcal.results.diagnostics import Diagnostics, Quality
 from torchcal.results.estimate import MapEstimate
 

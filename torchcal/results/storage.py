@@ -21,7 +21,8 @@ from torchcal.results.estimate import MapEstimate
 from torchcal.simulators import Scaling, Simulator
 
 if TYPE_CHECKING:
-    from torchcal.results.calibration import AdditiveCalibration, Calibration
+    from torchcal.results.additive import AdditiveCalibration
+    from torchcal.results.calibration import Calibration
 
 __all__ = ["additive_tree", "calibration_tree", "read_additive", "read_calibration", "to_arviz", "write"]
 

@@ -1,0 +1,124 @@
+"""The result of a conventional calibration."""
+
+import dataclasses
+import os
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from torch import Tensor
+
+from torchcal.data import Recording
+from torchcal.errors import DomainError
+from torchcal.prediction import (
+    AdditivePrediction,
+    additive_prediction,
+)
+from torchcal.propagation import NISP
+from torchcal.results import storage
+from torchcal.results.base import Result, conditions, indent, thin
+from torchcal.results.diagnostics import Diagnostics, table
+from torchcal.results.estimate import MapEstimate
+from torchcal.simulators import Simulator
+
+__all__ = ["AdditiveCalibration"]
+
+
+@dataclasses.dataclass(frozen=True, repr=False, eq=False)
+class AdditiveCalibration(Result):
+    """Result of `torchcal.calibrate_additive`, the conventional calibration.
+
+    Attributes:
+        map: The maximum a posteriori; ``alpha`` is λ̃ and ln σ, the covariance is zero.
+        samples: Draws of (λ̃, ln σ), ``(chains, draws, d + 1)``, or None.
+        diagnostics: How far to trust them.
+        recording: The data.
+        propagate: Zero-order propagation; `None` on a result loaded without a simulator.
+        settings: Numbers that the calibration was run with.
+    """
+
+    map: MapEstimate
+    samples: Tensor | None
+    diagnostics: Diagnostics
+    recording: Recording
+    propagate: NISP | None
+    settings: Mapping[str, Any]
+    stored: AdditivePrediction | None = None
+
+    @property
+    def parameters(self) -> Tensor:
+        """Draws of λ in physical units, ``(S, d)``."""
+        return self._propagation().scaling.physical(self._needed_draws()[:, :-1])
+
+    @property
+    def sigma(self) -> Tensor:
+        """Draws of σ in the output's unit, ``(S,)``."""
+        return self._needed_draws()[:, -1].exp()
+
+    def predict(
+        self,
+        x: Any = None,
+        *,
+        function: Callable[[Any, dict[str, Tensor]], Any] | None = None,
+        max_draws: int = 4000,
+    ) -> AdditivePrediction:
+        """Push-forward and posterior predictive, kept apart.
+
+        Args:
+            x: Conditions, the data's by default.
+            function: Another function of the parameters; its posterior predictive adds nothing to the
+                push-forward but σ², which has no meaning there: read ``push_forward``.
+            max_draws: At most this many draws, evenly spaced, are averaged over.
+        """
+        if self.propagate is None and x is None and function is None and self.stored is not None:
+            return self.stored
+        propagate = self._propagation()
+        if x is not None or function is not None:
+            where = propagate.x if x is None else conditions(x, None if function else self.recording)
+            other = None if function is None else Simulator(function, propagate.simulator.parameters)
+            propagate = propagate.at(where, simulator=other)
+        return additive_prediction(
+            propagate,
+            self.map.alpha[:-1],
+            thin(self.draws, max_draws),
+            log_sigma_map=float(self.map.alpha[-1]),
+        )
+
+    def _propagation(self) -> NISP:
+        if self.propagate is None:
+            raise DomainError(
+                "Expected a simulator. Got a calibration that was loaded without one. Use "
+                "AdditiveCalibration.load(path, simulator=...)."
+            )
+        return self.propagate
+
+    def _needed_draws(self) -> Tensor:
+        draws = self.draws
+        if draws is None:
+            raise DomainError("Expected posterior draws. Got a calibration with num_samples=0.")
+        return draws
+
+    def to_datatree(self) -> Any:
+        """The result as an ``xarray.DataTree``."""
+        return storage.additive_tree(self)
+
+    @classmethod
+    def load(
+        cls, path: str | os.PathLike[str], *, simulator: Simulator | None = None
+    ) -> "AdditiveCalibration":
+        """Read a result that `save` wrote."""
+        return storage.read_additive(cls, path, simulator)
+
+    def __str__(self) -> str:
+        lines = ["Calibration with an additive Gaussian discrepancy"]
+        lines.append(f"  data: {self.recording.n} conditions, outputs {', '.join(self.recording.outputs)}")
+        rows = []
+        draws = None if self.draws is None or self.propagate is None else self.parameters
+        for i, name in enumerate(self.map.parameters):
+            unit = self.settings["units"].get(name) or ""
+            sd = "" if draws is None else f"{float(draws[:, i].std()):.3g}"
+            rows.append((f"{name} [{unit}]" if unit else name, f"{self.map.mean[i]:.6g}", sd))
+        sd = "" if self.draws is None else f"{float(self.sigma.std()):.3g}"
+        rows.append(("sigma", f"{float(self.map.alpha[-1].exp()):.6g}", sd))
+        lines.append(indent(table(("parameter", "MAP", "posterior sd"), rows)))
+        lines.append(indent(str(self.diagnostics)))
+        return "\n".join(lines)

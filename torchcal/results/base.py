@@ -1,0 +1,100 @@
+"""What all results can do: print themselves, be saved and be exported."""
+
+import html
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchcal.data import Recording
+from torchcal.errors import DomainError
+from torchcal.results import storage
+from torchcal.results.estimate import MapEstimate
+from torchcal.simulators import Conditions
+
+__all__ = ["Result", "conditions", "indent", "thin"]
+
+
+class Result:
+    """Base class of frozen results."""
+
+    map: MapEstimate
+    samples: Tensor | None
+
+    @property
+    def alpha_names(self) -> tuple[str, ...]:
+        """The names of the columns of ``samples``."""
+        return self.map.alpha_names
+
+    @property
+    def draws(self) -> Tensor | None:
+        """All chains' draws, one below the other, ``(S, columns)``."""
+        return None if self.samples is None else self.samples.flatten(0, 1)
+
+    def to_datatree(self) -> Any:
+        """The result as an ``xarray.DataTree``."""
+        raise TypeError(f"{type(self).__name__} has no tree.")
+
+    def to_arviz(self) -> Any:
+        """The result as ``arviz.InferenceData`` (a ``DataTree`` from ArviZ 1.0 on)."""
+        return storage.to_arviz(self.to_datatree())
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the result to a netCDF file, whole or not at all. The simulator's code is not stored."""
+        storage.write(self.to_datatree(), path)
+
+    def __repr__(self) -> str:
+        return str(self)
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(str(self))}</pre>"
+
+
+def thin(draws: Tensor | None, most: int) -> Tensor | None:
+    """At most ``most`` draws, evenly spaced."""
+    if isinstance(most, bool) or not isinstance(most, int) or most < 1:
+        raise DomainError(f"Expected max_draws as a positive integer. Got {most!r}.")
+    if draws is None or len(draws) <= most:
+        return draws
+    return draws[torch.linspace(0, len(draws) - 1, most).round().long()]
+
+
+def conditions(x: Any, recording: Recording | None) -> Conditions:
+    """New conditions as float64 tensors, with the names of the recording's where there is one."""
+    if recording is None:
+        wanted = tuple(x) if isinstance(x, Mapping) else None
+    else:
+        wanted = tuple(recording.x) if isinstance(recording.x, Mapping) else None
+    if wanted is None:
+        if isinstance(x, Mapping):
+            raise DomainError(f"Expected conditions as one array, as in the recording. Got a dict {list(x)}.")
+        return _vector(x, "x")
+    if not isinstance(x, Mapping) or set(x) != set(wanted):
+        got = list(x) if isinstance(x, Mapping) else type(x).__name__
+        raise DomainError(f"Expected conditions as a dict with {list(wanted)}. Got {got}.")
+    values = {name: _vector(x[name], name) for name in wanted}
+    if len({len(value) for value in values.values()}) > 1:
+        raise DomainError(
+            f"Expected conditions of one length. Got { {name: len(v) for name, v in values.items()} }."
+        )
+    return values
+
+
+def _vector(value: Any, name: str) -> Tensor:
+    try:
+        array = torch.as_tensor(value, dtype=torch.float64).detach()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise DomainError(f"Expected condition {name!r} as numbers of shape (n,). Got {value!r}.") from error
+    if array.ndim == 0:
+        array = array[None]
+    if array.ndim != 1 or not len(array) or not bool(torch.isfinite(array).all()):
+        what = f"shape {tuple(array.shape)}" if array.ndim != 1 or not len(array) else "values that are not finite"
+        raise DomainError(f"Expected condition {name!r} as finite numbers of shape (n,). Got {what}.")
+    return array
+
+
+def indent(text: str) -> str:
+    """Every line two characters further right."""
+    return "\n".join("  " + line for line in text.splitlines())
