@@ -120,13 +120,16 @@ class Likelihood:
     name = "likelihood"
     log_prob: ClassVar[Callable[..., Tensor]]
 
-    def resolve(self, y: Tensor, spread: Tensor, num_embedded: int) -> "Likelihood":
+    def resolve(
+        self, y: Tensor, spread: Tensor, num_embedded: int, noise: Tensor | None = None
+    ) -> "Likelihood":
         """The likelihood with its defaults filled in from the data.
 
         Args:
             y: Recorded outputs, ``(n,)``.
             spread: Sd of each output over the recording, ``(n,)``.
             num_embedded: Number of uncertain parameters, d.
+            noise: Sd of the measurement noise, ``(n,)``, or None.
         """
         return self
 
@@ -136,7 +139,9 @@ class ABC(Likelihood):
     """Match the mean to the data and the sd to γ times the residual (Eq. 24).
 
     Args:
-        epsilon: Tolerance ε in the outputs' unit, a number or ``(n,)``; None for 1 % of the data's sd.
+        epsilon: Tolerance ε in the outputs' unit, a number or ``(n,)``; None for 1 % of the data's sd, and with a known
+            noise sd s for √((1 % of the data's sd)² + s²). A tolerance far below the noise makes α look better known
+            than the data allow.
         gamma: Wanted ratio γ of sd to residual.
 
     Raises:
@@ -153,9 +158,15 @@ class ABC(Likelihood):
             _positive(self.epsilon, "epsilon")
         _positive(self.gamma, "gamma")
 
-    def resolve(self, y: Tensor, spread: Tensor, num_embedded: int) -> "ABC":
+    def resolve(
+        self, y: Tensor, spread: Tensor, num_embedded: int, noise: Tensor | None = None
+    ) -> "ABC":
         """Fill in the default tolerance."""
-        return self if self.epsilon is not None else replace(self, epsilon=DEFAULT_TOLERANCE * spread)
+        if self.epsilon is not None:
+            return self
+        tolerance = DEFAULT_TOLERANCE * spread
+        # A mean cannot be asked to match data more closely than they are known.
+        return replace(self, epsilon=tolerance if noise is None else (tolerance.square() + noise.square()).sqrt())
 
     def log_prob(self, y: Tensor, mean: Tensor, sd: Tensor, noise: Tensor | None = None) -> Tensor:
         """Log-likelihood up to a constant, ``(*batch,)``."""
@@ -180,7 +191,9 @@ class ABCMean(Likelihood):
         if self.epsilon is not None:
             _positive(self.epsilon, "epsilon")
 
-    def resolve(self, y: Tensor, spread: Tensor, num_embedded: int) -> "ABCMean":
+    def resolve(
+        self, y: Tensor, spread: Tensor, num_embedded: int, noise: Tensor | None = None
+    ) -> "ABCMean":
         """Fill in the default tolerance."""
         return self if self.epsilon is not None else replace(self, epsilon=DEFAULT_TOLERANCE * spread)
 
@@ -221,9 +234,11 @@ class Additive(Likelihood):
     def log_prob(
         self, y: Tensor, mean: Tensor, log_sigma: Tensor, noise: Tensor | None = None
     ) -> Tensor:
-        """Normalised log-likelihood, ``(*batch,)``, of λ and ln σ, ``(*batch,)``."""
+        """Normalised log-likelihood, ``(*batch,)``; ``log_sigma`` is ``(*batch,)``, or ``(*batch, n)``."""
         _check_shapes(y, mean=mean, noise=noise)
-        variance = (2 * log_sigma).exp().unsqueeze(-1).expand(mean.shape)
+        if log_sigma.shape != mean.shape:
+            log_sigma = log_sigma.unsqueeze(-1).expand(mean.shape)
+        variance = (2 * log_sigma).exp()
         return _normal_log_prob(y, mean, variance if noise is None else variance + noise.square())
 
 
@@ -234,10 +249,12 @@ class Marginal(Likelihood):
     Args:
         num_samples: Number S of germ draws, the same for every α.
         bandwidth: Kernel sd relative to the samples' sd; None for Silverman's rule, (4 / 3S)^(1/5).
+        floor: Smallest kernel sd, in the outputs' unit; None for 1e-6 of the data's sd. It cuts off the spikes.
     """
 
     num_samples: int = 256
     bandwidth: float | None = None
+    floor: float | Tensor | None = None
 
     needs = "samples"
     name = "marginal"
@@ -245,12 +262,18 @@ class Marginal(Likelihood):
     def __post_init__(self) -> None:
         _check_samples(self.num_samples, self.bandwidth)
 
+    def resolve(
+        self, y: Tensor, spread: Tensor, num_embedded: int, noise: Tensor | None = None
+    ) -> "Marginal":
+        """Fill in the smallest kernel."""
+        return self if self.floor is not None else replace(self, floor=_KERNEL_FLOOR * spread)
+
     def log_prob(self, y: Tensor, samples: Tensor, noise: Tensor | None = None) -> Tensor:
         """Log-likelihood, ``(*batch,)``, from samples ``(*batch, S, n)``."""
         _check_shapes(y, samples=samples, noise=noise)
         count = samples.shape[-2]
         relative = self.bandwidth or (4 / (3 * count)) ** 0.2
-        variance = samples.var(-2, keepdim=True) * relative**2 + _TINY_VARIANCE
+        variance = samples.var(-2, keepdim=True) * relative**2 + _floor_variance(self.floor, y)
         if noise is not None:
             variance = variance + noise.square()
         kernels = -0.5 * ((y - samples).square() / variance + (2 * math.pi * variance).log())
@@ -269,10 +292,12 @@ class Full(Likelihood):
         num_samples: Number S of germ draws, the same for every α.
         bandwidth: Kernel size relative to the samples' covariance; None for Silverman's rule,
             (4 / (S (N + 2)))^(1 / (N + 4)).
+        floor: Smallest kernel sd, in the outputs' unit; None for 1e-6 of the data's sd.
     """
 
     num_samples: int = 256
     bandwidth: float | None = None
+    floor: float | Tensor | None = None
 
     needs = "samples"
     name = "full"
@@ -280,7 +305,9 @@ class Full(Likelihood):
     def __post_init__(self) -> None:
         _check_samples(self.num_samples, self.bandwidth)
 
-    def resolve(self, y: Tensor, spread: Tensor, num_embedded: int) -> "Full":
+    def resolve(
+        self, y: Tensor, spread: Tensor, num_embedded: int, noise: Tensor | None = None
+    ) -> "Full":
         """Raise where the likelihood is degenerate.
 
         Raises:
@@ -293,7 +320,7 @@ class Full(Likelihood):
                 "data, and the likelihood is zero for every alpha (Eqs. 14-15). Use ABC(), or a marginal "
                 "likelihood."
             )
-        return self
+        return self if self.floor is not None else replace(self, floor=_KERNEL_FLOOR * spread)
 
     def log_prob(self, y: Tensor, samples: Tensor, noise: Tensor | None = None) -> Tensor:
         """Log-likelihood, ``(*batch,)``, from samples ``(*batch, S, n)``."""
@@ -302,7 +329,7 @@ class Full(Likelihood):
         relative = self.bandwidth or (4 / (count * (n + 2))) ** (1 / (n + 4))
         offset = samples - samples.mean(-2, keepdim=True)
         covariance = offset.transpose(-1, -2) @ offset / (count - 1) * relative**2
-        extra = torch.full((n,), _TINY_VARIANCE, dtype=y.dtype, device=y.device)
+        extra = _floor_variance(self.floor, y).expand(n)
         if noise is not None:
             extra = extra + noise.square()
         # A floor relative to the largest variance keeps the factor finite where outputs move as one.
@@ -314,8 +341,16 @@ class Full(Likelihood):
         return kernels.logsumexp(-1) - math.log(count) - log_det - 0.5 * n * math.log(2 * math.pi)
 
 
-_TINY_VARIANCE = 1e-24
-"""Added to kernel variances so that a density of zero spread stays a number."""
+_KERNEL_FLOOR = 1e-6
+"""Smallest kernel sd as a share of the data's sd, where none is given."""
+
+
+def _floor_variance(floor: float | Tensor | None, y: Tensor) -> Tensor:
+    if floor is None:
+        spread = y.std() if len(y) > 1 else y.abs().max()
+        floor = _KERNEL_FLOOR * torch.where(spread > 0, spread, torch.ones_like(spread))
+    return torch.as_tensor(floor, dtype=y.dtype, device=y.device).square()
+
 
 _BY_NAME: dict[str, type[Likelihood]] = {
     "full": Full,

@@ -29,6 +29,7 @@ class Problem:
         noise: Sd of the measurement noise, ``(n,)``, or None.
         observed: Which outputs were recorded and take part, ``(n,)`` bool, or None for all.
         germ: Fixed germ draws for sample likelihoods, ``(S, germs)``.
+        unit: What the additive σ is measured in at each datum, ``(n,)``, where outputs have units of their own.
     """
 
     y: Tensor
@@ -38,6 +39,7 @@ class Problem:
     noise: Tensor | None = None
     observed: Tensor | None = None
     germ: Tensor | None = None
+    unit: Tensor | None = None
 
     def cast(self, dtype: torch.dtype) -> "Problem":
         """The same problem in another dtype."""
@@ -50,6 +52,7 @@ class Problem:
             prior=self.prior.cast(dtype),
             noise=None if self.noise is None else self.noise.to(dtype),
             germ=None if self.germ is None else self.germ.to(dtype),
+            unit=None if self.unit is None else self.unit.to(dtype),
         )
 
     def log_likelihood(self, alpha: Tensor) -> Tensor:
@@ -62,6 +65,7 @@ class Problem:
             noise=self.noise,
             observed=self.observed,
             germ=self.germ,
+            unit=self.unit,
         )
 
     def log_prob(self, alpha: Tensor) -> Tensor:
@@ -78,6 +82,7 @@ def log_likelihood(
     noise: Tensor | None = None,
     observed: Tensor | None = None,
     germ: Tensor | None = None,
+    unit: Tensor | None = None,
 ) -> Tensor:
     """Log-likelihood of α (with ln σ last for the additive one), ``(*batch, P)`` to ``(*batch,)``."""
 
@@ -87,7 +92,11 @@ def log_likelihood(
     y = pick(y)
     noise = None if noise is None else pick(noise)
     if isinstance(likelihood, Additive):
-        return likelihood.log_prob(y, pick(propagate.mean(alpha[..., :-1])), alpha[..., -1], noise)
+        mean = pick(propagate.mean(alpha[..., :-1]))
+        log_sigma = alpha[..., -1:].expand(mean.shape)
+        if unit is not None:
+            log_sigma = log_sigma + pick(unit).log()
+        return likelihood.log_prob(y, mean, log_sigma, noise)
     if likelihood.needs == "mean":
         return likelihood.log_prob(y, pick(propagate.mean(alpha)), None, noise)
     if likelihood.needs == "samples":
@@ -121,10 +130,11 @@ def additive(
     prior: CoefficientPrior,
     noise: Tensor | None = None,
     observed: Tensor | None = None,
+    unit: Tensor | None = None,
 ) -> None:
     """Pyro model of the conventional calibration: (λ, ln σ) from their prior, Eq. 4 as a factor (Eq. 3)."""
     alpha = pyro.sample("alpha", prior)
-    value = log_likelihood(alpha, y, propagate, Additive(), noise=noise, observed=observed)
+    value = log_likelihood(alpha, y, propagate, Additive(), noise=noise, observed=observed, unit=unit)
     pyro.factor("log_likelihood", value)
 
 

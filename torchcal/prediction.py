@@ -110,7 +110,12 @@ def embedded_prediction(propagate: NISP, alpha_map: Tensor, draws: Tensor | None
 
 
 def additive_prediction(
-    propagate: NISP, map_point: Tensor, draws: Tensor | None, *, log_sigma_map: float
+    propagate: NISP,
+    map_point: Tensor,
+    draws: Tensor | None,
+    *,
+    log_sigma_map: float,
+    unit: Tensor | None = None,
 ) -> AdditivePrediction:
     """Predictive moments of an additive calibration at a propagation's conditions.
 
@@ -119,16 +124,18 @@ def additive_prediction(
         map_point: MAP λ̃, ``(d,)``.
         draws: Posterior draws of (λ̃, ln σ), ``(S, d + 1)``, or None for the MAP alone.
         log_sigma_map: MAP ln σ.
+        unit: What σ is measured in at each output value, ``(n,)``; one by default.
     """
     like = propagate.nodes
     with torch.no_grad():
         center = _result(propagate.mean(map_point.to(like)))
-        at_map = Moments(center, torch.full_like(center, math.exp(log_sigma_map)))
+        one = torch.ones_like(center) if unit is None else unit.to(center)
+        at_map = Moments(center, math.exp(log_sigma_map) * one)
         if draws is None:
             return AdditivePrediction(propagate.x, Moments(center, 0 * center), at_map, at_map)
         outputs = propagate.mean(draws[:, :-1].to(like))
         mean, variance = outputs.mean(0), outputs.var(0, unbiased=False)
-        total = variance + (2 * draws[:, -1]).exp().mean().to(like)
+        total = variance + ((2 * draws[:, -1]).exp().mean() * one.square()).to(like)
     return AdditivePrediction(
         propagate.x,
         Moments(_result(mean), _result(variance.sqrt())),

@@ -156,8 +156,13 @@ class CoefficientPrior(pyro.distributions.TorchDistribution):
     def __init__(self, low: Tensor, high: Tensor, center: Tensor, spread: Tensor) -> None:
         self.low, self.high = low, high
         self._center, self._spread = center, spread
-        self.transform = Bounds(low, high)
+        self.transform = self._start_transform()
         super().__init__(torch.Size(), low.shape, validate_args=False)
+
+    def _start_transform(self) -> Bounds:
+        """Coordinates in which a sampler that knows nothing starts sensibly: spreads far smaller than ranges."""
+        step = torch.where(self._spread < 1, 0.1, 1.0).to(self.low)
+        return Bounds(self.low, self.high, torch.zeros_like(self.low), torch.diag(step))
 
     @property
     def support(self) -> constraints.Constraint:
@@ -176,7 +181,7 @@ class CoefficientPrior(pyro.distributions.TorchDistribution):
         for name, value in vars(self).items():
             if isinstance(value, Tensor):
                 setattr(other, name, value.to(dtype))
-        other.transform = Bounds(other.low, other.high)
+        other.transform = other._start_transform()
         return other
 
     def expand(self, batch_shape: _Shape, _instance: Any = None) -> "CoefficientPrior":

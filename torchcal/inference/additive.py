@@ -4,7 +4,6 @@ import math
 from collections.abc import Mapping
 
 import torch
-from torch import Tensor
 
 from torchcal import likelihoods, models
 from torchcal.data import Recording
@@ -17,7 +16,7 @@ from torchcal.inference.summary import diagnose, settings_of, to_result, warn_of
 from torchcal.models import Problem
 from torchcal.priors import CoefficientPrior, Flat
 from torchcal.propagation import NISP
-from torchcal.results import AdditiveCalibration, MapEstimate
+from torchcal.results import AdditiveCalibration, MapEstimate, sigma_unit
 from torchcal.simulators import Simulator
 
 __all__ = ["calibrate_additive"]
@@ -41,8 +40,9 @@ def calibrate_additive(
 ) -> AdditiveCalibration:
     r"""Calibrate the conventional way: λ and ln σ of an additive Gaussian discrepancy (Eqs. 2-4).
 
-    Flat priors on λ (within its bounds) and ln σ. This is the baseline whose push-forward shrinks with more data,
-    however wrong the model is.
+    Of several outputs, σ is that of the first; the others' are in proportion to the spread of their data, so that
+    units do not matter. Flat priors on λ (within its bounds) and ln σ. This is the baseline whose push-forward shrinks
+    with more data, however wrong the model is.
 
     Args:
         simulator: The model.
@@ -90,9 +90,10 @@ def calibrate_additive(
         y=y.to(device=device),
         propagate=propagate,
         likelihood=likelihoods.Additive(),
-        prior=_additive_prior(propagate, fit, noise),
+        prior=_additive_prior(propagate, fit, recording),
         noise=None if noise is None else noise.to(device=device),
         observed=None if bool(observed.all()) else observed.to(device=device),
+        unit=None if len(recording.outputs) == 1 else sigma_unit(recording).to(device=device),
     )
     estimate = maximise(problem, fit.scaled, starts=None, num_starts=num_starts, seed=seed)
     draws = None
@@ -121,12 +122,14 @@ def calibrate_additive(
     )
 
 
-def _additive_prior(propagate: NISP, fit: LeastSquares, noise: Tensor | None) -> CoefficientPrior:
+def _additive_prior(propagate: NISP, fit: LeastSquares, recording: Recording) -> CoefficientPrior:
     flat = Flat(propagate)
     like = flat.low
-    size = float(fit.residual.square().mean().sqrt())
+    unit = sigma_unit(recording)[recording.observed]
+    noise = recording.noise_sd
+    size = float((fit.residual / unit).square().mean().sqrt())
     # With known noise the likelihood no longer falls as σ → 0, and a flat ln σ needs a floor to be proper.
-    floor = -math.inf if noise is None else math.log(1e-3 * float(noise.min()))
+    floor = -math.inf if noise is None else math.log(1e-3 * float((noise[recording.observed] / unit).min()))
     center = math.log(size) if size > 0 else floor + 1
     if noise is not None:
         center = max(center, floor + 1)

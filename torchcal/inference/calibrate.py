@@ -138,12 +138,12 @@ def calibrate(
     check = _check_propagation(propagate, estimate.alpha, samples)
     prediction = embedded_prediction(propagate, estimate.alpha, None if samples is None else samples.flatten(0, 1))
     quality = diagnose(estimate, draws, samples, propagate, propagate.alpha_names, check)
-    posterior = math.nan if prediction.sd_posterior is None else mean_square(prediction.sd_posterior)
+    posterior = math.nan if prediction.sd_posterior is None else mean_square(prediction.sd_posterior, recording)
     quality = dataclasses.replace(
         quality,
-        model_error_variance=mean_square(prediction.sd_model_error),
+        model_error_variance=mean_square(prediction.sd_model_error, recording),
         posterior_variance=posterior,
-        map_variance=mean_square(prediction.map.sd),
+        map_variance=mean_square(prediction.map.sd, recording),
     )
     if propagate.pattern.num_germs:
         warn_of_tolerance(quality, problem.likelihood)

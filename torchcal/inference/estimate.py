@@ -37,6 +37,7 @@ class Estimate:
         ties: Number of different densities of λ that reach it: a symmetry of model and data makes more than one.
         null_directions: Unit vectors in α along which the log-posterior does not change, ``(k, P)``.
         unseen: Names of parameters whose means the data do not determine.
+        improper: Those of them that no bounds hold either, or whose spread is as free.
         curvature: Hessian of the negative log-posterior in α, ``(P, P)``.
     """
 
@@ -48,6 +49,7 @@ class Estimate:
     ties: int
     null_directions: Tensor
     unseen: tuple[str, ...]
+    improper: tuple[str, ...]
     curvature: Tensor
 
 
@@ -110,7 +112,9 @@ def maximise(
         )
     curvature = hessian(lambda a: -problem.log_prob(a), _inside(problem, best)[None])[0]
     values, vectors = torch.linalg.eigh(torch.nan_to_num(curvature))
-    null = vectors.T[values.abs() <= NULL_CURVATURE * values.abs().max().clamp_min(1e-300)]
+    top = float(values.abs().max().clamp_min(1e-300))
+    # Flat beside the steepest direction and flat in itself: at a spike every other direction is only the former.
+    null = vectors.T[values.abs() <= min(NULL_CURVATURE * top, max(1.0, 1e-9 * top))]
     unseen = _unseen_means(problem, best, curvature)
     if unseen:
         warnings.warn(
@@ -130,6 +134,7 @@ def maximise(
         ties=ties,
         null_directions=null,
         unseen=unseen,
+        improper=_unheld(problem, unseen),
         curvature=curvature,
     )
 
@@ -153,6 +158,14 @@ def _unseen_means(problem: Problem, alpha: Tensor, curvature: Tensor) -> tuple[s
             if bool(((there - here).abs() <= 1e-6 * (1 + here.abs())).all()):
                 names += [name for name, part in zip(pattern.names, direction.abs(), strict=True) if part > 0.1]
     return tuple(dict.fromkeys(names))
+
+
+def _unheld(problem: Problem, unseen: tuple[str, ...]) -> tuple[str, ...]:
+    if problem.prior.proper:
+        return ()
+    bounded = {p.name for p in problem.propagate.free if p.low is not None and p.high is not None}
+    plain = bounded - set(problem.propagate.pattern.embedded)
+    return tuple(name for name in unseen if name not in plain)
 
 
 def check_starts(problem: Problem, starts: Tensor | None) -> Tensor | None:
@@ -196,7 +209,7 @@ def _first_of_the_tied(problem: Problem, found: Minima) -> tuple[Tensor, int]:
 def _inside(problem: Problem, alpha: Tensor) -> Tensor:
     """A point far enough from the bounds to take differences at."""
     low, high = problem.prior.low, problem.prior.high
-    margin = 2e-5
+    margin = 2e-5 * alpha.abs().clamp_min(1.0)
     return torch.maximum(torch.minimum(alpha, high - margin), low + margin)
 
 

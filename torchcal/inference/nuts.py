@@ -77,7 +77,8 @@ def run_nuts(
                     hook_fn=hook,
                 )
                 mcmc.run(*arguments)
-                divergences += sum(len(found) for found in mcmc.diagnostics()["divergences"].values())
+                if num_samples >= 4:  # Pyro judges no shorter chain
+                    divergences += sum(len(found) for found in mcmc.diagnostics()["divergences"].values())
             chains.append(transform(torch.stack(current)))
     except KeyboardInterrupt:
         interrupted = True

@@ -66,11 +66,11 @@ class Plan:
 
 def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
     """Draw from the posterior of a problem, in coordinates whitened at its mode, as planned."""
-    if estimate.unseen and not problem.prior.proper:
+    if estimate.improper:
         raise ImproperPosteriorError(
             "Expected a proper posterior to draw from. Got one that does not change with "
-            f"{', '.join(estimate.unseen)}, under a flat prior. Hold a parameter with fixed=, give it bounds and a "
-            "Uniform prior, or use num_samples=0 for the maximum alone."
+            f"{', '.join(estimate.improper)}, under a flat prior. Hold a parameter with fixed=, use a Uniform prior, "
+            "or num_samples=0 for the maximum alone."
         )
     approximation = laplace(problem, estimate)
     _warn_of_rounding(estimate, plan.dtype)
@@ -94,7 +94,7 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
     prior = problem.prior.whitened(approximation.loc, approximation.scale_tril)
     arguments: tuple[Any, ...] = (problem.y, problem.propagate)
     if model is models.additive:
-        arguments += (prior, problem.noise, problem.observed)
+        arguments += (prior, problem.noise, problem.observed, problem.unit)
     else:
         arguments += (problem.likelihood, prior, problem.noise, problem.observed, problem.germ)
     return run_nuts(

@@ -110,7 +110,9 @@ def embedded_problem(
             f"Expected an embedding with at least one uncertain parameter for the {likelihood.name} likelihood. "
             "Got none: there is no model-error sd. Embed a parameter, or use ABCMean()."
         )
-    likelihood = likelihood.resolve(y[observed], recording.spread[observed], germs)
+    likelihood = likelihood.resolve(
+        y[observed], recording.spread[observed], germs, None if noise is None else noise[observed]
+    )
     epsilon = getattr(likelihood, "epsilon", None)
     if epsilon is not None:
         epsilon = torch.as_tensor(epsilon, dtype=torch.float64)

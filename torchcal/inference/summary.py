@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcal import likelihoods
+from torchcal.data import Recording
 from torchcal.errors import ConvergenceWarning, ExtrapolationWarning, ToleranceWarning
 from torchcal.inference import diagnostics as measure
 from torchcal.inference.draws import Draws
@@ -169,9 +170,10 @@ def settings_of(propagate: NISP, fit: LeastSquares, embedding: str, seed: int, n
     }
 
 
-def mean_square(sd: Tensor) -> float:
-    """Mean of squares over the data."""
-    return float(sd.square().mean())
+def mean_square(sd: Tensor, recording: Recording) -> float:
+    """Mean of squares over the data; of several outputs, each in units of its own spread."""
+    unit = recording.spread if len(recording.outputs) > 1 else torch.ones_like(recording.spread)
+    return float((sd / unit.to(sd)).square().mean())
 
 
 def to_result(value: Tensor) -> Tensor:

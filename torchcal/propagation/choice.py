@@ -65,7 +65,7 @@ def _by_trial(propagate: "NISP", counts: list[int]) -> RuleChoice:
                 mean, variance = propagate.moments(alpha)
             sd = variance.sqrt()
             if previous is not None:
-                scale = torch.maximum(mean.abs(), sd).amax(-1, keepdim=True)
+                scale = propagate.largest(torch.maximum(mean.abs(), sd))
                 change = torch.maximum((mean - previous[0]).abs(), (sd - previous[1]).abs())
                 if bool((change <= 1e-9 * scale).all()):
                     return RuleChoice("tensor", smaller)

@@ -37,18 +37,18 @@ class PropagationCheck:
 def compare(propagate: "NISP", alpha: Tensor) -> PropagationCheck:
     """Moments at α against those of a finer rule, and the expansion against the full variance."""
     finer = propagate.copy(rule=propagate.rule_choice.finer(propagate.pattern.num_germs))
-    floor = propagate.sd_floor
     with torch.no_grad():
         mean, variance = propagate.moments(alpha)
         other_mean, other_variance = finer.moments(alpha)
         truncated = 0.0
+        floor = propagate.floor(mean).square().expand(mean.shape)
         if propagate.order is not None and bool((propagate.weights > 0).all()):
             full = propagate.copy(order=None, rule=None)
             full.refine(alpha)
             whole = full.moments(alpha)[1]
-            lost = 1 - variance / whole.clamp_min(floor**2)
-            truncated = float(torch.where(whole > floor**2, lost, 0 * lost).max())
-    scale = torch.maximum(mean.abs(), variance.sqrt()).amax(-1, keepdim=True).clamp_min(floor)
+            lost = 1 - variance / torch.maximum(whole, floor)
+            truncated = float(torch.where(whole > floor, lost, 0 * lost).max())
+    scale = torch.maximum(propagate.largest(torch.maximum(mean.abs(), variance.sqrt())), floor.sqrt())
     return PropagationCheck(
         nodes=propagate.num_nodes,
         finer_nodes=finer.num_nodes,

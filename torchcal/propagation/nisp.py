@@ -46,7 +46,7 @@ class NISP(nn.Module):
         trial_spread: Width of the densities on which enough nodes are found: with 1, three sd of a parameter reach
             its bounds, or one sd is one unit of scale where it has none.
         sd_floor: δ in :math:`\sqrt{\sigma^2 + \delta^2}`, which keeps the gradient finite at zero spread; in
-            the outputs' unit. The default is below any figure a user reads.
+            the outputs' unit. By default 1e-8 of the largest mean of an output, below any figure a user reads.
         max_elements: Batch × nodes × outputs evaluated at once. Larger work is cut into pieces, whose
             intermediate values are recomputed in the backward pass: 2**24 numbers are 128 MiB.
 
@@ -84,7 +84,7 @@ class NISP(nn.Module):
         rule: polychaos.Rule | RuleChoice | int | None = None,
         max_nodes: int = 4096,
         trial_spread: float = 1.0,
-        sd_floor: float = 1e-8,
+        sd_floor: float | None = None,
         max_elements: int = 2**24,
     ) -> None:
         super().__init__()
@@ -94,7 +94,7 @@ class NISP(nn.Module):
             raise DomainError(f"Expected one of torchcal.embeddings, such as Gaussian(). Got {embedding!r}.")
         if order is not None and (isinstance(order, bool) or not isinstance(order, int) or order < 1):
             raise DomainError(f"Expected order as a positive integer or None. Got {order!r}.")
-        if not (math.isfinite(sd_floor) and sd_floor > 0):
+        if sd_floor is not None and not (math.isfinite(sd_floor) and sd_floor > 0):
             raise DomainError(f"Expected sd_floor > 0. Got {sd_floor!r}.")
         self.simulator = simulator
         self.embedding = embedding
@@ -106,7 +106,7 @@ class NISP(nn.Module):
         self.order = order
         self.max_nodes = max_nodes
         self.trial_spread = trial_spread
-        self.sd_floor = float(sd_floor)
+        self.sd_floor = None if sd_floor is None else float(sd_floor)
         self.max_elements = int(max_elements)
         self._x_names = tuple(x) if isinstance(x, Mapping) else None
         for i, value in enumerate(x.values() if isinstance(x, Mapping) else [x]):
@@ -169,7 +169,20 @@ class NISP(nn.Module):
             EmbeddingError: If nothing is embedded: there is then no model-error sd. Use `mean`.
         """
         mean, variance = self.moments(alpha)
-        return mean, (variance + self.sd_floor**2).sqrt()
+        return mean, (variance + self.floor(mean).square()).sqrt()
+
+    def floor(self, mean: Tensor) -> Tensor:
+        """δ for outputs with this mean, ``(*batch, n)`` or one number."""
+        if self.sd_floor is not None:
+            return torch.full_like(mean[..., :1], self.sd_floor)
+        smallest = torch.finfo(mean.dtype).tiny ** 0.25  # its square is still a number
+        return (1e-8 * self.largest(mean.detach().abs())).clamp_min(smallest)
+
+    def largest(self, values: Tensor) -> Tensor:
+        """The largest of each output's values, in the place of every value of that output, ``(*batch, n)``."""
+        count = 1 if self.outputs is None else len(self.outputs)
+        split = values.reshape(*values.shape[:-1], count, values.shape[-1] // count)
+        return split.amax(-1, keepdim=True).expand(split.shape).reshape(values.shape)
 
     def moments(self, alpha: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the outputs, ``(*batch, n)`` each, without the floor of `forward`."""

@@ -19,10 +19,18 @@ def moments(propagate: "NISP", alpha: Tensor) -> tuple[Tensor, Tensor]:
     center, scale = propagate.scaling.center.to(alpha), propagate.scaling.scale.to(alpha)
     log = propagate.scaling.log.to(alpha.device)
     if bool(log.any()) and not (propagate.pattern.order <= 1 and propagate.pattern.basis.name == "hermite"):
-        values = propagate.parameters_at(alpha, propagate.nodes)
-        mean = torch.einsum("q,...qd->...d", propagate.weights, values)
+        # The output's own nodes need not be enough for exp(λ): a line in ln λ takes two.
+        germs = propagate.pattern.num_germs
+        count = {0: 1, 1: 48, 2: 32, 3: 16}.get(germs)
+        if count is None:
+            nodes, weights = propagate.nodes, propagate.weights
+        else:
+            rule = polychaos.tensor_rule(propagate.pattern.basis, germs, count)
+            nodes, weights = rule.nodes.to(alpha), rule.weights.to(alpha)
+        values = propagate.parameters_at(alpha, nodes)
+        mean = torch.einsum("q,...qd->...d", weights, values)
         offset = values - mean.unsqueeze(-2)
-        return mean, torch.einsum("q,...qd,...qe->...de", propagate.weights, offset, offset)
+        return mean, torch.einsum("q,...qd,...qe->...de", weights, offset, offset)
     mean = center + scale * matrix[..., 0]
     factor = scale[:, None] * matrix[..., 1:]
     norms = polychaos.norms(propagate.pattern.basis, propagate.pattern.indices[1:]).to(alpha)

@@ -20,7 +20,7 @@ from torchcal.results.diagnostics import Diagnostics, table
 from torchcal.results.estimate import MapEstimate
 from torchcal.simulators import Simulator
 
-__all__ = ["AdditiveCalibration"]
+__all__ = ["AdditiveCalibration", "sigma_unit"]
 
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
@@ -81,6 +81,7 @@ class AdditiveCalibration(Result):
             self.map.alpha[:-1],
             thin(self.draws, max_draws),
             log_sigma_map=float(self.map.alpha[-1]),
+            unit=None if function is not None else sigma_unit(self.recording, len(first(propagate.x))),
         )
 
     def _propagation(self) -> NISP:
@@ -122,3 +123,19 @@ class AdditiveCalibration(Result):
         lines.append(indent(table(("parameter", "MAP", "posterior sd"), rows)))
         lines.append(indent(str(self.diagnostics)))
         return "\n".join(lines)
+
+
+def sigma_unit(recording: Recording, num_conditions: int | None = None) -> Tensor:
+    """What σ is measured in at each output value: the spread of its output's data, the first output's being one.
+
+    Args:
+        recording: The data.
+        num_conditions: Number of conditions; the recording's by default.
+    """
+    spread = recording.spread[:: recording.n]
+    return (spread / spread[0]).repeat_interleave(recording.n if num_conditions is None else num_conditions)
+
+
+def first(x: Any) -> Tensor:
+    """The first of the conditions."""
+    return next(iter(x.values())) if isinstance(x, Mapping) else x

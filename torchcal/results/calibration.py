@@ -90,10 +90,12 @@ class Calibration(Result):
         if x is None and function is None:
             return self.propagate
         where = self.propagate.x if x is None else conditions(x, None if function else self.recording)
-        if function is None:
-            return self.propagate.at(where)
-        other = self.propagate.at(where, simulator=Simulator(function, self.propagate.simulator.parameters))
-        other.refine(self.map.alpha.to(other.nodes))
+        simulator = None if function is None else Simulator(function, self.propagate.simulator.parameters)
+        other = self.propagate.at(where, simulator=simulator)
+        if other.pattern.num_germs:  # nodes that were enough at the data may not be elsewhere
+            alpha = self.map.alpha.to(other.nodes)
+            other.refine(alpha)
+            other.check(alpha)
         return other
 
     def sample_outputs(self, num: int, x: Any = None, *, kind: str = "posterior", seed: int = 0) -> Tensor:

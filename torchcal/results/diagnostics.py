@@ -105,13 +105,13 @@ class Diagnostics:
 def r_hat_threshold(num_draws: int) -> float:
     """Largest R-hat that passes.
 
-    Chains of n independent draws have, split in halves, an R-hat of about √(1 + 2/n) by chance alone; twice that
+    Chains of n independent draws have, split in halves, an R-hat of about √(1 + 2/n) by chance alone; four times that
     variance is allowed for the worst of many quantities where chains are short.
 
     >>> r_hat_threshold(1000)
     1.01
     """
-    return max(R_HAT_THRESHOLD, (1 + 4 / max(num_draws, 1)) ** 0.5)
+    return max(R_HAT_THRESHOLD, (1 + 8 / max(num_draws, 1)) ** 0.5)
 
 
 def table(header: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:

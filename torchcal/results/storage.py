@@ -292,8 +292,9 @@ def _read(path: str | os.PathLike[str], kind: str) -> tuple[dict[str, dict[str, 
 
 def _rebuild(module: Any, spec: Mapping[str, Any]) -> Any:
     values = {k: (tuple(v) if isinstance(v, list) else v) for k, v in spec.items() if k != "kind"}
-    if isinstance(values.get("epsilon"), tuple):
-        values["epsilon"] = torch.tensor(values["epsilon"], dtype=torch.float64)
+    for key in ("epsilon", "floor"):
+        if isinstance(values.get(key), tuple):
+            values[key] = torch.tensor(values[key], dtype=torch.float64)
     return getattr(module, spec["kind"])(**values)
 
 
