@@ -58,11 +58,7 @@ class DegenerateLikelihoodError(TorchcalError, ValueError):
 
 
 class ConvergenceError(TorchcalError, RuntimeError):
-    """A search could not produce an estimate at all. Carries what it had as ``.partial``."""
-
-    def __init__(self, message: str, partial: object = None) -> None:
-        super().__init__(message)
-        self.partial = partial
+    """A search could not produce an estimate at all."""
 
 
 class MissingDependencyError(TorchcalError, ImportError):

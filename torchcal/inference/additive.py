@@ -95,7 +95,7 @@ def calibrate_additive(
         observed=None if bool(observed.all()) else observed.to(device=device),
         unit=None if len(recording.outputs) == 1 else sigma_unit(recording).to(device=device),
     )
-    estimate = maximise(problem, fit.scaled, starts=None, num_starts=num_starts, seed=seed)
+    estimate = maximise(problem, fit.scaled, starts=None, num_starts=num_starts, seed=seed, progress=progress)
     draws = None
     if num_samples:
         draws = draw(problem, estimate, models.additive, plan)
@@ -118,7 +118,7 @@ def calibrate_additive(
         diagnostics=quality,
         recording=recording,
         propagate=propagate,
-        settings=settings_of(propagate, fit, "additive", seed, plan.warmup),
+        settings=settings_of(problem, fit, "additive", seed, plan.warmup),
     )
 
 

@@ -126,7 +126,9 @@ def calibrate(
     check_starts(build(Scaling.from_parameters(free), 1 if rule is None else rule), starts)
     fit = least_squares(simulator, recording, fixed, seed=seed)
     problem = build(fit.scaling, rule)
-    estimate = maximise(problem, fit.scaled, starts=starts, num_starts=num_starts, seed=seed)
+    estimate = maximise(
+        problem, fit.scaled, starts=starts, num_starts=num_starts, seed=seed, progress=progress
+    )
     propagate = problem.propagate
     draws: Draws | None = None
     samples: Tensor | None = None
@@ -165,7 +167,7 @@ def calibrate(
         embedding=embedding,
         likelihood=problem.likelihood,
         propagate=propagate,
-        settings=settings_of(propagate, fit, type(embedding).__name__, seed, plan.warmup),
+        settings=settings_of(problem, fit, type(embedding).__name__, seed, plan.warmup),
     )
 
 

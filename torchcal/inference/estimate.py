@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from tqdm.auto import tqdm
 
 from torchcal.errors import ConvergenceError, ConvergenceWarning, IdentifiabilityWarning, ShapeError
 from torchcal.inference.newton import Minima, hessian, minimise
@@ -62,7 +63,13 @@ class Laplace:
 
 
 def maximise(
-    problem: Problem, leading: Tensor, *, starts: Tensor | None, num_starts: int, seed: int
+    problem: Problem,
+    leading: Tensor,
+    *,
+    starts: Tensor | None,
+    num_starts: int,
+    seed: int,
+    progress: bool = False,
 ) -> Estimate:
     """Maximise the posterior of α.
 
@@ -72,6 +79,7 @@ def maximise(
         starts: A user's own starting points ``(S, P)``, or None.
         num_starts: Number of starting points made otherwise.
         seed: Of the starting points.
+        progress: Whether to show a bar.
 
     Raises:
         ConvergenceError: If the posterior is not finite at any start.
@@ -88,7 +96,13 @@ def maximise(
     def objective(u: Tensor) -> Tensor:
         return -problem.log_prob(transform.bound(u))
 
-    found = minimise(objective, transform.unbound(starts))
+    bar = tqdm(desc="maximum", unit="step", disable=not progress, leave=False)
+
+    def show(_iteration: int, values: Tensor) -> None:
+        bar.update(1)
+        bar.set_postfix(objective=f"{float(values.min()):.6g}")
+
+    found = minimise(objective, transform.unbound(starts), progress=show)
     if not bool(torch.isfinite(found.values[0])):
         raise ConvergenceError(
             f"Expected a finite posterior at some starting point. Got none at {len(starts)}. Check the "
@@ -101,7 +115,8 @@ def maximise(
             best = transform.bound(found.points[:1])[..., : problem.propagate.num_alpha]
             if not problem.propagate.refine(best):
                 break
-            found = minimise(objective, found.points[: max(4, total // 4)])
+            found = minimise(objective, found.points[: max(4, total // 4)], progress=show)
+    bar.close()
     best, ties = _first_of_the_tied(problem, found)
     if agreeing < 2 <= total:
         warnings.warn(

@@ -14,6 +14,7 @@ from torchcal.inference import diagnostics as measure
 from torchcal.inference.draws import Draws
 from torchcal.inference.estimate import Estimate
 from torchcal.inference.fitting import LeastSquares
+from torchcal.models import Problem
 from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results import Diagnostics, Quality
 from torchcal.results.diagnostics import ESS_THRESHOLD, r_hat_threshold
@@ -152,11 +153,13 @@ def warn_of_box(simulator: Simulator, propagate: NISP, alpha: Tensor) -> None:
         )
 
 
-def settings_of(propagate: NISP, fit: LeastSquares, embedding: str, seed: int, num_warmup: int) -> dict[str, Any]:
+def settings_of(problem: Problem, fit: LeastSquares, embedding: str, seed: int, num_warmup: int) -> dict[str, Any]:
     """What a result stores of how it was made, as plain data."""
+    propagate = problem.propagate
     choice = propagate.rule_choice
     return {
         "embedding": embedding,
+        "prior": type(problem.prior).__name__,
         "seed": seed,
         "num_warmup": num_warmup,
         "order": propagate.order,
