@@ -39,7 +39,6 @@ class Estimate:
         null_directions: Unit vectors in α along which the log-posterior does not change, ``(k, P)``.
         unseen: Names of parameters whose means the data do not determine.
         improper: Those of them that no bounds hold either, or whose spread is as free.
-        curvature: Hessian of the negative log-posterior in α, ``(P, P)``.
     """
 
     alpha: Tensor
@@ -51,7 +50,6 @@ class Estimate:
     null_directions: Tensor
     unseen: tuple[str, ...]
     improper: tuple[str, ...]
-    curvature: Tensor
 
 
 @dataclass(frozen=True)
@@ -150,7 +148,6 @@ def maximise(
         null_directions=null,
         unseen=unseen,
         improper=_unheld(problem, unseen),
-        curvature=curvature,
     )
 
 
