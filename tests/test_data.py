@@ -328,7 +328,7 @@ REFUSED = {
     "units of unknown": ({"units": {"T": "K"}}, RecordingError, r"among \['x', 'y'\]\. Got 'T'"),
     "units not a dict": ({"units": "m"}, RecordingError, r"Expected units: a dict\. Got 'm'"),
     "unit not a string": ({"units": {"x": 1}}, RecordingError, r"unit of 'x'\. Got 1"),
-    "runs": ({"runs": []}, RecordingError, r"Got runs="),
+    "runs beside x": ({"runs": []}, RecordingError, r"x= and y=, or runs=\. Got runs= and x="),
     "noise zero": ({"noise": 0.0}, DomainError, r'Expected noise as finite sd > 0\. Got 0\.0 .*noise="none"'),
     "noise negative": ({"noise": [1, -2, -3]}, DomainError, r'Got -2\.0 at index 1.*noise="none"'),
     "noise nan": ({"noise": NAN}, DomainError, r'Got nan .*noise="none"'),

@@ -30,8 +30,8 @@ ROOMS = (
     "results",
     "inference",
     "terms",
-    "discovery",
     "report",
+    "discovery",
     "cli",
 )
 PYRO_ROOMS = {"priors", "models", "inference"}

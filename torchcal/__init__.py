@@ -1,31 +1,39 @@
 """torchcal: calibrate a simulation that is wrong, and find the physics that it leaves out."""
 
-from torchcal import embeddings, errors, likelihoods, models, polychaos, priors, results
-from torchcal.data import Recording
+from torchcal import discovery, embeddings, errors, likelihoods, models, polychaos, priors, results, terms
+from torchcal.data import Recording, Run
+from torchcal.discovery import diagnose
 from torchcal.errors import TorchcalError, TorchcalWarning
 from torchcal.inference import calibrate, calibrate_additive
 from torchcal.prediction import scores
 from torchcal.propagation import NISP
 from torchcal.simulators import (
     ExternalSimulator,
+    ODESimulator,
     Parameter,
     PolynomialSurrogate,
     Simulator,
     build_surrogate,
 )
+from torchcal.terms import Term
 
 __all__ = [
     "NISP",
     "ExternalSimulator",
+    "ODESimulator",
     "Parameter",
     "PolynomialSurrogate",
     "Recording",
+    "Run",
     "Simulator",
+    "Term",
     "TorchcalError",
     "TorchcalWarning",
     "build_surrogate",
     "calibrate",
     "calibrate_additive",
+    "diagnose",
+    "discovery",
     "embeddings",
     "errors",
     "likelihoods",
@@ -34,4 +42,5 @@ __all__ = [
     "priors",
     "results",
     "scores",
+    "terms",
 ]

@@ -1,5 +1,6 @@
-"""Recordings: what was measured, under which conditions, and how noisy it is."""
+"""Recordings: what was measured, under which conditions or in which runs, and how noisy it is."""
 
 from torchcal.data.recording import Recording
+from torchcal.data.run import Run
 
-__all__ = ["Recording"]
+__all__ = ["Recording", "Run"]

@@ -140,13 +140,17 @@ def _first_text(array: np.ndarray) -> str:
     return ""
 
 
-def check_finite(array: Tensor, label: str, *, is_output: bool, missing: bool) -> None:
+def check_finite(
+    array: Tensor, label: str, *, is_output: bool, missing: bool, kind: str = "a condition"
+) -> None:
     """Raise for infinite numbers, and for NaN that is not declared missing, naming the first."""
     infinite, nan = torch.isinf(array), torch.isnan(array)
     if infinite.any():
         bad, advice = infinite, "remove the condition, or correct the value"
+        if kind != "a condition":
+            advice = "remove the sample, or correct the value"
     elif nan.any() and not is_output:
-        bad, advice = nan, "a condition must be known: remove it, or fill in its value"
+        bad, advice = nan, f"{kind} must be known: remove it, or fill in its value"
     elif nan.any() and not missing:
         bad, advice = nan, "if it marks a missing sample, give missing=True; otherwise correct it"
     else:
@@ -192,5 +196,7 @@ def sample_spread(values: Tensor) -> Tensor:
 
 def value_range(values: Tensor) -> str:
     """Smallest and largest value as text."""
+    if not len(values):
+        return "nothing observed"
     low, high = f"{values.min().item():.4g}", f"{values.max().item():.4g}"
     return low if low == high else f"{low} to {high}"

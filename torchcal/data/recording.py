@@ -1,7 +1,7 @@
 """Recordings: what was measured, under which conditions, and how noisy it is."""
 
+import copy
 import os
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,18 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcal.data.arrays import (
-    check_finite,
-    check_lengths,
-    common_device,
-    declared_units,
-    named,
-    sample_spread,
-    to_tensor,
-    value_range,
-)
+from torchcal.data.arrays import sample_spread, value_range
+from torchcal.data.frames import check_columns, column_names, read_csv
 from torchcal.data.noise import noise_sd
-from torchcal.errors import MissingDependencyError, RecordingError, ShapeError
+from torchcal.data.parts import run_parts, static_parts
+from torchcal.data.run import Run, change
+from torchcal.errors import RecordingError, ShapeError
 
 __all__ = ["Recording"]
 
@@ -29,6 +23,10 @@ __all__ = ["Recording"]
 @dataclass(frozen=True, init=False, repr=False, eq=False)
 class Recording:
     """Conditions and measured outputs as float64 tensors. Everything is checked once, here, and copied.
+
+    A recording is static, from ``x`` and ``y``, or in time, from ``runs``. One in time is like any other whose
+    conditions are ``{"time": (n,), "run": (n,)}``: its runs stand one after another, ``run`` counts them from 0,
+    and ``n`` is the number of their samples.
 
     Arrays may be torch tensors, numpy arrays, lists, pandas Series, xarray DataArrays or pint Quantities
     of any real dtype. They are matched by position; an index or a coordinate is not looked at. Arrays on
@@ -43,24 +41,29 @@ class Recording:
         missing: Whether NaN in an output (or a masked entry of a numpy masked array) is a missing sample.
             Otherwise it is an error.
         units: Dict from condition and output names to units (``"x"`` and ``"y"`` where arrays were given
-            without names). A Quantity is converted to its declared unit, or declares its own; a DataArray's
-            ``attrs["units"]`` declares a unit too, and must be spelled as the one given here.
-        runs: Recordings in time. Not available yet.
+            without names), in time also of inputs and ``"time"``. A Quantity is converted to its declared unit,
+            or declares its own; a DataArray's ``attrs["units"]`` declares a unit too, and must be spelled as the
+            one given here.
+        runs: List of `Run`, instead of ``x`` and ``y``. All have the same inputs; where one lacks an output of
+            another, its samples of it are missing, whatever ``missing`` says.
 
     Attributes:
         x: Tensor ``(n,)`` or dict of tensors ``(n,)``, as given.
         y: Tensor ``(n_total,)``, the outputs one after another; NaN where missing.
         noise: ``None``, ``"none"``, or the sd, tensor ``(n_total,)``.
-        missing: As given.
-        units: Dict from names to units, for the names whose unit is known.
+        missing: As given, or True where a run lacks an output.
+        units: Dict from names of conditions and outputs to units, where they are known; those of inputs are in
+            the runs' ``units``.
         outputs: Names of the outputs.
         n: Number of conditions; ``n_total = n * len(outputs)``.
         observed: Bool tensor ``(n_total,)``, False where a sample is missing.
         spread: Tensor ``(n_total,)``, > 0: the sample sd (``n - 1``) of the observed data of each output, in
             its unit; the absolute value where the data are constant, and 1 where they are all zero.
+        runs: Tuple of runs, in the recording's units; None for a static recording.
 
     Raises:
-        RecordingError: If data are NaN, infinite, not real numbers, too few, of unequal lengths, or misnamed.
+        RecordingError: If data are NaN, infinite, not real numbers, too few, of unequal lengths, or misnamed, or
+            if runs do not go together.
         ShapeError: If an array has no or several dimensions, or the noise does not fit the outputs.
         DomainError: If a noise sd is not a positive finite number.
 
@@ -80,6 +83,7 @@ class Recording:
     n: int
     observed: Tensor
     spread: Tensor
+    runs: tuple[Run, ...] | None
 
     def __init__(
         self,
@@ -91,45 +95,23 @@ class Recording:
         units: Mapping[str, str] | None = None,
         runs: Any = None,
     ) -> None:
-        if runs is not None:
+        if runs is not None and (x is not None or y is not None):
             raise RecordingError(
-                "Expected a static recording, x= and y=. Got runs= (recordings in time come later)."
+                f"Expected x= and y=, or runs=. Got runs= and {'x=' if x is not None else 'y='} (runs hold their own "
+                "times and outputs)."
             )
         if not isinstance(missing, bool | np.bool_):
             raise RecordingError(
                 f"Expected missing=True or missing=False. Got {type(missing).__name__} "
                 "(mark missing samples by NaN in y and give missing=True)."
             )
-        given_x, given_y = named(x, "x"), named(y, "y")
-        if both := [name for name in given_y if name in given_x]:
-            raise RecordingError(
-                f"Expected outputs and conditions with different names. Got {both[0]!r} in both (rename one; "
-                "an array without a name is called 'x' as condition, 'y' as output: give a dict to name it)."
-            )
-        declared = declared_units(units, [*given_x, *given_y])
-
-        known: dict[str, str] = {}
-        arrays: dict[str, Tensor] = {}
-        for letter, given, original in (("x", given_x, x), ("y", given_y, y)):
-            for name, values in given.items():
-                label = f"{letter}[{name!r}]" if isinstance(original, Mapping) else letter
-                array, unit = to_tensor(values, label, declared.get(name))
-                if array.ndim != 1:
-                    what = "a scalar" if array.ndim == 0 else f"shape {tuple(array.shape)}"
-                    raise ShapeError(
-                        f"Expected {label} of shape (n,). Got {what} (give one value per condition; several "
-                        "conditions or outputs go into a dict from names to arrays)."
-                    )
-                check_finite(array, label, is_output=letter == "y", missing=bool(missing))
-                arrays[name] = array
-                if unit is not None:
-                    known[name] = unit
-        check_lengths(arrays)
-        n = len(next(iter(arrays.values())))
-        device = common_device(arrays)
-        arrays = {name: array.to(device) for name, array in arrays.items()}
-
-        observed = {name: ~torch.isnan(arrays[name]) for name in given_y}
+        if runs is not None:
+            parts = run_parts(runs, units, bool(missing))
+        else:
+            parts = static_parts(x, y, units, bool(missing))
+        outputs = tuple(parts.y)
+        n = len(parts.y[outputs[0]])
+        observed = {name: ~torch.isnan(values) for name, values in parts.y.items()}
         for name, mask in observed.items():
             if not mask.any():
                 raise RecordingError(
@@ -143,20 +125,40 @@ class Recording:
             )
 
         put = object.__setattr__
-        put(self, "x", {name: arrays[name] for name in given_x} if isinstance(x, Mapping) else arrays["x"])
-        put(self, "y", torch.cat([arrays[name] for name in given_y]))
-        put(self, "missing", bool(missing))
-        put(self, "units", known)
-        put(self, "outputs", tuple(given_y))
+        put(self, "x", parts.x)
+        put(self, "y", torch.cat(list(parts.y.values())))
+        put(self, "missing", parts.missing)
+        put(self, "units", parts.units)
+        put(self, "outputs", outputs)
         put(self, "n", n)
         put(self, "observed", torch.cat(list(observed.values())))
-        put(self, "spread", torch.cat([sample_spread(arrays[name][observed[name]]).expand(n) for name in given_y]))
-        put(self, "noise", noise_sd(noise, tuple(given_y), n, known, device))
+        put(
+            self,
+            "spread",
+            torch.cat([sample_spread(parts.y[name][mask]).expand(n) for name, mask in observed.items()]),
+        )
+        put(self, "noise", noise_sd(noise, outputs, n, parts.units, self.y.device))
+        put(self, "runs", parts.runs)
 
     @property
     def conditions(self) -> tuple[str, ...]:
         """Names of the conditions; ``("x",)`` where they are one array without a name."""
         return tuple(self.x) if isinstance(self.x, dict) else ("x",)
+
+    @property
+    def time(self) -> Tensor:
+        """Times of all samples, run after run, shape ``(n,)``; an error in a static recording."""
+        return self._in_time()["time"]
+
+    @property
+    def run_index(self) -> Tensor:
+        """Which run each sample belongs to, from 0, int64, shape ``(n,)``; an error in a static recording."""
+        return self._in_time()["run"].to(torch.int64)
+
+    def _in_time(self) -> dict[str, Tensor]:
+        if self.runs is None or not isinstance(self.x, dict):
+            raise RecordingError("Expected a recording in time. Got a static one (make it with runs=[Run(...)]).")
+        return self.x
 
     @property
     def noise_sd(self) -> Tensor | None:
@@ -195,8 +197,13 @@ class Recording:
 
         Raises:
             ShapeError: If the mask is not of dtype bool and shape ``(n,)``.
-            RecordingError: If too few conditions, or no observed value of some output, are kept.
+            RecordingError: If too few conditions, or no observed value of some output, are kept, or if the
+                recording is one in time.
         """
+        if self.runs is not None:
+            raise RecordingError(
+                "Expected a static recording. Got one in time, whose trajectories stay whole (use masked)."
+            )
         keep = mask if isinstance(mask, Tensor) else torch.as_tensor(np.array(mask))
         if keep.dtype != torch.bool or keep.shape != (self.n,):
             raise ShapeError(
@@ -216,6 +223,56 @@ class Recording:
             units=self.units,
         )
 
+    def masked(self, keep: Any) -> "Recording":
+        """Mark outputs as missing where the mask is False; conditions, times and inputs stay.
+
+        This is how data are held out: a simulator still sees every condition and whole trajectories.
+
+        Args:
+            keep: Bool array, ``(n,)`` for all outputs alike, or ``(n_total,)`` in the order of ``y``.
+
+        Returns:
+            The same recording with ``missing=True``. Its spread is that of the kept data of each output; an output
+            of which nothing is kept has the spread it had before.
+
+        Raises:
+            ShapeError: If the mask is not of dtype bool and one of these shapes.
+            RecordingError: If fewer than 2 observed values are kept.
+
+        >>> Recording(x=[0, 1, 2], y=[5, 6, 7]).masked([True, False, True]).y.tolist()
+        [5.0, nan, 7.0]
+        """
+        mask = keep if isinstance(keep, Tensor) else torch.as_tensor(np.array(keep))
+        total = len(self.y)
+        if mask.dtype != torch.bool or mask.shape not in ((self.n,), (total,)):
+            wanted = f"({self.n},)" + (f" or ({total},)" if total != self.n else "")
+            raise ShapeError(
+                f"Expected keep of dtype bool and shape {wanted}. Got {mask.dtype}, {tuple(mask.shape)} "
+                "(True for each datum to keep; indices do not work)."
+            )
+        mask = mask.to(self.y.device)
+        mask = mask if len(mask) == total else mask.repeat(len(self.outputs))
+        observed = self.observed & mask
+        if (left := int(observed.sum())) < 2:
+            raise RecordingError(
+                f"Expected at least 2 observed values to keep. Got {left} (one data point cannot calibrate anything)."
+            )
+        y = self.y.masked_fill(~mask, torch.nan)
+        parts = zip(*(self.split(v).values() for v in (y, observed, self.spread)), strict=True)
+        spread = [sample_spread(part[seen]).expand(self.n) if seen.any() else old for part, seen, old in parts]
+        twin = copy.copy(self)
+        put = object.__setattr__
+        put(twin, "y", y)
+        put(twin, "missing", True)
+        put(twin, "observed", observed)
+        put(twin, "spread", torch.cat(spread))
+        if self.runs is not None:
+            lengths = [len(run.time) for run in self.runs]
+            kept = {name: part.split(lengths) for name, part in self.split(y).items()}
+            runs = enumerate(self.runs)
+            put(twin, "runs", tuple(change(r, outputs={k: kept[k][i].clone() for k in r.outputs}) for i, r in runs))
+        return twin
+
     @classmethod
     def from_frame(
         cls, frame: Any, x: str | Sequence[str], y: str | Sequence[str], **options: Any
@@ -231,19 +288,8 @@ class Recording:
         Raises:
             RecordingError: If a column does not exist or is named twice, or as `Recording`.
         """
-        if not hasattr(frame, "columns"):
-            raise RecordingError(
-                f"Expected a data frame. Got {type(frame).__name__} (use Recording(x=..., y=...) for arrays)."
-            )
-        names_x, names_y = ([c] if isinstance(c, str) else list(c) for c in (x, y))
-        available = list(frame.columns)
-        for position, name in enumerate(names := [*names_x, *names_y]):
-            if name not in available:
-                raise RecordingError(
-                    f"Expected columns among {available}. Got {name!r} (check the spelling and the spaces)."
-                )
-            if name in names[:position]:
-                raise RecordingError(f"Expected each column once. Got {name!r} twice (leave one out).")
+        names_x, names_y = column_names(x), column_names(y)
+        check_columns(frame, [*names_x, *names_y], "Recording(x=..., y=...)")
         if isinstance(x, str) and isinstance(options.get("units"), Mapping):
             options["units"] = {("x" if key == x else key): unit for key, unit in options["units"].items()}
         return cls(
@@ -268,40 +314,34 @@ class Recording:
             MissingDependencyError: If pandas is not installed.
             RecordingError: If the file is not a table, or as `from_frame`.
         """
-        try:
-            import pandas
-        except ImportError as error:
-            raise MissingDependencyError(
-                "Expected pandas for Recording.from_csv. Got no such package "
-                "(pip install pandas, or give arrays)."
-            ) from error
-        try:
-            with warnings.catch_warnings():
-                # Lines longer than the header: by default pandas shifts every column by one, without a word.
-                warnings.simplefilter("error", pandas.errors.ParserWarning)
-                frame = pandas.read_csv(path, skipinitialspace=True, index_col=False)
-        except (ValueError, pandas.errors.ParserWarning) as error:
-            raise RecordingError(
-                f"Expected a CSV file with a header line in {os.fspath(path)}. Got: {error} "
-                "(read it with pandas.read_csv and its options, then use Recording.from_frame)."
-            ) from error
-        return cls.from_frame(frame, x, y, **options)
+        return cls.from_frame(read_csv(path), x, y, **options)
 
     def __repr__(self) -> str:
         lost = int((~self.observed).sum())
-        lines = [f"Recording: {self.n} conditions"]
+        if self.runs is None:
+            lines = [f"Recording: {self.n} conditions"]
+        else:
+            count = "1 run" if len(self.runs) == 1 else f"{len(self.runs)} runs"
+            lines = [f"Recording in time: {count}, {self.n} samples"]
         if lost:
             lines[0] += f", {lost} of {len(self.y)} values missing"
         columns = self.x if isinstance(self.x, dict) else {"x": self.x}
         noises = self.split(self.noise) if isinstance(self.noise, Tensor) else {}
         for name, values in columns.items():
-            lines.append(f"  condition {self._title(name)}: {value_range(values)}")
+            if self.runs is None:
+                lines.append(f"  condition {self._title(name)}: {value_range(values)}")
+            elif name == "time":
+                lines.append(f"  {self._title(name)}: {value_range(values)}")
         for name, values in self.split(self.y).items():
             line = f"  output    {self._title(name)}: {value_range(values[~torch.isnan(values)])}"
             lines.append(line + (f", noise sd {value_range(noises[name])}" if noises else ""))
+        for name in self.runs[0].inputs if self.runs else ():
+            driven = torch.cat([run.inputs[name] for run in self.runs or ()])
+            lines.append(f"  input     {self._title(name)}: {value_range(driven)}")
         if not noises:
             lines.append("  noise     " + ("unknown" if self.noise is None else "none"))
         return "\n".join(lines)
 
     def _title(self, name: str) -> str:
-        return f"{name} [{self.units[name]}]" if name in self.units else name
+        units = self.units | (self.runs[0].units if self.runs else {})
+        return f"{name} [{units[name]}]" if name in units else name

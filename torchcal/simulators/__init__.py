@@ -4,19 +4,24 @@ from torchcal.simulators.build import build_surrogate
 from torchcal.simulators.design import Evaluations
 from torchcal.simulators.external import ExternalSimulator
 from torchcal.simulators.held_out import HeldOutError
+from torchcal.simulators.ode import ODESimulator
 from torchcal.simulators.parameter import Parameter, Scaling, free_parameters
-from torchcal.simulators.static import Conditions, Simulator, check_parameters
+from torchcal.simulators.static import Conditions, Linearisation, Simulator, check_parameters
 from torchcal.simulators.surrogate import PolynomialSurrogate
+from torchcal.simulators.trajectories import Trajectories
 
 __all__ = [
     "Conditions",
     "Evaluations",
     "ExternalSimulator",
     "HeldOutError",
+    "Linearisation",
+    "ODESimulator",
     "Parameter",
     "PolynomialSurrogate",
     "Scaling",
     "Simulator",
+    "Trajectories",
     "build_surrogate",
     "check_parameters",
     "free_parameters",

@@ -233,9 +233,21 @@ class _Differenced(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, job: _Job) -> Tensor:
         ctx.save_for_backward(values)
+        ctx.save_for_forward(values)
         ctx.job = job
         found = job(values.detach().cpu().to(torch.float64).numpy())
         return torch.from_numpy(found).to(values)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Tensor:
+        """Central difference along one direction for each row."""
+        (values,) = ctx.saved_tensors
+        direction = tangents[0].detach().to(torch.float64)
+        centre = values.detach().to(torch.float64)
+        size = (direction.abs() / ctx.job.steps(centre)).amax(dim=(1, 2), keepdim=True)
+        moved = direction / torch.where(size > 0, size, torch.ones_like(size))
+        up, down = torch.as_tensor(ctx.job(torch.cat([centre + moved, centre - moved]).cpu().numpy())).chunk(2)
+        return (0.5 * size[:, :, 0].cpu() * (up - down)).to(values)
 
     @staticmethod
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, None]:

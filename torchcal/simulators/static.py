@@ -1,17 +1,35 @@
 """Static simulators: outputs as a function of conditions and parameters."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
+from torchcal.data import Recording
 from torchcal.errors import DomainError, ShapeError, SimulatorError
 from torchcal.simulators.parameter import Parameter
 
-__all__ = ["Conditions", "Simulator", "check_parameters"]
+__all__ = ["Conditions", "Linearisation", "Simulator", "check_parameters"]
 
 Conditions = Tensor | Mapping[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """Outputs and their derivatives at some parameter values.
+
+    Attributes:
+        y: Outputs, ``(H, n)``.
+        jacobian: ∂y/∂λ in physical units, ``(H, n, columns)``.
+        warm: What makes a call at nearby values cheaper; hand it back to `Simulator.linearise`.
+    """
+
+    y: Tensor
+    jacobian: Tensor
+    warm: Any = None
 
 
 def check_parameters(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
@@ -103,6 +121,43 @@ class Simulator:
             return self._flatten(result, values, n, outputs)
 
         return evaluate
+
+    def bind(self, recording: Recording) -> "Simulator":
+        """The simulator of this recording's outputs; a static one is that already."""
+        return self
+
+    def linearise(
+        self,
+        x: Conditions,
+        values: Tensor,
+        outputs: Sequence[str] | None = None,
+        columns: Sequence[int] | None = None,
+        warm: Any = None,
+    ) -> Linearisation:
+        """Outputs and their exact derivatives by the parameters, in forward mode.
+
+        Args:
+            x: Conditions.
+            values: Parameter values, ``(H, d)``, physical units.
+            outputs: Names of the outputs wanted.
+            columns: Places of the parameters to derive by; all by default.
+            warm: ``warm`` of an earlier result at nearby values.
+        """
+        evaluate = self.at(x, outputs)
+        values = values.detach()
+        columns = list(range(values.shape[-1])) if columns is None else list(columns)
+        if not columns:
+            with torch.no_grad():
+                y = evaluate(values)
+            return Linearisation(y, y.new_zeros(*y.shape, 0))
+        tangent = values.new_zeros(len(columns), *values.shape)
+        for j, column in enumerate(columns):
+            tangent[j, ..., column] = 1.0
+        with torch.no_grad(), forward_ad.dual_level():
+            dual = forward_ad.make_dual(values.expand(len(columns), *values.shape).contiguous(), tangent)
+            found = forward_ad.unpack_dual(evaluate(dual))
+            derivative = torch.zeros_like(found.primal) if found.tangent is None else found.tangent
+        return Linearisation(found.primal[0], derivative.permute(1, 2, 0))
 
     def _flatten(self, result: Any, values: Tensor, n: int, outputs: Sequence[str] | None) -> Tensor:
         if not isinstance(result, Mapping):

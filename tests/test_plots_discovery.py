@@ -1,0 +1,561 @@
+"""Figures of a diagnosis: what is drawn equals what was given, and nothing hides anything else."""
+
+import math
+from types import SimpleNamespace
+
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import torch
+
+from torchcal import plots
+from torchcal.data import Recording, Run
+from torchcal.discovery.records import (
+    Estimate,
+    Experiment,
+    Fit,
+    Hypothesis,
+    Limit,
+    Location,
+    MissingRate,
+    NeededShift,
+    NoiseModel,
+    Score,
+    Scores,
+    Table,
+)
+from torchcal.errors import DomainError, ShapeError
+from torchcal.plots import discovery
+
+F64 = torch.float64
+NASTY = 'a <b>bold</b> & "quoted" $\\foo$ term of a user who writes very long names indeed'
+
+
+class StandIn(SimpleNamespace):
+    """Has a diagnosis's attributes, and says so."""
+
+    def __str__(self):
+        return self.words
+
+
+def noise(*shape, seed=1):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=F64)
+
+
+def fit(recording, prediction, terms=(), estimates=()):
+    return Fit(tuple(terms), tuple(estimates), prediction, recording.y - prediction, 150.0, 0.4)
+
+
+def scored(recording, prediction, mask):
+    def score(part):
+        error = (recording.y - prediction)[part & recording.observed]
+        rmse = float(error.square().mean().sqrt())
+        return Score(rmse, -math.log(rmse) - 1.4, 0.93, len(error))
+
+    held = None if mask is None else score(mask)
+    return Scores(score(torch.ones_like(recording.observed)), held, prediction, 0.02)
+
+
+def oscillator(samples=60):
+    """Two runs of two outputs; quadratic drag is named, the end of run 1 was held out."""
+    t = torch.linspace(0, 10, samples, dtype=F64)
+    runs, base, full = [], {"x": [], "v": []}, {"x": [], "v": []}
+    for i, size in enumerate((1.0, 2.5)):
+        soft, hard = torch.exp(-0.12 * t), 1 / (1 + 0.1 * size * t)
+        for states, decay in ((base, soft), (full, hard)):
+            states["x"].append(size * decay * torch.cos(2 * t))
+            states["v"].append(-2 * size * decay * torch.sin(2 * t))
+        outputs = {key: full[key][i] + 0.05 * noise(samples, seed=10 * i + j) for j, key in enumerate("xv")}
+        outputs["x"][5:8] = math.nan
+        runs.append(Run(t, outputs=outputs, inputs={"f": torch.sin(t)}, initial={"x": size}))
+    units = {"x": "m", "v": "m/s", "time": "s"}
+    recording = Recording(runs=runs, noise=0.05, missing=True, units=units)
+    before, after = (torch.cat([*states["x"], *states["v"]]) for states in (base, full))
+    late = (recording.x["run"] == 1) & (recording.x["time"] > 6.5)
+    mask = torch.cat([late, late]) & recording.observed
+    drag = Estimate("quadratic drag.c", 0.101, 0.004, "1/m")
+    table = [
+        Hypothesis(("quadratic drag",), 312.4, 0.93, (drag,), True, 0.97, 0.41, 0.052, 17.3, True),
+        Hypothesis(("cubic drag",), 309.6, 0.056, (Estimate("cubic drag.c", 0.03, 0.002, "s/m^2"),), True, 0.94,
+                   0.02, 0.08, 16.8, True),
+        Hypothesis(("quadratic drag", "cubic stiffness"), 308.1, 0.012, (), True, 0.97, 0.4, 0.052, None, True),
+        Hypothesis(("bias force",), 20.2, 1e-90, (), False, 0.1, 1e-9, 0.3, 2.2, False, None, ("x offset",), "sign"),
+        Hypothesis((), 0.0, 1e-130, (), True, 0.0, 1e-20, 0.31),
+        Hypothesis(("none of these",), 295.0, 0.002),
+        Hypothesis(("Coulomb friction",), -2500.0, 0.0, (), False),
+    ]  # fmt: skip
+    speed = torch.linspace(-4, 4, 50, dtype=F64)
+    spans = torch.linspace(0.3, 9.7, 14, dtype=F64)
+    return StandIn(
+        words="Something is missing (p = 2e-31): quadratic drag.\nIts coefficient is 0.101 ± 0.004 1/m.",
+        verdict="named", terms=["quadratic drag"], tied=[], p_detect=2e-31, confidence=0.93, remaining=0.03,
+        recording=recording, held_out=mask, base=fit(recording, before, (), (Estimate("k", 4.02, 0.01, "1/s^2"),
+                                                                            Estimate("c", 0.24, 0.01, "1/s", True))),
+        final=fit(recording, after, ("quadratic drag",), (Estimate("k", 4.0, 0.01, "1/s^2"), drag)),
+        where=Table([Location("equation", "v", "v", ((-4.5, -2.6), (2.4, 5.0)), 0.81, 200.0),
+                     Location("equation", "v", "t", ((0.0, 3.0),), 0.5, 90.0)],
+                    ("kind", "target", "driver", "spans", "share", "evidence")),
+        ranking=Table(table, ("terms", "log_evidence")),
+        detection_limit=Table([
+            Limit("quadratic drag", "c", 0.006, "1/m", 0.9, 0.101), Limit("cubic drag", "c", 0.004, "s/m^2", 0.9, 0.03),
+            Limit("cubic stiffness", "k3", 0.02, "1/(m^2 s^2)", 0.9, -0.006),
+            Limit("bias force", "b", 0.01, "m/s^2", 0.9),
+            Limit("linear drag", "c", math.inf, "1/s", 0.9, None, "already in the base model"),
+            Limit("Stribeck friction", "a", 0.5, "m/s^2", 0.9), Limit("Stribeck friction", "b", 0.25, None, 0.9),
+        ], ("term", "smallest")),
+        before=scored(recording, before, mask), after=scored(recording, after, mask),
+        improved=None, symptoms=["c ran to its bound of 0.24 1/s"],
+        noise=NoiseModel({"x": 0.05, "v": 0.05}, {"x": 0.0, "v": 0.02}, "given", 1),
+        shifts=[NeededShift("c", "1/s", "t", spans, 0.3 / (1 + 0.3 * spans) - 0.15 + 0.02 * noise(14, seed=4),
+                            0.02 + 0.4 * (spans > 9), -0.93)],
+        missing=MissingRate("equation", "v", "v", speed, -0.1 * speed * speed.abs(), 0.05 + 0.02 * speed.abs(), "m/s^2",
+                            t, torch.zeros_like(t)),
+        experiment=None, equations=["dx/dt = v", "dv/dt = -k x - c v + f - c |v| v"],
+        identifiability=["all base parameters are told by these data"],
+        simulator=SimpleNamespace(states={"x": "m", "v": "m/s"}), library=["quadratic drag", "cubic drag"],
+        settings={"seed": 0, "versions": {"torch": "2.x"}}, seconds=12.3,
+    )  # fmt: skip
+
+
+def ignition():
+    """Static, two conditions, without noise: two hypotheses are tied, the held-out data lie scattered."""
+    grid = torch.meshgrid(
+        torch.linspace(1000, 1300, 11, dtype=F64), torch.linspace(0.6, 1.8, 7, dtype=F64), indexing="ij"
+    )
+    x = {"T0": grid[0].flatten(), "phi": grid[1].flatten()}
+    truth = -18 + 19000 / x["T0"] + 1.3 * x["phi"].log()
+    base = -18 + 19000 / x["T0"] + 0.1
+    recording = Recording(x=x, y={"ln tau": truth}, noise="none", units={"T0": "K"})
+    mask = torch.zeros(77, dtype=torch.bool)
+    mask[::6] = True
+    names = [("fuel order",), ("composition-dependent rate",)]
+    return StandIn(
+        words="Two candidates explain it equally well.", verdict="ambiguous", terms=[], tied=[list(n) for n in names],
+        p_detect=0.0, confidence=0.5, remaining=0.02, recording=recording, held_out=mask,
+        base=fit(recording, base), final=fit(recording, base + 1.29 * x["phi"].log() - 0.1, names[0]),
+        where=Table([Location("parameter", "lnA", "phi", ((0.6, 0.9), (1.4, 1.8)), 0.99, 80.0)], ("kind",)),
+        ranking=Table([Hypothesis(names[0], 80.0, 0.5), Hypothesis(names[1], 79.9, 0.49), Hypothesis((), 0.0, 0.0),
+                       Hypothesis(("O2 order",), 40.0, 1e-18, (), False), Hypothesis(("none of these",), 60.0, 0.01)],
+                      ("terms",)),
+        detection_limit=Table([Limit("fuel order", "fuel_order", 0.01, None, 0.9, -1.3)], ("term",)),
+        before=scored(recording, base, mask), after=scored(recording, truth + 0.01, mask),
+        symptoms=[], noise=NoiseModel({}, {}, "none"),
+        shifts=[NeededShift("lnA", None, "phi", x["phi"][:7], -1.3 * x["phi"][:7].log(), torch.full((7,), 0.1), -0.99)],
+        missing=None, identifiability=[], equations=[], simulator=SimpleNamespace(), settings={}, library=[],
+        experiment=Experiment("one more delay at phi = 3", 5.2, {"T0": torch.tensor([1100.0]), "phi": 3.0}),
+        seconds=3.0,
+    )  # fmt: skip
+
+
+def cooling():
+    """Static, one condition, consistent; nothing was held out."""
+    x = torch.linspace(0, 120, 30, dtype=F64)
+    base = 25 + 60 * torch.exp(-x / 40)
+    recording = Recording(x=x, y=base + 0.3 * noise(30), units={"x": "min", "y": "°C"})
+    return StandIn(
+        words="The model agrees with the data.", verdict="consistent", terms=[], tied=[], p_detect=0.4, confidence=0.9,
+        remaining=0.0, recording=recording, held_out=None, base=fit(recording, base), final=fit(recording, base),
+        where=[], ranking=Table([Hypothesis((), 0.0, 0.9), Hypothesis(("radiation",), -1.5, 0.1)]),
+        detection_limit=Table([]), before=scored(recording, base, None), after=scored(recording, base, None),
+        symptoms=[], noise=NoiseModel({"y": 0.3}, {"y": 0.0}, "estimated"), shifts=[], missing=None, experiment=None,
+        equations=[], identifiability=[], simulator=SimpleNamespace(), settings={}, library=["radiation"], seconds=1.0,
+    )  # fmt: skip
+
+
+def unexplained():
+    """Long, dense, one run, names with markup; the driver is a hidden state."""
+    t = torch.linspace(0, 50, 3000, dtype=F64)
+    wiggle = 0.4 * torch.exp(-(((t - 30) / 3) ** 2))
+    base = torch.sin(t / 3)
+    recording = Recording(
+        runs=[Run(t, outputs={NASTY: base + wiggle + 0.1 * noise(3000)})], units={NASTY: "US$/h", "time": "h"}
+    )
+    grid = torch.linspace(0, 50, 80, dtype=F64)
+    late = t > 40
+    return StandIn(
+        words=f"Something is missing that is not among the candidates: {NASTY}.", verdict="unexplained", terms=[],
+        tied=[], p_detect=0.0, confidence=0.97, remaining=0.9, recording=recording, held_out=late,
+        base=fit(recording, base), final=fit(recording, base),
+        where=[Location("output", NASTY, "t", ((25.0, 35.0), (-math.inf, 2.0)), 0.9, 600.0),
+               Location("equation", "h", "hidden", ((0.0, 1.0),), 0.3, 20.0)],
+        ranking=[Hypothesis((NASTY,), -math.inf, 0.0, (), False), Hypothesis((), 0.0, 0.0),
+                 Hypothesis(("none of these",), 600.0, 1.0),
+                 Hypothesis(("lag", "drift", "saturation", "second heat capacity"), 3.0, 0.0)],
+        detection_limit=[Limit(NASTY, "a", 0.3, "$/h", 0.9, 0.001), Limit("lag", "tau", math.inf, "h", 0.9, math.nan)],
+        before=scored(recording, base, late), after=scored(recording, base, late),
+        symptoms=[f"{NASTY} wanders"], noise=NoiseModel({NASTY: 0.1}, {NASTY: 0.3}, "estimated", 3, {NASTY: 0.01}),
+        shifts=[], missing=MissingRate("output", NASTY, "t", grid, 0.4 * torch.exp(-(((grid - 30) / 3) ** 2)),
+                                       torch.full((80,), 0.05), "US$/h", grid, grid),
+        experiment=None, equations=[], identifiability=[f"{NASTY} & drift cannot be told apart"],
+        simulator=SimpleNamespace(), settings={"seed": 3}, library=[NASTY], seconds=100.0,
+    )  # fmt: skip
+
+
+STAND_INS = (oscillator, ignition, cooling, unexplained)
+
+
+def curve(ax, name):
+    (found,) = [line for line in ax.lines if line.get_label() == name]
+    return found
+
+
+def labels(ax):
+    return ax.get_legend_handles_labels()[1]
+
+
+def overlaps(first, second):
+    return first.x0 < second.x1 and second.x0 < first.x1 and first.y0 < second.y1 and second.y0 < first.y1
+
+
+# --- both fits -------------------------------------------------------------------------------------------
+
+
+def test_each_run_and_output_has_its_panel_with_both_fits():
+    d = oscillator()
+    axes = plots.both_fits(d.recording, d.base, d.final, held_out=d.held_out)
+    assert [(ax.get_title(loc="left"), ax.get_ylabel()) for ax in axes] == [
+        ("run 0", "x [m]"), ("run 1", "x [m]"), ("run 0", "v [m/s]"), ("run 1", "v [m/s]")
+    ]  # fmt: skip
+    assert {ax.get_xlabel() for ax in axes} == {"time [s]"}
+    for i, start in enumerate((0, 60, 120, 180)):
+        for name, model in (("base model", d.base), ("with quadratic drag", d.final)):
+            np.testing.assert_array_equal(curve(axes[i], name).get_ydata(), model.prediction[start : start + 60])
+        data = curve(axes[i], "data") if "data" in [line.get_label() for line in axes[i].lines] else axes[i].lines[0]
+        seen = d.recording.observed[start : start + 60]
+        np.testing.assert_array_equal(data.get_ydata(), d.recording.y[start : start + 60][seen])
+    assert ["held out" in labels(ax) for ax in axes] == [False, True, False, True]
+    (span,) = [patch for patch in axes[1].patches if patch.get_label() == "held out"]
+    t = d.recording.runs[1].time
+    assert span.get_x() == pytest.approx(float(t[t <= 6.5].max() + t[t > 6.5].min()) / 2)
+
+
+def test_one_run_or_output_can_be_chosen():
+    d = oscillator()
+    ax = plots.both_fits(d.recording, d.base, d.final, run=1, output="v")
+    assert ax.get_title(loc="left") == "run 1"
+    np.testing.assert_array_equal(curve(ax, "base model").get_ydata(), d.base.prediction[180:])
+    alone = plots.both_fits(d.recording, d.base, output="x", run=0, names=("mine", ""))
+    assert "mine" in labels(alone)
+    assert "accepted model" not in labels(alone)
+
+
+def test_a_run_without_the_output_gets_no_panel():
+    t = torch.linspace(0, 1, 9, dtype=F64)
+    recording = Recording(runs=[Run(t, outputs={"a": t, "b": t}), Run(t, outputs={"a": t})])
+    axes = plots.both_fits(recording, torch.zeros(36, dtype=F64))
+    assert [(ax.get_ylabel(), ax.get_title(loc="left")) for ax in axes] == [
+        ("a", "run 0"), ("a", "run 1"), ("b", "run 0")
+    ]  # fmt: skip
+
+
+def test_several_conditions_are_drawn_along_the_one_that_matters():
+    d = ignition()
+    axes = plots.both_fits(d.recording, d.base, d.final, held_out=d.held_out, along="phi", most=4)
+    assert [ax.get_title(loc="left") for ax in axes] == [f"T0 = {T} K" for T in (1000, 1090, 1210, 1300)]
+    np.testing.assert_allclose(curve(axes[1], "with fuel order").get_ydata(), d.final.prediction[21:28])
+    assert d.held_out[0]
+    np.testing.assert_allclose(curve(axes[0], "held out").get_xdata(), [0.6, 1.8])  # scattered: ringed, not shaded
+    assert not axes[0].patches
+
+
+def test_several_conditions_without_a_choice_are_fitted_against_measured():
+    d = ignition()
+    ax = plots.both_fits(d.recording, d.base, d.final)
+    np.testing.assert_array_equal(curve(ax, "base model").get_xdata(), d.recording.y)
+    np.testing.assert_array_equal(curve(ax, "base model").get_ydata(), d.base.prediction)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("measured ln tau", "fitted ln tau")
+
+
+def test_worst_outputs_are_kept_where_there_are_too_many():
+    t = torch.linspace(0, 1, 10, dtype=F64)
+    recording = Recording(x=t, y={f"y{i}": t for i in range(8)})
+    wrong = torch.cat([t + 0.1 * i for i in range(8)])
+    axes = plots.both_fits(recording, wrong, most=3)
+    assert [ax.get_ylabel() for ax in axes] == ["y5", "y6", "y7"]
+
+
+def test_long_recordings_are_thinned_but_keep_both_ends():
+    d = unexplained()
+    ax = plots.both_fits(d.recording, d.base)
+    drawn = curve(ax, "data").get_xdata()
+    assert len(drawn) == discovery.MOST_POINTS
+    assert (drawn[0], drawn[-1]) == (0.0, 50.0)
+    assert len(curve(ax, "base model").get_xdata()) == 3000
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "match"),
+    [
+        ({"output": "z"}, DomainError, "Expected output among"),
+        ({"along": "z"}, DomainError, "Expected along"),
+        ({"run": 7}, DomainError, r"Expected run among \[0, 1\]"),
+        ({"most": 0}, DomainError, "Expected most"),
+        ({"held_out": torch.zeros(3, dtype=torch.bool)}, ShapeError, "Expected a mask"),
+        ({"held_out": torch.zeros(240)}, ShapeError, "Expected a mask"),
+        ({"ax": []}, ShapeError, "at least one axes"),
+        ({"ax": 3}, DomainError, "Expected ax"),
+    ],
+)
+def test_both_fits_says_what_is_wrong(options, error, match):
+    d = oscillator()
+    with pytest.raises(error, match=match):
+        plots.both_fits(d.recording, d.base, **options)
+
+
+def test_fits_of_another_length_are_refused():
+    with pytest.raises(ShapeError, match=r"Expected before of shape \(240,\)"):
+        plots.both_fits(oscillator().recording, torch.zeros(239))
+    with pytest.raises(ShapeError, match="Expected after"):
+        plots.both_fits(oscillator().recording, torch.zeros(240), "text")
+
+
+# --- where -----------------------------------------------------------------------------------------------
+
+
+def test_residuals_are_data_minus_model_against_the_driver():
+    d = cooling()
+    ax = plots.residual_map(d.recording, d.base, d.base.prediction + 1, noise=d.noise, spans=[(40, 60)], share=0.5)
+    points = curve(ax, "base model")
+    np.testing.assert_array_equal(points.get_xdata(), d.recording.x)
+    np.testing.assert_allclose(points.get_ydata(), d.recording.y - d.base.prediction)
+    np.testing.assert_allclose(curve(ax, "accepted model").get_ydata(), d.recording.y - d.base.prediction - 1)
+    shapes = {patch.get_label(): patch.get_extents().transformed(ax.transData.inverted()) for patch in ax.patches}
+    assert (shapes["mismatch located here (50 % of it)"].x0, shapes["mismatch located here (50 % of it)"].x1) == (
+        40,
+        60,
+    )
+    assert shapes["±2 noise sd"].y1 == pytest.approx(0.6)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [min]", "data − model, y [°C]")
+
+
+def test_a_dense_map_draws_local_means():
+    d = ignition()
+    ax = plots.residual_map(d.recording, d.base, driver="phi")
+    line = curve(ax, "base model, local mean")
+    phi = d.recording.x["phi"].unique()
+    np.testing.assert_allclose(line.get_xdata(), phi)
+    np.testing.assert_allclose(line.get_ydata(), 1.3 * phi.log() - 0.1, atol=1e-9)
+
+
+def test_a_driver_is_found_where_it_is():
+    d = oscillator()
+    np.testing.assert_array_equal(plots.driver_values(d.recording, "t"), d.recording.x["time"])
+    np.testing.assert_array_equal(plots.driver_values(d.recording, "f"), d.recording.x["time"].sin())
+    np.testing.assert_array_equal(plots.driver_values(d.recording, "v", d.base), d.base.prediction[120:])
+    assert plots.driver_values(d.recording, "hidden") is None
+    with pytest.raises(DomainError, match=r"give its values="):
+        plots.residual_map(d.recording, d.base, driver="hidden")
+    ax = plots.residual_map(d.recording, d.base, driver="hidden", values=d.recording.x["time"] ** 2, output="v")
+    assert ax.get_xlabel() == "hidden"
+    with pytest.raises(ShapeError, match=r"Expected values of shape \(120,\)"):
+        plots.residual_map(d.recording, d.base, driver="hidden", values=torch.zeros(5))
+
+
+def test_spans_are_cut_to_the_data():
+    d = cooling()
+    ax = plots.residual_map(d.recording, d.base, spans=[(-math.inf, 10.0), (500, 600), (100.0, math.inf)])
+    located = [p.get_extents().transformed(ax.transData.inverted()) for p in ax.patches]
+    np.testing.assert_allclose([(box.x0, box.x1) for box in located], [(0, 10), (100, 120)], atol=1e-9)
+
+
+# --- ranking ---------------------------------------------------------------------------------------------
+
+
+def bars(ax):
+    return {ax.get_yticklabels()[round(bar.get_y() + bar.get_height() / 2)].get_text(): bar for bar in ax.patches}
+
+
+def test_ranking_shows_evidence_and_marks_what_each_is():
+    d = oscillator()
+    ax = plots.ranking(d.ranking, accepted=d.terms, tied=[["cubic drag"]])
+    found = bars(ax)
+    assert list(dict.fromkeys(text.get_text() for text in ax.get_yticklabels())) == [
+        "quadratic drag", "cubic drag", "quadratic drag + cubic stiffness", "none of these", "bias force",
+        "base model alone", "Coulomb friction",
+    ]  # fmt: skip
+    assert found["quadratic drag"].get_width() == 312.4
+    assert -2500 < found["Coulomb friction"].get_width() < 0  # cut, with its number beside it
+    written = {text.get_text() for text in ax.texts}
+    assert {"+312.4", "−2500", "93 %", "<0.1 %", "ln K", "prob."} <= written
+    assert found["bias force"].get_hatch() == "xxxx"
+    assert found["cubic drag"].get_hatch() == "////"
+    assert found["quadratic drag"].get_hatch() is None
+    assert ax.get_xlabel() == "log evidence against the base, ln K [1]"
+
+
+def test_the_base_and_none_of_these_stay_in_a_short_ranking():
+    many = [Hypothesis((f"candidate {i}",), 300.0 - i, 0.02) for i in range(40)]
+    rest = [Hypothesis((), 0.0, 0.0), Hypothesis(("none of these",), -5.0, 0.0)]
+    ax = plots.ranking([*rest, *many], most=6, tied=[["candidate 30"]], value="probability")
+    names = [text.get_text() for text in ax.get_yticklabels()]
+    assert sorted(names) == sorted(
+        ["base model alone", "none of these", "candidate 30", "candidate 0", "candidate 1", "candidate 2"]
+    )
+    assert "(36 weaker ones not shown)" in ax.get_xlabel()
+    with pytest.raises(DomainError, match="at least one hypothesis"):
+        plots.ranking([])
+    with pytest.raises(DomainError, match="Expected value"):
+        plots.ranking(many, value="evidence")
+
+
+# --- shift, rate -----------------------------------------------------------------------------------------
+
+
+def test_needed_shift_keeps_its_range_despite_a_blind_stretch():
+    needed = oscillator().shifts[0]
+    ax = plots.needed_shift(needed, units={"time": "s"})
+    (points,) = ax.containers
+    np.testing.assert_array_equal(points.lines[0].get_ydata(), needed.shift)
+    assert ax.get_ylim()[1] < 0.2
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("time [s]", "needed shift of c [1/s], ±1 sd")
+    assert ax.get_title(loc="right") == "rank correlation −0.93"
+
+
+def test_missing_rate_has_a_band_of_two_sd():
+    missing = oscillator().missing
+    ax = plots.missing_rate(missing, units={"v": "m/s"})
+    np.testing.assert_array_equal(curve(ax, "estimate").get_ydata(), missing.rate)
+    top = ax.collections[0].get_paths()[0].vertices
+    assert top[:, 1].max() == pytest.approx(float((missing.rate + 2 * missing.sd).max()))
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("v [m/s]", "missing rate of dv/dt [m/s^2]")
+    with pytest.raises(ShapeError, match="Expected sd"):
+        plots.missing_rate(SimpleNamespace(**{**vars(missing), "sd": missing.sd[1:]}))
+
+
+# --- proof -----------------------------------------------------------------------------------------------
+
+
+def test_held_out_draws_the_predictions_of_the_scores():
+    d = oscillator()
+    ax = plots.held_out(d.recording, d.before, d.after, d.held_out)
+    np.testing.assert_array_equal(curve(ax, "base model").get_ydata(), d.before.prediction[60:120])
+    assert "held out" in labels(ax)
+    d = ignition()
+    ax = plots.held_out(d.recording, d.before, d.after, d.held_out)
+    np.testing.assert_array_equal(curve(ax, "accepted model").get_xdata(), d.recording.y[d.held_out])
+    assert ax.get_ylabel() == "predicted ln tau"
+    with pytest.raises(DomainError, match="Got none"):
+        plots.held_out(d.recording, d.before, d.after, torch.zeros(77, dtype=torch.bool))
+
+
+def test_scores_are_drawn_before_and_after():
+    d = oscillator()
+    axes = plots.held_out_scores(d.before, d.after, unit="m")
+    assert [ax.get_xlabel() for ax in axes] == ["RMSE [m]", "log score [nat]", "coverage [1]"]
+    for ax, field in zip(axes, ("rmse", "log_score", "coverage"), strict=True):
+        for name, scores in (("before", d.before), ("after", d.after)):
+            (first,) = curve(ax, name).get_xdata()
+            (second,) = curve(ax, "_" + name).get_xdata()
+            assert first == getattr(scores.fitted, field)
+            assert second == getattr(scores.held_out, field)
+    only = plots.held_out_scores(cooling().before)
+    assert [text.get_text() for text in only[0].get_yticklabels()] == ["fitted"]
+    with pytest.raises(ShapeError, match="three axes"):
+        plots.held_out_scores(d.before, ax=axes[:2])
+
+
+# --- limits ----------------------------------------------------------------------------------------------
+
+
+def test_detection_limits_are_ratios():
+    d = oscillator()
+    ax = plots.detection_limits(d.detection_limit)
+    names = [text.get_text() for text in ax.get_yticklabels()]
+    assert names[:3] == ["quadratic drag", "cubic drag", "cubic stiffness"]
+    assert {"Stribeck friction.a", "Stribeck friction.b"} <= set(names)
+    dots = {int(line.get_ydata()[0]): line.get_xdata()[0] for line in ax.lines if len(line.get_xdata()) == 1}
+    assert dots == pytest.approx({0: 0.101 / 0.006, 1: 7.5, 2: 0.3})
+    assert ax.get_xscale() == "log"
+    assert {"0.006 1/m", "already in the base model"} <= {text.get_text() for text in ax.texts}
+    with pytest.raises(DomainError, match="at least one candidate"):
+        plots.detection_limits([])
+
+
+# --- overview --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("make", STAND_INS)
+def test_overview_shows_what_there_is(make, monkeypatch):
+    monkeypatch.setattr(plt, "show", lambda *args, **options: pytest.fail("a figure was shown"))
+    settings, state = dict(matplotlib.rcParams), torch.get_rng_state()
+    figure = plots.discovery_overview(make())
+    figure.canvas.draw()
+    keys = {
+        "oscillator": ["fits", "residuals", "ranking", "shift", "missing", "held out", "scores", "limits"],
+        "ignition": ["fits", "residuals", "ranking", "shift", "held out", "scores", "limits"],
+        "cooling": ["fits", "residuals", "ranking", "scores"],
+        "unexplained": ["fits", "residuals", "ranking", "missing", "held out", "scores", "limits"],
+    }
+    parts = discovery.figure_parts(make())
+    assert [part.key for part in parts] == keys[make.__name__]
+    assert len(figure.subfigs) == len(parts)
+    assert dict(matplotlib.rcParams) == settings
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+@pytest.mark.parametrize("make", STAND_INS)
+def test_nothing_is_cut_off_or_hidden(make):
+    figure = plots.discovery_overview(make())
+    figure.canvas.draw()
+    page = figure.bbox
+    for part in figure.subfigs:
+        title = part._suptitle.get_window_extent()
+        legends = [ax.get_legend() for ax in part.axes if ax.get_legend()] + list(part.legends)
+        for legend in legends:
+            box = legend.get_window_extent()
+            assert not overlaps(box, title)
+            for ax in part.axes:
+                assert not overlaps(box.padded(-1), ax.bbox), part._suptitle.get_text()
+                for text in ax.texts:
+                    assert not overlaps(box.padded(-1), text.get_window_extent()), text.get_text()
+        for ax in part.axes:
+            box = ax.get_tightbbox()
+            assert box.x0 >= page.x0 - 1
+            assert box.x1 <= page.x1 + 1
+            assert box.y0 >= page.y0 - 1
+            assert box.y1 <= page.y1 + 1
+            assert min(ax.bbox.width, ax.bbox.height) > 0.9 * figure.dpi
+    for i, one in enumerate(figure.axes):
+        for other in figure.axes[:i]:
+            assert not overlaps(one.get_tightbbox().padded(-1.5), other.get_tightbbox().padded(-1.5))
+
+
+def test_overview_draws_in_a_given_figure():
+    figure = plt.figure(figsize=(11, 9))
+    (part,) = figure.subfigures(1, 1, squeeze=False).flat
+    assert plots.discovery_overview(cooling(), figure) is figure
+    assert part is not plots.discovery_overview(cooling(), plt.figure())
+    with pytest.raises(DomainError, match="Expected fig"):
+        plots.discovery_overview(cooling(), fig=3)
+    with pytest.raises(DomainError, match="Expected diagnosis"):
+        plots.discovery_overview(SimpleNamespace())
+
+
+def test_values_of_a_hidden_driver_come_from_the_diagnosis():
+    d = oscillator()
+    d.where = [Location("equation", "v", "hidden", ((0.1, 0.2),), 0.4, 9.0)]
+    (part,) = [part for part in discovery.figure_parts(d) if part.key == "residuals"]
+    assert part.name == "Residuals"
+    d.drivers = {"hidden": torch.linspace(0, 1, 120, dtype=F64)}
+    (part,) = [part for part in discovery.figure_parts(d) if part.key == "residuals"]
+    assert part.name == "Where the mismatch sits"
+    figure = plt.figure()
+    part.draw(figure)
+    assert figure.axes[0].get_xlabel() == "hidden"
+
+
+def test_a_dollar_in_a_name_is_no_mathematics():
+    ax = plots.ranking([Hypothesis((NASTY,), 1.0, 1.0), Hypothesis((), 0.0, 0.0)])
+    ax.figure.canvas.draw()
+    shown = ax.get_yticklabels()[0].get_text()
+    assert r"\$" in shown
+    assert len(shown) <= 48
+
+
+@pytest.mark.parametrize("pair", [(discovery.BASE, discovery.ACCEPTED), (discovery.HELD_OUT, discovery.ACCEPTED)])
+def test_colours_differ_in_grey(pair):
+    def grey(color):
+        return float(np.dot([0.2126, 0.7152, 0.0722], matplotlib.colors.to_rgb(color)))
+
+    assert abs(grey(pair[0]) - grey(pair[1])) > 0.2

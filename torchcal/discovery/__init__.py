@@ -1,0 +1,35 @@
+"""Discovery: detect a mismatch, locate it, name it, model it, prove it."""
+
+from torchcal.discovery.diagnose import diagnose
+from torchcal.discovery.records import (
+    Estimate,
+    Experiment,
+    Fit,
+    Hypothesis,
+    Limit,
+    Location,
+    MissingRate,
+    NeededShift,
+    NoiseModel,
+    Score,
+    Scores,
+    Table,
+)
+from torchcal.discovery.result import Diagnosis
+
+__all__ = [
+    "Diagnosis",
+    "Estimate",
+    "Experiment",
+    "Fit",
+    "Hypothesis",
+    "Limit",
+    "Location",
+    "MissingRate",
+    "NeededShift",
+    "NoiseModel",
+    "Score",
+    "Scores",
+    "Table",
+    "diagnose",
+]

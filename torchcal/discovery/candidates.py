@@ -1,0 +1,238 @@
+"""Candidates prepared for a recording: the extended simulator, which parameters are amplitudes, and their tangents."""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.fitting import Fitted
+from torchcal.discovery.problem import Problem
+from torchcal.errors import DomainError, SimulatorError
+from torchcal.simulators import Parameter, Trajectories
+from torchcal.terms import Term, extend
+from torchcal.terms.term import neutral_of
+
+__all__ = ["Candidate", "base_columns", "drivers_scale", "prepare", "spread_values"]
+
+#: Points of a grid of shape parameters: along one, two, three and more of them.
+GRID_POINTS = (1, 9, 5, 4)
+#: Range of a shape parameter measured on a driver's scale.
+SCALE_RANGE = (0.02, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A term, or several, added to the base and looked at from the base's fit.
+
+    Attributes:
+        terms: The terms.
+        problem: With the extended simulator.
+        free: Places of all parameters that a refit frees.
+        own: Places of the terms' parameters.
+        amplitudes: Places among them whose neutral values switch the terms off.
+        neutral: Neutral values of ``own`` (the middle of the bounds for a shape without one).
+        shapes: Values of ``own`` on a grid of shapes, ``(G, len(own))``, amplitudes neutral.
+        tangents: ∂y/∂amplitude at each shape, ``(G, n, len(amplitudes))``.
+        begin: Base estimate with the terms at neutral, ``(P,)``.
+    """
+
+    terms: tuple[Term, ...]
+    problem: Problem
+    free: list[int]
+    own: list[int]
+    amplitudes: list[int]
+    neutral: Tensor
+    shapes: Tensor
+    tangents: Tensor
+    begin: Tensor
+
+    @property
+    def name(self) -> str:
+        """Names of its terms."""
+        return " + ".join(term.name for term in self.terms)
+
+    def one_sided(self, place: int) -> int:
+        """+1 or −1 where physics lets the amplitude leave its neutral value to one side only, else 0."""
+        parameter = self.problem.parameters[place]
+        neutral = float(self.neutral[self.own.index(place)])
+        if parameter.low is not None and parameter.low >= neutral - 1e-12 * abs(neutral):
+            return 1
+        if parameter.high is not None and parameter.high <= neutral + 1e-12 * abs(neutral):
+            return -1
+        return 0
+
+    @property
+    def blind(self) -> bool:
+        """Whether the tangent vanishes at the neutral value, so that only a refit can tell."""
+        return not bool((self.tangents.abs() > 0).any())
+
+
+def base_columns(problem: Problem, fixed: Mapping[str, float]) -> tuple[list[int], dict[int, float]]:
+    """Places of the base's free parameters, and values of those held."""
+    free, held = [], {}
+    for i, parameter in enumerate(problem.parameters):
+        if parameter.name in fixed:
+            held[i] = float(fixed[parameter.name])
+        elif parameter.neutral is not None:
+            held[i] = parameter.neutral
+        else:
+            free.append(i)
+    return free, held
+
+
+def drivers_scale(problem: Problem, found: Fitted) -> dict[str, float]:
+    """Largest magnitude of every driver and output on the calibrated trajectory."""
+    scale = {
+        name: float(values.abs().max())
+        for name, values in problem.drivers(found.values[None], found.warm).items()
+        if bool(torch.isfinite(values).all())
+    }
+    if "t" in scale and problem.order is not None:
+        scale["t"] = float(problem.order.max() - problem.order.min())
+    for number, name in enumerate(problem.recording.outputs):
+        scale.setdefault(name, float(found.y[problem.output_of == number].abs().max()))
+    return scale
+
+
+def sized(term: Term, scale: Mapping[str, float]) -> Term:
+    """The term with bounds for the shape parameters that it measures on a driver's scale."""
+    if not term.scales:
+        return term
+    parameters = []
+    for parameter in term.parameters:
+        driver = term.scales.get(parameter.name)
+        if driver is None or (parameter.low is not None and parameter.high is not None):
+            parameters.append(parameter)
+            continue
+        if driver not in scale:
+            raise DomainError(
+                f"Expected the term {term.name!r} to measure {parameter.name!r} on the scale of one of "
+                f"{list(scale)}. Got {driver!r}."
+            )
+        size = scale[driver] or 1.0
+        low, high = (part * size for part in SCALE_RANGE)
+        parameters.append(dataclasses.replace(parameter, low=low, high=high, initial=None, neutral=None))
+    sizedterm = object.__new__(Term)
+    for field in dataclasses.fields(Term):
+        object.__setattr__(sizedterm, field.name, getattr(term, field.name))
+    object.__setattr__(sizedterm, "parameters", tuple(parameters))
+    return sizedterm
+
+
+def spread_values(target: Problem, names: Sequence[str], values: Tensor) -> Tensor:
+    """Values by name in another simulator's order; nan for names it alone has."""
+    place = {name: i for i, name in enumerate(names)}
+    return torch.stack([
+        values[place[q.name]] if q.name in place else values.new_tensor(math.nan) for q in target.parameters
+    ])  # fmt: skip
+
+
+def _shape_points(parameter: Parameter, count: int) -> list[float]:
+    low, high = parameter.low, parameter.high
+    if low is None or high is None:
+        middle = parameter.initial or parameter.neutral or 1.0
+        return [middle * 2.0**k for k in torch.linspace(-2, 2, count).tolist()] if count > 1 else [middle]
+    at = torch.linspace(0, 1, count + 2, dtype=torch.float64)[1:-1]
+    if parameter.transform == "log" or (low > 0 and high / low > 20):
+        return [float(low * (high / low) ** a) for a in at]
+    return [float(low + (high - low) * a) for a in at]
+
+
+def prepare(
+    base: Problem, found: Fitted, terms: Sequence[Term], fixed: Mapping[str, float], scale: Mapping[str, float]
+) -> Candidate:
+    """Extend the simulator by terms and take the tangents of their amplitudes at the base's fit.
+
+    Raises:
+        SimulatorError: If the terms change the simulator at their neutral values.
+    """
+    terms = tuple(sized(term, scale) for term in terms)
+    extended = base.with_simulator(extend(base.simulator, terms))
+    problem = dataclasses.replace(extended, keep=base.keep)
+    begin = spread_values(problem, [q.name for q in base.parameters], found.values)
+    own, neutral, certain = [], [], []
+    terms_names = {term.full(q.name): (term, q) for term in terms for q in term.parameters}
+    freed = {name for term in terms for name in term.frees}
+    base_parameters = {q.name: q for q in base.parameters}
+    for i, q in enumerate(problem.parameters):
+        if q.name in terms_names:
+            at = neutral_of(terms_names[q.name][1])
+        elif q.name in freed:
+            at = base_parameters[q.name].neutral
+            at = float(begin[i]) if at is None else at
+        else:
+            continue
+        own.append(i)
+        certain.append(at is not None)
+        neutral.append(_shape_points(q, 1)[0] if at is None else at)
+        begin[i] = neutral[-1]
+    held, _ = base_columns(problem, fixed)
+    free = sorted(set(held) | set(own))
+
+    def linear(rows: Tensor, columns: list[int]) -> tuple[Tensor, Tensor]:
+        warm = None
+        if isinstance(problem.simulator, Trajectories) and isinstance(found.warm, Tensor):
+            same = len(problem.simulator.ode.states) == found.warm.shape[-1]
+            warm = found.warm.expand(len(rows), *found.warm.shape[1:]) if same else None
+        y, jacobian, _ = problem.evaluate(rows, columns, warm)
+        return y, jacobian
+
+    y, jacobian = linear(begin[None], own)
+    size = found.whitening.sd.min()
+    change = float((y[0] - found.y).abs().max())
+    if not change <= 1e-6 * max(float(found.y.abs().max()), float(size)):
+        raise SimulatorError(
+            f"Expected the term {' + '.join(t.name for t in terms)!r} to leave the simulator unchanged at its neutral "
+            f"values {dict(zip([problem.parameters[i].name for i in own], neutral, strict=True))}. Got a change of "
+            f"{change:.3g} (give neutral= the value at which it has no effect)."
+        )
+    moves = torch.nan_to_num(jacobian[0], nan=1.0, posinf=1.0, neginf=1.0).abs().amax(0) > 0
+    amplitudes = [place for place, sure, m in zip(own, certain, moves.tolist(), strict=True) if sure and m]
+    if not amplitudes:  # a product of parameters, or a threshold: try each with the others away from neutral
+        amplitudes = _hidden_amplitudes(problem, own, certain, begin, linear)
+    shape = [place for place in own if place not in amplitudes]
+    grid = _grid(problem, shape)
+    rows = begin.expand(len(grid), -1).clone()
+    if shape:
+        rows[:, shape] = grid
+    tangents = _in_pieces(linear, rows, amplitudes)
+    return Candidate(
+        terms=terms,
+        problem=problem,
+        free=free,
+        own=own,
+        amplitudes=amplitudes,
+        neutral=torch.tensor(neutral, dtype=torch.float64),
+        shapes=rows[:, own],
+        tangents=torch.nan_to_num(tangents, nan=0.0, posinf=0.0, neginf=0.0),
+        begin=begin,
+    )
+
+
+def _in_pieces(linear: object, rows: Tensor, amplitudes: list[int]) -> Tensor:
+    return torch.cat([linear(rows[k : k + 16], amplitudes)[1] for k in range(0, len(rows), 16)])  # type: ignore[operator]
+
+
+def _hidden_amplitudes(problem: Problem, own: list[int], certain: list[bool], begin: Tensor, linear: object) -> list[int]:
+    for place, sure in zip(own, certain, strict=True):
+        if not sure:
+            continue
+        row = begin.clone()
+        for other in own:
+            if other != place:
+                row[other] = _shape_points(problem.parameters[other], 1)[0]
+        jacobian = linear(row[None], [place])[1]  # type: ignore[operator]
+        if bool((torch.nan_to_num(jacobian).abs() > 0).any()):
+            return [place]
+    return [own[0]]
+
+
+def _grid(problem: Problem, shape: list[int]) -> Tensor:
+    count = GRID_POINTS[min(len(shape), len(GRID_POINTS) - 1)]
+    points = [_shape_points(problem.parameters[place], count) for place in shape]
+    rows = list(itertools.product(*points))[:256]
+    return torch.tensor(rows, dtype=torch.float64).reshape(len(rows), len(shape))

@@ -1,0 +1,161 @@
+"""Channels: the places where a change of the model can act, and what a change there does to the data.
+
+A change of one equation at one moment moves everything that is observed later. Those linear responses, along the fitted
+trajectory, say what any rate, known or unknown, in any window of time or state, does to the recording.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from torchcal.discovery.fitting import Fitted
+from torchcal.discovery.problem import Problem
+from torchcal.simulators import Trajectories
+
+__all__ = ["Channel", "channels", "responses"]
+
+#: Moments that a trajectory is cut into, over all runs.
+BINS = 150
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """A place where a change can act.
+
+    Attributes:
+        kind: ``"equation"``, ``"parameter"`` or ``"output"``.
+        target: Which one.
+        unit: Of a change there.
+        drivers: What the change may vary with: values at the K points where it can act, ``(K,)`` each.
+        time: Time, or condition, of the points ``(K,)``.
+        matrix: Response of the n used data to a unit change at each point, ``(n, K)``; or its diagonal ``(n,)`` where
+            each point is a datum.
+    """
+
+    kind: str
+    target: str
+    unit: str | None
+    drivers: dict[str, Tensor]
+    time: Tensor
+    matrix: Tensor
+
+    def response(self, profile: Tensor) -> Tensor:
+        """Change of the data by a change ``profile`` (K, m) along the points, ``(n, m)``."""
+        return self.matrix[:, None] * profile if self.matrix.ndim == 1 else self.matrix @ profile
+
+
+def _binning(bound: Trajectories) -> tuple[Tensor, int]:
+    """Bin of every step ``(R, K)`` (−1 for padding), and how many there are."""
+    runs = len(bound.runs)
+    each = max(30, BINS // runs)
+    bins = torch.full_like(bound._h, -1, dtype=torch.long)
+    first = 0
+    for r in range(runs):
+        real = int((bound._h[r] > 0).sum())
+        count = min(each, real)
+        bins[r, :real] = first + (torch.arange(real) * count) // real
+        first += count
+    return bins, first
+
+
+def responses(problem: Problem, found: Fitted, forcing: Tensor) -> tuple[Tensor, dict[str, Tensor], Tensor]:
+    """Responses of the used data to forcings within each bin of the trajectory, by the adjoint recursion.
+
+    Args:
+        problem: With a simulator in time.
+        found: Its fit.
+        forcing: Change of the state by the end of each step, ``(R, K, S, m)``.
+
+    Returns:
+        ``(n, bins, m)``, the drivers ``(bins,)`` by name, and the bins' times.
+    """
+    bound = problem.simulator
+    if not isinstance(bound, Trajectories):
+        raise TypeError("responses need a simulator in time")
+    values, states = found.values[None], found.warm
+    if states is None:
+        states = bound.solve(values)
+    flow = bound.flow(values, states)[0]  # (R, K, S, S)
+    size = flow.shape[-1]
+    seen = states[:, bound._run_of, bound._node_of]
+    with torch.no_grad(), forward_ad.dual_level():
+        tangent = torch.zeros(size, *seen.shape, dtype=torch.float64)
+        for i in range(size):
+            tangent[i, ..., i] = 1.0
+        dual = forward_ad.make_dual(seen.expand(size, -1, -1, -1).contiguous(), tangent)
+        plain = values.expand(size, -1, -1)
+        out = forward_ad.unpack_dual(bound._measure(plain, dual, problem.recording.outputs)).tangent
+    rows = torch.zeros(size, len(problem.recording.y), dtype=torch.float64) if out is None else out[:, 0]
+    rows = rows.T[problem.index]  # (n, S)
+    run_of, node_of = bound._run_of[problem.condition_of], bound._node_of[problem.condition_of]
+    bins, count = _binning(bound)
+    result = torch.zeros(problem.n, count, forcing.shape[-1], dtype=torch.float64)
+    for r in range(len(bound.runs)):
+        mine = (run_of == r).nonzero()[:, 0]
+        order = node_of[mine].argsort(descending=True, stable=True)
+        mine = mine[order]
+        nodes = node_of[mine].tolist()
+        adjoint = torch.zeros(len(mine), size, dtype=torch.float64)
+        filled = 0
+        last = int((bound._h[r] > 0).sum())
+        block = torch.zeros(len(mine), count, forcing.shape[-1], dtype=torch.float64)
+        where = bins[r].tolist()
+        for k in range(last - 1, -1, -1):
+            while filled < len(nodes) and nodes[filled] >= k + 1:
+                adjoint[filled] = rows[mine[filled]]
+                filled += 1
+            if filled == 0:
+                continue
+            active = adjoint[:filled]
+            block[:filled, where[k]] += active @ forcing[r, k]
+            adjoint[:filled] = active @ flow[r, k]
+        result[mine] = block
+    along = bound.along(values, states)
+    flat = bins.reshape(-1)
+    real = flat >= 0
+    weight = torch.zeros(count, dtype=torch.float64).index_add_(0, flat[real], torch.ones(int(real.sum()), dtype=torch.float64))
+    drivers = {}
+    for name, table in along.items():
+        middle = (0.5 * (table[:, :-1] + table[:, 1:])).reshape(-1)[real]
+        drivers[name] = torch.zeros(count, dtype=torch.float64).index_add_(0, flat[real], middle) / weight
+    return result, drivers, drivers["t"]
+
+
+def _plain(name: str, unit: str | None) -> str | None:
+    return None if unit is None else (f"{unit}/s" if unit else "1/s")
+
+
+def channels(problem: Problem, found: Fitted) -> list[Channel]:
+    """Every equation, every free parameter and every output."""
+    list_: list[Channel] = []
+    bound = problem.simulator
+    names = [q.name for q in problem.parameters]
+    if isinstance(bound, Trajectories):
+        states = found.warm if found.warm is not None else bound.solve(found.values[None])
+        own = [i for i in found.free if names[i] not in bound.initial_names]
+        size = len(bound.ode.states)
+        _, _, by_parameter = bound._step_derivatives(found.values[None], states, own)
+        kicks = torch.diag_embed(bound._h[..., None].expand(-1, -1, size))
+        forcing = torch.cat([kicks, by_parameter[0]], dim=-1)
+        response, drivers, time = responses(problem, found, forcing)
+        labels = [("equation", state, _plain(state, unit)) for state, unit in bound.ode.states.items()]
+        labels += [("parameter", names[i], problem.parameters[i].unit) for i in own]
+        for m, (kind, target, unit) in enumerate(labels):
+            list_.append(Channel(kind, target, unit, drivers, time, response[:, :, m]))
+        at_data = {name: values[problem.condition_of] for name, values in problem.drivers(found.values[None], states).items()}
+    else:
+        at_data = {name: values[problem.condition_of] for name, values in problem.drivers(found.values[None], None).items()}
+        time = problem.order[problem.condition_of] if problem.order is not None else torch.arange(problem.n).double()
+        for j, i in enumerate(found.free):
+            list_.append(Channel("parameter", names[i], problem.parameters[i].unit, at_data, time, found.jacobian[:, j]))
+    time = problem.order[problem.condition_of] if problem.order is not None else torch.arange(problem.n).double()
+    for number, name in enumerate(problem.recording.outputs):
+        mine = (problem.output_of == number).double()
+        own_drivers = {**at_data, f"{name} itself": found.y}
+        if not problem.in_time or name in at_data:
+            own_drivers.pop(f"{name} itself")
+        list_.append(Channel("output", name, problem.recording.units.get(name), own_drivers, time, mine))
+    return [c for c in list_ if math.isfinite(float(c.matrix.abs().sum()))]

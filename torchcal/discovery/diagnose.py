@@ -1,0 +1,439 @@
+"""`diagnose`: locate the mismatch of a simulation and a recording, name it, model it, prove it."""
+
+import math
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from torchcal.data import Recording
+from torchcal.discovery import explain, verify
+from torchcal.discovery.candidates import base_columns
+from torchcal.discovery.experiment import propose
+from torchcal.discovery.fitting import Fitted
+from torchcal.discovery.records import Estimate, Hypothesis, Scores, Table
+from torchcal.discovery.result import Diagnosis
+from torchcal.discovery.search import PRIOR, Model, Search, describe
+from torchcal.discovery.problem import Problem
+from torchcal.errors import ConvergenceWarning, DomainError, RecordingError
+from torchcal.simulators import Parameter, Simulator, Trajectories
+from torchcal.terms import Term, extend
+
+__all__ = ["diagnose"]
+
+#: A hypothesis is named when it has at least this probability among those the library offers.
+NAMED = 0.95
+#: Structure left after a hypothesis with less probability than this by noise alone speaks against it.
+WHITE = 0.005
+#: Of the tied hypotheses, those that together have this probability are listed.
+TIED = 0.98
+#: Of a recording without noise, the share of the held-out misfit that a named term must remove.
+REMOVED = 0.9
+#: Power of the stated detection limits.
+POWER = 0.95
+
+COLUMNS = (
+    "terms", "region", "log_evidence", "probability", "misfit_removed", "p_white", "physical", "estimates",
+    "held_out_rmse", "score", "refitted", "aliases", "note",
+)  # fmt: skip
+
+
+def diagnose(
+    simulator: Simulator,
+    recording: Recording,
+    candidates: Sequence[Term] = (),
+    *,
+    holdout: Any = None,
+    fixed: Mapping[str, float] | None = None,
+    confidence: float = 0.99,
+    max_terms: int = 3,
+    num_starts: int = 12,
+    seed: int = 0,
+    progress: bool = True,
+) -> Diagnosis:
+    """Find the physics that was left out of a simulation, or say that nothing is missing, or that it is unknown.
+
+    All base parameters and unknown initial states are calibrated first, which bends them to hide what is missing. What is
+    left is compared with noise, located, and screened in the tangent space of the candidates. Every surviving candidate
+    is then added and refitted together with everything else, several together too; evidence, physical bounds and the
+    whiteness of what is left decide, and held-out data must agree.
+
+    Args:
+        simulator: The base model, a `Simulator` or an `ODESimulator`. Parameters with a neutral value stay there until a
+            candidate frees them.
+        recording: The data; of a `Recording(runs=...)` for an `ODESimulator`.
+        candidates: Terms that might have been left out. A later term replaces an earlier one of the same name.
+        holdout: None to hold out the last quarter (see `torchcal.discovery.verify.choose`), False for nothing, a share,
+            or a bool array, True where held out.
+        fixed: Values of parameters that are not calibrated.
+        confidence: 1 minus the probability of calling noise a mismatch.
+        max_terms: Terms that may be missing together.
+        num_starts: Starting values of the base's calibration.
+        seed: Of every random number.
+        progress: Whether to show a bar.
+
+    Returns:
+        The diagnosis; print it.
+
+    Raises:
+        DomainError: If an argument is not as described.
+        RecordingError: If simulator and recording do not belong together.
+        ConvergenceError: If the base cannot be calibrated at all.
+    """
+    begun = time.perf_counter()
+    terms = _check(simulator, recording, candidates, confidence, max_terms, num_starts)
+    problem = Problem.of(simulator, recording)
+    free, _ = base_columns(problem, fixed or {})
+    if not free:
+        raise DomainError("Expected at least one parameter to calibrate. Got all of them fixed or dormant.")
+    if problem.n <= len(free):
+        raise RecordingError(
+            f"Expected more data than parameters to calibrate. Got {problem.n} data and {len(free)} free parameters."
+        )
+    for term in terms:
+        extend(simulator, [term])  # raises for names that do not fit, before any long work
+    mask = verify.choose(recording, holdout, len(free))
+    bar = tqdm(disable=not progress, desc="diagnose", unit="step", leave=False)
+
+    def tick(text: str) -> None:
+        bar.set_postfix_str(text)
+        bar.update()
+
+    try:
+        search = Search(problem, terms, fixed or {}, seed, num_starts, max_terms, tick)
+        tick("calibrate the base")
+        search.calibrate_base()
+        search.screen_all()
+        detected = search.exact or search.p_detect < 1.0 - confidence
+        if terms:
+            search.refit_singles()
+            if detected and _wants_more(search):
+                search.refit_several()
+        decision = _decide(search, detected, mask)
+        return _result(search, decision, simulator, recording, mask, confidence, begun, terms, seed)
+    finally:
+        bar.close()
+
+
+def _check(
+    simulator: Any, recording: Any, candidates: Any, confidence: float, max_terms: int, num_starts: int
+) -> list[Term]:
+    if not isinstance(simulator, Simulator):
+        raise DomainError(f"Expected a Simulator or an ODESimulator. Got {type(simulator).__name__}.")
+    if not isinstance(recording, Recording):
+        raise RecordingError(f"Expected a torchcal.Recording. Got {type(recording).__name__}.")
+    if isinstance(candidates, Term):
+        candidates = [candidates]
+    by_name: dict[str, Term] = {}
+    for term in candidates:
+        if not isinstance(term, Term):
+            raise DomainError(f"Expected candidates as torchcal.Term objects. Got {type(term).__name__}: {term!r}.")
+        by_name[term.name] = term
+    if not 0.5 < confidence < 1:
+        raise DomainError(f"Expected confidence between 0.5 and 1. Got {confidence!r}.")
+    for name, value in (("max_terms", max_terms), ("num_starts", num_starts)):
+        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            raise DomainError(f"Expected {name} as a positive integer. Got {value!r}.")
+    return list(by_name.values())
+
+
+def _wants_more(search: Search) -> bool:
+    """Whether one term is not the whole story."""
+    physical = [m for m in search.models if m.physical]
+    if not physical:
+        return True
+    best = max(physical, key=lambda m: m.weight)
+    if search.exact:
+        return explain.removed(search, best) < 0.99999
+    return search.examine(best).p_value < 0.05
+
+
+class _Decision:
+    """Verdict, accepted model and probabilities."""
+
+    def __init__(self) -> None:
+        self.verdict = "consistent"
+        self.best: Model | None = None
+        self.tied: list[Model] = []
+        self.probability: dict[int, float] = {}
+        self.none = 0.0
+        self.base = 1.0
+        self.none_evidence = 0.0
+        self.withdrawn = ""
+
+
+def _none_evidence(search: Search, ranked: list[Model]) -> float:
+    """Log evidence that something smooth and unknown is missing: in the base, or beside the best models."""
+    def unknown(structure: Any) -> float:
+        kinds = ("equation", "output") if search.problem.in_time else ("parameter", "output")
+        places = [p.evidence for p in structure.places if p.channel.kind in kinds]
+        return max(places) - math.log(len(places)) if places else -math.inf
+
+    prior = math.log(PRIOR["none"])
+    found = unknown(search.structure) + prior
+    for model in ranked[:4]:
+        extra = unknown(search.examine(model))
+        found = max(found, model.weight + extra + prior)
+    return found
+
+
+def _decide(search: Search, detected: bool, mask: Tensor | None) -> _Decision:
+    decision = _Decision()
+    ranked = sorted((m for m in search.models if m.physical), key=lambda m: -m.weight)
+    if search.exact:
+        return _decide_exact(search, ranked, mask, decision)
+    decision.none_evidence = _none_evidence(search, ranked) if detected else math.log(PRIOR["none"])
+    _weigh(search, decision)
+    if not detected or decision.base > 0.5:
+        decision.verdict = "consistent"
+        return decision
+    white = [m for m in ranked[:6] if search.examine(m).p_value >= WHITE]
+    if not white or decision.none > 0.5:
+        decision.verdict = "unexplained"
+        return decision
+    top = max(m.weight for m in white)
+    total = sum(math.exp(m.weight - top) for m in ranked)
+    shares = [(math.exp(m.weight - top) / total, m) for m in ranked]
+    shares.sort(key=lambda pair: -pair[0])
+    best = white[0]
+    groups = _by_name(shares)
+    first = groups[best.names]
+    if first >= NAMED:
+        decision.verdict, decision.best = "named", best
+    else:
+        decision.verdict = "ambiguous"
+        covered = 0.0
+        seen: set[tuple[str, ...]] = set()
+        for share, model in shares:
+            if covered >= TIED and len(seen) >= 2:
+                break
+            if model.names not in seen and not model.note:
+                seen.add(model.names)
+                decision.tied.append(model)
+            covered += share
+        if len(decision.tied) < 2:
+            decision.verdict, decision.best, decision.tied = "named", best, []
+    _prove(search, decision, mask)
+    return decision
+
+
+def _by_name(shares: Sequence[tuple[float, Model]]) -> dict[tuple[str, ...], float]:
+    """Probability of each set of terms, wherever they act."""
+    found: dict[tuple[str, ...], float] = {}
+    for share, model in shares:
+        found[model.names] = found.get(model.names, 0.0) + share
+    return found
+
+
+def _weigh(search: Search, decision: _Decision) -> None:
+    """Probabilities of all hypotheses, "none of these" among them."""
+    weights = [m.weight for m in search.models]
+    base = math.log(PRIOR["base"])
+    top = max([*weights, base, decision.none_evidence])
+    total = sum(math.exp(w - top) for w in [*weights, base, decision.none_evidence])
+    decision.probability = {id(m): math.exp(m.weight - top) / total for m in search.models}
+    decision.base = math.exp(base - top) / total
+    decision.none = math.exp(decision.none_evidence - top) / total
+
+
+def _decide_exact(search: Search, ranked: list[Model], mask: Tensor | None, decision: _Decision) -> _Decision:
+    """Without noise nothing is white: a term must remove nearly all of the held-out misfit and beat its rivals."""
+    decision.none_evidence = -math.inf
+    _weigh(search, decision)
+    recording = search.problem.recording
+    if float(search.base.residual.abs().max()) <= 1e-6 * float(recording.spread.max()):
+        decision.verdict = "consistent"
+        return decision
+
+    def gain(model: Model) -> float:
+        if mask is None:
+            return explain.removed(search, model)
+        before = verify.held_out_fit(search.base, search.noise, mask)
+        after = verify.held_out_fit(model.found, search.noise, mask)
+        if before is None or after is None:
+            return 0.0
+        y, old, new = recording.y[mask], before.prediction[mask], after.prediction[mask]
+        return 1.0 - float((y - new).square().sum() / (y - old).square().sum())
+
+    singles = [m for m in ranked if len(m.numbers) == 1 and not m.note]
+    good = [m for m in singles if explain.removed(search, m) >= REMOVED and gain(m) >= REMOVED]
+    if not good:
+        good = [m for m in ranked if len(m.numbers) > 1 and not m.note and explain.removed(search, m) >= REMOVED and gain(m) >= REMOVED]
+        fewest = min((len(m.numbers) for m in good), default=0)
+        good = [m for m in good if len(m.numbers) == fewest]
+    if not good:
+        decision.verdict = "unexplained"
+        return decision
+    good.sort(key=lambda m: m.found.chi2)
+    rivals = [m for m in good[1:] if m.names != good[0].names and m.found.chi2 < 3.0 * good[0].found.chi2]
+    if rivals:
+        decision.verdict, decision.tied = "ambiguous", [good[0], *rivals]
+    else:
+        decision.verdict, decision.best = "named", good[0]
+    return decision
+
+
+def _prove(search: Search, decision: _Decision, mask: Tensor | None) -> None:
+    """Withdraw a name that predicts held-out data worse than the base does."""
+    if decision.best is None or mask is None:
+        return
+    before = verify.held_out_fit(search.base, search.noise, mask)
+    after = verify.held_out_fit(decision.best.found, search.noise, mask)
+    if before is None or after is None:
+        return
+    seen = mask & search.problem.keep
+    gain, error = verify.compare(search.problem.recording, before.prediction, after.prediction, search.noise, seen)
+    if gain < -error:
+        decision.withdrawn = (
+            f"{' and '.join(decision.best.names)} explained the fitted data but predicted held-out data worse than the base "
+            f"(by {-gain:.2g} ± {error:.1g} noise variances a datum), so the name is withdrawn."
+        )
+        decision.verdict, decision.best = "unexplained", None
+
+
+def _scores(search: Search, found: Fitted, mask: Tensor | None) -> Scores:
+    recording = search.problem.recording
+    prediction, sd = verify.predict(found, search.noise)
+    fitted = verify.score(recording, prediction, sd, search.problem.keep)
+    if mask is None:
+        return Scores(fitted, None, None)
+    apart = verify.held_out_fit(found, search.noise, mask)
+    if apart is None:
+        return Scores(fitted, None, None)
+    held = verify.score(recording, apart.prediction, apart.sd, mask & search.problem.keep)
+    return Scores(fitted, held, apart.prediction)
+
+
+def _result(
+    search: Search,
+    decision: _Decision,
+    simulator: Simulator,
+    recording: Recording,
+    mask: Tensor | None,
+    confidence: float,
+    begun: float,
+    terms: list[Term],
+    seed: int,
+) -> Diagnosis:
+    best = decision.best
+    shown = best or (decision.tied[0] if decision.tied else None)
+    if shown is not None:
+        search.examine(shown)
+    base = explain.fit_record(search.base, search.structure, ())
+    final = base if best is None else explain.fit_record(best.found, best.structure, best.names)
+    _warn(search)
+    before = _scores(search, search.base, mask)
+    after = None if shown is None else _scores(search, shown.found, mask)
+    if best is None:
+        improved: Simulator = simulator
+    else:
+        improved = _improved(simulator, best)
+    remaining = 0.0 if decision.verdict == "consistent" else 1.0
+    if best is not None:
+        remaining = 1.0 - explain.removed(search, best)
+    return Diagnosis(
+        verdict=decision.verdict,
+        terms=list(best.names) if best else [],
+        tied=[list(m.names) for m in decision.tied],
+        where=explain.locate(search, shown) if decision.verdict != "consistent" else Table([], ("kind", "target")),
+        ranking=_ranking(search, decision, mask),
+        detection_limit=explain.limits(search, 1.0 - confidence, POWER),
+        remaining=remaining,
+        before=before,
+        after=after,
+        improved=improved,
+        symptoms=explain.symptoms(search, best),
+        noise=search.noise.record(search.problem),
+        base=base,
+        final=final,
+        shifts=explain.needed_shifts(search) if decision.verdict != "consistent" else [],
+        missing=explain.missing_rate(search) if decision.verdict != "consistent" else None,
+        experiment=propose(decision.tied[:4], search.noise) if decision.tied else None,
+        equations=explain.formulas(best) if best else [],
+        identifiability=explain.identifiability(search),
+        recording=recording,
+        simulator=simulator,
+        held_out=mask,
+        p_detect=search.p_detect,
+        confidence=confidence,
+        library=[term.name for term in terms],
+        settings={"seed": seed, "withdrawn": decision.withdrawn, "solver": _solver(search.problem.simulator)},
+        seconds=time.perf_counter() - begun,
+    )
+
+
+def _solver(simulator: Simulator) -> str:
+    if isinstance(simulator, Trajectories):
+        return f"classical Runge–Kutta, {simulator.num_steps} steps a run"
+    return "static"
+
+
+def _improved(simulator: Simulator, best: Model) -> Simulator:
+    """The user's simulator with the accepted terms, begun at their estimates."""
+    improved = extend(simulator, best.candidate.terms)
+    estimate = dict(zip([q.name for q in best.found.problem.parameters], best.found.values.tolist(), strict=True))
+    own = {best.found.problem.parameters[i].name for i in best.candidate.own}
+    parameters = []
+    for q in improved.parameters:
+        value = estimate.get(q.name)
+        if q.name in own and value is not None and q.contains(value) and (q.transform != "log" or value > 0):
+            q = Parameter(q.name, q.unit, q.low, q.high, value, None, q.transform, q.per_run)
+        parameters.append(q)
+    improved.parameters = tuple(parameters)
+    return improved
+
+
+def _warn(search: Search) -> None:
+    if search.base.agreeing < 0.2:
+        warnings.warn(
+            f"Only {search.base.agreeing:.0%} of the base's starting values came to the best fit. Give initial= or bounds "
+            "to its parameters, or more num_starts.",
+            ConvergenceWarning,
+            stacklevel=4,
+        )
+
+
+def _ranking(search: Search, decision: _Decision, mask: Tensor | None) -> Table[Hypothesis]:
+    rows = []
+    ordered = sorted(search.models, key=lambda m: -decision.probability.get(id(m), 0.0))
+    for place, model in enumerate(ordered[:60]):
+        held = None
+        if mask is not None and (place < 3 or model is decision.best):
+            apart = verify.held_out_fit(model.found, search.noise, mask)
+            if apart is not None:
+                held = verify.score(search.problem.recording, apart.prediction, apart.sd, mask & search.problem.keep).rmse
+        names = [q.name for q in model.candidate.problem.parameters]
+        own: tuple[Estimate, ...] = explain.estimates(model.found, [i for i in model.candidate.own if names[i]])
+        rows.append(
+            Hypothesis(
+                terms=model.names,
+                log_evidence=model.log_evidence,
+                probability=decision.probability.get(id(model), 0.0),
+                estimates=own,
+                physical=model.physical,
+                misfit_removed=explain.removed(search, model),
+                p_white=model.structure.p_value if model.structure else None,
+                held_out_rmse=held,
+                score=search.screening.score(model.numbers[0]) if len(model.numbers) == 1 else None,
+                refitted=True,
+                region=describe(model),
+                aliases=tuple(search.aliases.get(model.numbers[0], ())) if len(model.numbers) == 1 else (),
+                note=model.note,
+            )
+        )
+    fitted = {m.numbers for m in search.models}
+    for i, candidate in enumerate(search.candidates):
+        if (i,) not in fitted:
+            note = "" if candidate.blind or search.screening.best[i] >= 0 else "already in the base model"
+            rows.append(Hypothesis((candidate.name,), -math.inf, 0.0, score=search.screening.score(i), note=note))
+    rows.append(Hypothesis((), 0.0, decision.base, p_white=search.structure.p_value, refitted=True, note="the base alone"))
+    if not search.exact:
+            rows.append(
+            Hypothesis(("none of these",), decision.none_evidence - math.log(PRIOR["none"]), decision.none, note="something unknown and smooth")
+        )
+    rows.sort(key=lambda row: (-row.probability, -row.log_evidence))
+    return Table(rows, COLUMNS)

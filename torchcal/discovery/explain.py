@@ -1,0 +1,238 @@
+"""From the search to the records of a result: where, how much, what would tell, and what cannot be told."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.channels import Channel
+from torchcal.discovery.fitting import Fitted
+from torchcal.discovery.records import Estimate, Fit, Limit, Location, MissingRate, NeededShift, Table
+from torchcal.discovery.search import Model, Search
+from torchcal.discovery.structure import Place, Structure
+
+__all__ = ["estimates", "fit_record", "identifiability", "limits", "locate", "missing_rate", "needed_shifts", "symptoms"]
+
+#: A span begins where the estimated change exceeds this share of its largest magnitude.
+SPAN_LEVEL = 0.3
+#: A base parameter that moves by this many sd when a term is added was bent by it.
+BENT = 3.0
+
+
+def estimates(found: Fitted, places: Sequence[int]) -> tuple[Estimate, ...]:
+    """Estimates of some parameters."""
+    sd = found.sd()
+    bound = {i for i, at in zip(found.free, found.at_bound.tolist(), strict=True) if at}
+    result = []
+    for i in places:
+        q = found.problem.parameters[i]
+        value = float(found.values[i])
+        spread = float(sd[i])
+        if spread > 1e5 * max(abs(value), 1e-300):
+            spread = math.inf
+        result.append(Estimate(q.name, value, spread, q.unit, i in bound))
+    return tuple(result)
+
+
+def fit_record(found: Fitted, structure: Structure | None, terms: tuple[str, ...]) -> Fit:
+    """A fit as a record."""
+    recording = found.problem.recording
+    whole = found.problem.simulator.linearise(recording.x, found.values[None], recording.outputs, [], found.warm)
+    residual = torch.where(recording.observed, recording.y - whole.y[0], torch.full_like(recording.y, math.nan))
+    return Fit(
+        terms, estimates(found, found.free), whole.y[0], residual, found.chi2, structure.p_value if structure else 1.0
+    )
+
+
+def spans(channel: Channel, driver: str, profile: Tensor) -> tuple[tuple[float, float], ...]:
+    """Ranges of the driver where the change is large."""
+    values = channel.drivers[driver]
+    order = values.argsort(stable=True)
+    along, size = values[order], profile[order].abs()
+    high = size >= SPAN_LEVEL * float(size.max())
+    found: list[tuple[float, float]] = []
+    start: float | None = None
+    last = 0.0
+    for value, inside in zip(along.tolist(), high.tolist(), strict=True):
+        if inside and start is None:
+            start = value
+        if not inside and start is not None:
+            found.append((start, last))
+            start = None
+        last = value
+    if start is not None:
+        found.append((start, last))
+    return tuple(found[:6])
+
+
+def locate(search: Search, best: Model | None) -> Table[Location]:
+    """Where the mismatch sits; a named local term says it best."""
+    rows = []
+    if best is not None and best.window is not None:
+        w = best.window
+        drivers = search._drivers()[w.driver]
+        low = w.low if math.isfinite(w.low) else float(drivers.min())
+        high = w.high if math.isfinite(w.high) else float(drivers.max())
+        kind, target = _acts_on(best)
+        rows.append(Location(kind, target, w.driver, ((low, high),), removed(search, best), best.log_evidence))
+    seen = set()
+    for place in search.structure.places:
+        key = (place.channel.kind, place.channel.target)
+        if place.evidence < 2.0 or key in seen:
+            continue
+        seen.add(key)
+        rows.append(
+            Location(place.channel.kind, place.channel.target, place.driver,
+                     spans(place.channel, place.driver, place.profile), place.share, place.evidence)
+        )  # fmt: skip
+        if len(rows) >= 8:
+            break
+    return Table(rows, ("kind", "target", "driver", "spans", "share", "evidence"))
+
+
+def _acts_on(model: Model) -> tuple[str, str]:
+    term = model.candidate.terms[0]
+    if term.rates:
+        return "equation", next(iter(term.rates))
+    if term.outputs:
+        return "output", next(iter(term.outputs))
+    return "parameter", next(iter([*term.shifts, *term.frees]))
+
+
+def removed(search: Search, model: Model) -> float:
+    """Share of the squared misfit beyond noise that a model removes."""
+    freedom = search.problem.n - len(search.base.free)
+    excess = search.base.chi2 - (0 if search.exact else freedom)
+    left = model.found.chi2 - (0 if search.exact else search.problem.n - len(model.found.free))
+    if excess <= 0:
+        return 0.0
+    return min(max(1.0 - max(left, 0.0) / excess, 0.0), 1.0)
+
+
+def limits(search: Search, alpha: float, power: float) -> Table[Limit]:
+    """Smallest detectable effects."""
+    screening = search.screening
+    from_power = math.sqrt(2) * float(torch.special.erfinv(torch.tensor(2 * power - 1, dtype=torch.float64)))
+    # Three families of statistics share the level.
+    critical = float(screening.null.quantile(1 - alpha / 3)) if len(screening.null) else 3.5
+    fitted = {m.numbers[0]: m for m in search.models if len(m.numbers) == 1 and m.window is None}
+    rows = []
+    for i, candidate in enumerate(search.candidates):
+        place = candidate.amplitudes[0]
+        column = screening.best[i]
+        q = candidate.problem.parameters[place]
+        model = fitted.get(i)
+        estimate = float(model.found.values[place]) if model else None
+        if column < 0:
+            note = "tangent vanishes: only large effects can tell" if candidate.blind else "already in the base model"
+            rows.append(Limit(candidate.name, q.name, math.inf, q.unit, power, estimate, note))
+            continue
+        norm = float(screening.norm[column])
+        note = f"also: {', '.join(search.aliases[i])}" if search.aliases.get(i) else ""
+        rows.append(Limit(candidate.name, q.name, (critical + from_power) / norm, q.unit, power, estimate, note))
+    return Table(rows, ("term", "parameter", "smallest", "unit", "power", "estimate", "note"))
+
+
+def needed_shifts(search: Search) -> list[NeededShift]:
+    """The shift of each parameter against the driver that it varies with most."""
+    rows: dict[str, Place] = {}
+    for place in search.structure.places:
+        if place.channel.kind == "parameter" and place.channel.target not in rows and place.evidence > 0:
+            rows[place.channel.target] = place
+    result = []
+    for name, place in rows.items():
+        values = place.channel.drivers[place.driver]
+        order = values.argsort(stable=True)
+        pick = order[torch.linspace(0, len(order) - 1, min(60, len(order))).round().long().unique()]
+        a, b = values[pick], place.profile[pick]
+        ranks = [v.argsort().argsort().double() for v in (a, b)]
+        correlation = float(torch.corrcoef(torch.stack(ranks))[0, 1]) if len(pick) > 2 else 0.0
+        result.append(NeededShift(name, place.channel.unit, place.driver, a, b, place.sd[pick], correlation))
+    return result[:6]
+
+
+def missing_rate(search: Search) -> MissingRate | None:
+    """The best smooth unknown change of one channel."""
+    kinds = ("equation", "output") if search.problem.in_time else ("parameter", "output")
+    place = next((p for p in search.structure.places if p.channel.kind in kinds and p.evidence > 0), None)
+    if place is None:
+        return None
+    values = place.channel.drivers[place.driver]
+    order = values.argsort(stable=True)
+    return MissingRate(
+        place.channel.kind, place.channel.target, place.driver, values[order], place.profile[order], place.sd[order],
+        place.channel.unit, place.channel.time, place.profile,
+    )  # fmt: skip
+
+
+def symptoms(search: Search, best: Model | None) -> list[str]:
+    """Calibrated values that give the mismatch away."""
+    rows = []
+    sd = search.base.sd()
+    for i, at in zip(search.base.free, search.base.at_bound.tolist(), strict=True):
+        q = search.base.problem.parameters[i]
+        if at:
+            rows.append(f"{q.name} runs to its bound, {float(search.base.values[i]):.4g}{_unit(q.unit)}, in the calibrated base")
+    if best is not None:
+        places = {q.name: k for k, q in enumerate(best.found.problem.parameters)}
+        for i in search.base.free:
+            q = search.base.problem.parameters[i]
+            a, b = float(search.base.values[i]), float(best.found.values[places[q.name]])
+            moved = abs(b - a) / max(float(sd[i]), 1e-300)
+            if moved > BENT and abs(b - a) > 0.01 * abs(a):
+                rows.append(
+                    f"{q.name} was bent: {a:.4g} ± {float(sd[i]):.2g}{_unit(q.unit)} in the calibrated base, "
+                    f"{b:.4g}{_unit(q.unit)} with {' and '.join(best.names)}"
+                )
+    if search.noise.doubted > 1:
+        rows.append(f"the residual's fastest part is {search.noise.doubted:.1f} times the noise sd that was given")
+    return rows
+
+
+def _unit(unit: str | None) -> str:
+    return f" {unit}" if unit else ""
+
+
+def identifiability(search: Search) -> list[str]:
+    """Parameters and candidates that these data cannot tell."""
+    rows: list[str] = []
+    base = search.base
+    jacobian = base.whitening(base.jacobian)
+    size = jacobian.norm(dim=0)
+    names = [base.problem.parameters[i].name for i in base.free]
+    for name, norm in zip(names, size.tolist(), strict=True):
+        if norm == 0:
+            rows.append(f"{name} has no effect on these data")
+    unit = jacobian[:, size > 0] / size[size > 0]
+    kept = [name for name, norm in zip(names, size.tolist(), strict=True) if norm > 0]
+    if unit.shape[1] > 1:
+        values, vectors = torch.linalg.eigh(unit.T @ unit)
+        for k in range(len(values)):
+            if float(values[k]) < 1e-6:
+                mixed = [kept[j] for j in range(len(kept)) if abs(float(vectors[j, k])) > 0.2]
+                if len(mixed) > 1:
+                    rows.append(f"only a combination of {', '.join(mixed)} can be told")
+    screening = search.screening
+    for i, candidate in enumerate(search.candidates):
+        if screening.best[i] < 0 and not candidate.blind:
+            rows.append(f"{candidate.name} cannot be told from the parameters of the base")
+        for j in range(i):
+            c = abs(screening.correlation(i, j))
+            if c > 0.99:
+                rows.append(f"{search.candidates[j].name} and {candidate.name} are nearly the same here (correlation {c:.3f})")
+    return rows[:12]
+
+
+def formulas(model: Model) -> list[str]:
+    """The accepted terms' formulas with their estimates."""
+    rows = []
+    for term in model.candidate.terms:
+        own = [i for i in model.candidate.own
+               if model.found.problem.parameters[i].name in
+               {*(term.full(q.name) for q in term.parameters), *term.frees}]  # fmt: skip
+        text = term.formula or term.name
+        rows.append(f"{text}, with " + "; ".join(str(e) for e in estimates(model.found, own)))
+    return rows
+
+

@@ -1,0 +1,201 @@
+"""Least squares on the trajectories: Levenberg–Marquardt from several starts at once, within physical bounds."""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.problem import Problem, Whitening
+
+__all__ = ["Fitted", "fit", "starts"]
+
+#: Relative change of χ² below which a fit has converged.
+TOLERANCE = 1e-7
+MAX_STEPS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """The best of several fits.
+
+    Attributes:
+        problem: What was fitted.
+        whitening: Of its residuals.
+        values: Parameters ``(P,)``, physical units.
+        free: Places of those that were fitted.
+        y: Fitted outputs at the used data, ``(n,)``.
+        jacobian: ∂y/∂λ of the free ones there, ``(n, free)``.
+        chi2: ‖W (y − f)‖².
+        at_bound: Which of the free ones lie on a bound that they want to cross, bool ``(free,)``.
+        warm: Warm start.
+        agreeing: Share of the starts that came to this χ².
+    """
+
+    problem: Problem
+    whitening: Whitening
+    values: Tensor
+    free: list[int]
+    y: Tensor
+    jacobian: Tensor
+    chi2: float
+    at_bound: Tensor
+    warm: Any
+    agreeing: float = 1.0
+
+    @property
+    def residual(self) -> Tensor:
+        """``y − f`` at the used data."""
+        return self.problem.y - self.y
+
+    def covariance(self) -> Tensor:
+        """Of the free parameters, ``(free, free)``; directions without information get a huge variance."""
+        j = self.whitening(self.jacobian)
+        scale = j.square().sum(0).sqrt()
+        scale = torch.where(scale > 0, scale, torch.ones_like(scale))
+        values, vectors = torch.linalg.eigh((j / scale).T @ (j / scale))
+        inverse = 1.0 / values.clamp_min(1e-13 * max(float(values.max()), 1e-300))
+        return (vectors * inverse) @ vectors.T / (scale[:, None] * scale)
+
+    def sd(self) -> Tensor:
+        """Standard deviations ``(P,)``; 0 for those held."""
+        found = torch.zeros_like(self.values)
+        found[self.free] = self.covariance().diagonal().clamp_min(0).sqrt()
+        return found
+
+
+def starts(problem: Problem, count: int, seed: int, fixed: dict[int, float] | None = None) -> Tensor:
+    """Starting values ``(count, P)``: first guesses, then ever wilder ones within the bounds."""
+    generator = torch.Generator().manual_seed(seed)
+    columns = []
+    spread = torch.linspace(0.0, 1.0, count, dtype=torch.float64) if count > 1 else torch.zeros(1, dtype=torch.float64)
+    for i, q in enumerate(problem.parameters):
+        noise = torch.randn(count, generator=generator, dtype=torch.float64) * spread
+        unit = torch.rand(count, generator=generator, dtype=torch.float64)
+        positive = q.transform == "log" or (q.low is not None and q.low >= 0)
+        if fixed is not None and i in fixed:
+            columns.append(torch.full((count,), fixed[i], dtype=torch.float64))
+            continue
+        if q.initial is not None and q.initial != 0:
+            guess = q.initial * noise.exp() if positive else q.initial + abs(q.initial) * noise
+        elif q.low is not None and q.high is not None:
+            at = 0.5 + (unit - 0.5) * spread if q.initial is None else spread * unit * 0.2
+            base = q.low if q.initial is None else q.initial
+            width = q.high - q.low
+            guess = base + at * width
+            if q.transform == "log":
+                guess = q.low * (q.high / q.low) ** at
+        elif positive:
+            guess = (1.5 * noise).exp() + (q.low or 0.0)
+        else:
+            guess = (q.initial or 0.0) + noise
+        low = -torch.inf if q.low is None else q.low
+        high = torch.inf if q.high is None else q.high
+        columns.append(guess.clamp(low, high))
+    return torch.stack(columns, dim=-1)
+
+
+def fit(
+    problem: Problem,
+    whitening: Whitening,
+    begin: Tensor,
+    free: list[int],
+    *,
+    warm: Any = None,
+    max_steps: int = MAX_STEPS,
+) -> Fitted | None:
+    """Minimise χ² over the free parameters from every row of ``begin`` (H, P); None where no start works.
+
+    Marquardt's scaling makes it independent of units. A parameter on a bound that the gradient pushes outward is held
+    for the step. Parameters with ``transform="log"`` are stepped in their logarithm.
+    """
+    low, high = problem.limits()
+    low, high = low[free], high[free]
+    log = torch.tensor([problem.parameters[i].transform == "log" for i in free])
+    target = whitening.vector(problem.y)
+    values = begin.clone()
+    values[:, free] = values[:, free].clamp(low, high)
+
+    def evaluate(points: Tensor, warm: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Any]:
+        y, jacobian, warm = problem.evaluate(points, free, warm)
+        residual = target - whitening.vector(y)
+        chi2 = residual.square().sum(-1)
+        bad = ~torch.isfinite(chi2) | ~torch.isfinite(jacobian).flatten(1).all(-1)
+        return y, jacobian, residual, torch.where(bad, torch.full_like(chi2, torch.inf), chi2), warm
+
+    y, jacobian, residual, chi2, warm = evaluate(values, warm)
+    alive = torch.isfinite(chi2)
+    if not bool(alive.any()):
+        return None
+    if not bool(alive.all()):  # infinite trajectories would poison the batch
+        values, y, jacobian, residual, chi2 = (t[alive] for t in (values, y, jacobian, residual, chi2))
+        warm = warm[alive] if isinstance(warm, Tensor) else None
+    damping = torch.full_like(chi2, 1e-3)
+    size = torch.zeros(len(values), len(free), dtype=torch.float64)
+    done = torch.zeros(len(values), dtype=torch.bool)
+    for _ in range(max_steps):
+        if not free:
+            break
+        slope = whitening(jacobian)
+        if bool(log.any()):
+            slope = torch.where(log, slope * values[:, None, free], slope)
+        gradient = (slope.transpose(-1, -2) @ residual.unsqueeze(-1))[..., 0]
+        normal = slope.transpose(-1, -2) @ slope
+        size = torch.maximum(size * 0.9, normal.diagonal(dim1=-2, dim2=-1))
+        now = values[:, free]
+        stuck = ((now <= low) & (gradient < 0)) | ((now >= high) & (gradient > 0)) | (size <= 0)
+        gradient = torch.where(stuck, torch.zeros_like(gradient), gradient)
+        unit = torch.where(stuck | (size <= 0), torch.ones_like(size), size).sqrt()
+        matrix = normal / (unit[:, :, None] * unit[:, None])
+        matrix = torch.where(stuck[:, :, None] | stuck[:, None], torch.zeros_like(matrix), matrix)
+        matrix = matrix + torch.diag_embed(damping[:, None] + 1e-12 + stuck.to(matrix))
+        change = torch.linalg.solve(matrix, (gradient / unit).unsqueeze(-1))[..., 0] / unit
+        moved = torch.where(log, now * change.clamp(-2, 2).exp(), now + change).clamp(low, high)
+        trial = values.clone()
+        trial[:, free] = torch.where(done[:, None], now, moved)
+        step = torch.where(log, (trial[:, free] / now).log(), trial[:, free] - now)
+        predicted = 2 * (step * gradient).sum(-1) - (step.unsqueeze(1) @ normal @ step.unsqueeze(-1))[:, 0, 0]
+        y_new, jacobian_new, residual_new, chi2_new, warm_new = evaluate(trial, warm)
+        gain = (chi2 - chi2_new) / predicted.clamp_min(1e-300)
+        better = (chi2_new < chi2) & ~done
+        small = predicted <= TOLERANCE * (chi2 + 1e-3 * problem.n)
+        done = done | (small & ~(chi2_new < chi2 * (1 - TOLERANCE))) | (~better & (damping > 1e10))
+        for old, new in ((values, trial), (y, y_new), (jacobian, jacobian_new), (residual, residual_new), (chi2, chi2_new)):
+            old[better] = new[better]
+        if isinstance(warm, Tensor) and isinstance(warm_new, Tensor):
+            warm = warm.clone()
+            warm[better] = warm_new[better]
+        else:
+            warm = warm_new if bool(better.all()) else warm
+        damping = torch.where(better, damping * torch.where(gain > 0.75, 0.2, torch.where(gain > 0.25, 0.5, 2.0)), damping * 5)
+        damping = damping.clamp(1e-9, 1e12)
+        if bool(done.all()):
+            break
+    best = int(chi2.argmin())
+    gradient = (whitening(jacobian[best]).T @ residual[best]) if free else target[:0]
+    now = values[best, free]
+    width = torch.where(torch.isfinite(high - low), high - low, now.abs().clamp_min(1e-300))
+    spread = (whitening(jacobian[best]).square().sum(0)).clamp_min(1e-300).sqrt() if free else target[:0]
+    near = 1e-6 * width
+    pushed = gradient / spread
+    at_bound = ((now <= low + near) & (pushed < -2.0)) | ((now >= high - near) & (pushed > 2.0))
+    return Fitted(
+        problem=problem,
+        whitening=whitening,
+        values=values[best],
+        free=list(free),
+        y=y[best],
+        jacobian=jacobian[best],
+        chi2=float(chi2[best]),
+        at_bound=at_bound,
+        warm=warm[best : best + 1] if isinstance(warm, Tensor) else None,
+        agreeing=float((chi2 <= chi2[best] * (1 + 1e-3) + 0.1).double().mean()),
+    )
+
+
+def refit(found: Fitted, whitening: Whitening, problem: Problem | None = None) -> Fitted:
+    """The same model fitted again with other noise, or to other data, from where it stood."""
+    problem = found.problem if problem is None else problem
+    again = fit(problem, whitening, found.values[None], found.free, warm=found.warm)
+    return dataclasses.replace(found, problem=problem, whitening=whitening) if again is None else again

@@ -1,0 +1,254 @@
+"""What is noise and what may be physics: the noise model, from the recording itself where nobody knows it.
+
+Physics moves slowly against the sampling, or along the tangents of the model. Whatever is left beyond a smooth curve
+and those tangents is taken for noise, and its size and correlation are estimated by restricted maximum likelihood.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.problem import Problem, Whitening
+from torchcal.discovery.records import NoiseModel
+from torchcal.errors import DomainError
+
+__all__ = ["Noise", "estimate", "smooth_columns", "spikes"]
+
+#: AR(1) coefficients that are tried.
+GRID = torch.linspace(0.0, 0.95, 39, dtype=torch.float64)
+#: Share of a sequence's degrees of freedom that smooth curves may take.
+SMOOTH_SHARE = 1.0 / 3.0
+#: A sample that differs from its neighbours' mean by more than this many robust sd, alone, is an outlier.
+SPIKE = 4.5
+#: Weight against correlation: log prior density of φ is −SHRINK·φ.
+SHRINK = 2.0
+#: How much larger the noise found may be than the noise given before the given one is doubted.
+EXCESS = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """A noise model of the used data.
+
+    Attributes:
+        sd: ``(n_total,)``.
+        correlation: AR(1) coefficient by output, ``(outputs,)``.
+        freedom: Degrees of freedom that the size was estimated with; infinite where it is known.
+        posterior: Probability of each coefficient in `GRID`, by output, ``(outputs, grid)``.
+        source: As in `NoiseModel`.
+        doubted: By how much the noise found exceeds the noise given, where that is a contradiction; else 1.
+    """
+
+    sd: Tensor
+    correlation: Tensor
+    freedom: float
+    posterior: Tensor
+    source: str
+    doubted: float = 1.0
+    step: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    def whitening(self, problem: Problem) -> Whitening:
+        """Of a problem's residuals."""
+        return problem.whitening(self.sd, self.correlation)
+
+    def record(self, problem: Problem) -> NoiseModel:
+        """For the result."""
+        names = problem.recording.outputs
+        sd = {name: float(values[torch.isfinite(values)].median())
+              for name, values in problem.recording.split(self.sd).items()}  # fmt: skip
+        return NoiseModel(
+            sd=sd,
+            correlation={name: float(c) for name, c in zip(names, self.correlation, strict=True)},
+            source=self.source,
+            outliers=int((problem.recording.observed & ~problem.keep).sum()),
+            quantisation=self.step,
+        )
+
+
+def smooth_columns(problem: Problem, places: Tensor) -> Tensor:
+    """Smooth curves over one sequence, ``(len(places), m)``, m about a third of its length."""
+    n = len(places)
+    count = int(n * SMOOTH_SHARE)
+    if problem.order is not None:
+        at = problem.order[problem.condition_of[places]]
+        rank = torch.linspace(0, 1, n, dtype=torch.float64)
+        span = float(at.max() - at.min())
+        # Equal steps where sampling is even; ranks where it is not, so that curves bend where there are data.
+        uneven = float(at.diff().max()) > 3 * float(at.diff().median()) if n > 2 else False
+        along = rank if uneven or span <= 0 else (at - at.min()) / span
+        return torch.cos(math.pi * along[:, None] * torch.arange(count, dtype=torch.float64))
+    x = problem.recording.x
+    columns = torch.stack([c[problem.condition_of[places]] for c in x.values()], dim=-1)  # type: ignore[union-attr]
+    columns = (columns - columns.mean(0)) / columns.std(0).clamp_min(1e-300)
+    powers = [torch.ones(n, 1, dtype=torch.float64)]
+    for _ in range(6):
+        if sum(p.shape[1] for p in powers) >= count:
+            break
+        last = powers[-1]
+        powers.append((last[:, :, None] * columns[:, None]).flatten(1))
+    design = torch.cat(powers, dim=1)
+    u, s, _ = torch.linalg.svd(design, full_matrices=False)
+    return u[:, : min(count, int((s > 1e-9 * s[0]).sum()))]
+
+
+def _orthonormal(columns: Tensor, most: int) -> Tensor:
+    size = columns.norm(dim=0)
+    columns = columns[:, size > 0] / size[size > 0]
+    if columns.shape[1] == 0:
+        return columns
+    u, s, _ = torch.linalg.svd(columns, full_matrices=False)
+    return u[:, : min(most, int((s > 1e-8 * s[0]).sum()))]
+
+
+def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor | str | None) -> Noise:
+    """The noise model from the residual of a fitted model.
+
+    Args:
+        problem: The used data.
+        residual: ``(n,)``.
+        design: Tangents that a further refit could use, ``(n, k)``; what they explain is not noise.
+        given: As ``recording.noise``.
+
+    Raises:
+        DomainError: If there are too few data to tell noise from anything else.
+    """
+    recording = problem.recording
+    outputs = len(recording.outputs)
+    correlation = torch.zeros(outputs, dtype=torch.float64)
+    posterior = torch.zeros(outputs, len(GRID), dtype=torch.float64)
+    posterior[:, 0] = 1.0
+    if isinstance(given, str):  # a detailed simulation: what counts is the misfit in units of the spread
+        sd = recording.spread * 1e-3
+        return Noise(sd, correlation, math.inf, posterior, "none")
+    known = given if isinstance(given, Tensor) else torch.ones_like(recording.y)
+    replicated = _pure_error(problem) if given is None else None
+    sd = known.clone()
+    freedom, doubted = math.inf, 1.0
+    for output in range(outputs):
+        parts = [places for places in problem.sequences if int(problem.output_of[places[0]]) == output]
+        n = sum(len(places) for places in parts)
+        if n == 0:
+            continue
+        scaled = [residual[places] / known[problem.index[places]] for places in parts]
+        bases, usable = [], 0
+        for places in parts:
+            own = design[places] / known[problem.index[places]][:, None]
+            share = max(int(len(places) * SMOOTH_SHARE), min(design.shape[1], len(places) // 2))
+            wide = torch.cat([smooth_columns(problem, places), _orthonormal(own, share)], dim=1)
+            bases.append(_orthonormal(wide, int(0.6 * len(places))))
+            usable += len(places) - bases[-1].shape[1]
+        if usable < 2:
+            raise DomainError(
+                f"Expected enough data to tell noise from misfit. Got {n} of output {recording.outputs[output]!r}. "
+                "Give noise= its standard deviation."
+            )
+        correlated = problem.order is not None and problem.in_time and n >= 40
+        logs, sizes = [], []
+        for rho in GRID if correlated else GRID[:1]:
+            square, log_det, count = 0.0, 0.0, 0
+            for places, r, basis in zip(parts, scaled, bases, strict=True):
+                e, b = _decorrelate(r[:, None], rho)[:, 0], _decorrelate(basis, rho)
+                q, upper = torch.linalg.qr(b)
+                left = e - q @ (q.T @ e)
+                square += float(left.square().sum())
+                log_det += 0.5 * (len(places) - 1) * math.log(1 - float(rho) ** 2)
+                log_det += float(upper.diagonal().abs().log().sum())
+                count += len(places) - b.shape[1]
+            sizes.append(square / count)
+            logs.append(-0.5 * count * math.log(max(square, 1e-300)) - log_det - SHRINK * float(rho))
+        likelihood = torch.tensor(logs, dtype=torch.float64)
+        weight = (likelihood - likelihood.max()).exp()
+        posterior[output, : len(weight)] = weight / weight.sum()
+        best = int(likelihood.argmax())
+        correlation[output] = GRID[best]
+        scale = math.sqrt(sizes[best])
+        mask = torch.arange(len(recording.y)) // recording.n == output
+        if given is None:
+            if replicated is not None and replicated[1][output] >= 3:
+                sd[mask], freedom = replicated[0][output], min(freedom, float(replicated[1][output]))
+            else:
+                sd[mask], freedom = scale, min(freedom, usable)
+        elif scale > EXCESS * (1 + 2 / math.sqrt(2 * usable)):
+            doubted = max(doubted, scale)
+            sd[mask] = sd[mask] * scale
+    step = _quantisation(problem)
+    for name, size in step.items():
+        mask = torch.arange(len(recording.y)) // recording.n == recording.outputs.index(name)
+        sd[mask] = sd[mask].clamp_min(size / math.sqrt(12.0))
+    source = "given" if isinstance(given, Tensor) else "replicates" if replicated is not None else "estimated"
+    return Noise(sd, correlation, freedom, posterior, source, doubted, step)
+
+
+def _decorrelate(values: Tensor, rho: Tensor) -> Tensor:
+    if float(rho) == 0.0:
+        return values
+    rest = (values[1:] - rho * values[:-1]) / math.sqrt(1 - float(rho) ** 2)
+    return torch.cat([values[:1], rest])
+
+
+def _pure_error(problem: Problem) -> tuple[Tensor, Tensor] | None:
+    """Noise sd and degrees of freedom by output from data at identical conditions; None without any."""
+    x = problem.recording.x
+    if problem.in_time:
+        return None
+    columns = torch.stack(list(x.values()), dim=-1) if isinstance(x, dict) else x[:, None]
+    _, group = columns.unique(dim=0, return_inverse=True)
+    if int(group.max()) + 1 == len(columns):
+        return None
+    outputs = len(problem.recording.outputs)
+    square, freedom = torch.zeros(outputs, dtype=torch.float64), torch.zeros(outputs, dtype=torch.float64)
+    for output in range(outputs):
+        mine = problem.output_of == output
+        y, g = problem.y[mine], group[problem.condition_of[mine]]
+        count = torch.zeros(int(group.max()) + 1, dtype=torch.float64).index_add_(0, g, torch.ones_like(y))
+        total = torch.zeros_like(count).index_add_(0, g, y)
+        square[output] = (y - (total / count.clamp_min(1))[g]).square().sum()
+        freedom[output] = float((count - 1).clamp_min(0).sum())
+    if float(freedom.min()) < 3:
+        return None
+    return (square / freedom).sqrt(), freedom
+
+
+def _quantisation(problem: Problem) -> dict[str, float]:
+    """Step of each output whose values are few multiples of one number."""
+    found = {}
+    for name, values in problem.recording.split(problem.recording.y).items():
+        seen = values[torch.isfinite(values)].unique()
+        if len(seen) < 3:
+            continue
+        step = float(seen.diff().min())
+        size = float(seen.abs().max())
+        if step > 1e-6 * size and float(((seen / step) - (seen / step).round()).abs().max()) < 1e-3:
+            found[name] = step
+    return found
+
+
+def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
+    """Used data that stick out alone from their neighbours, bool ``(n,)``.
+
+    The second difference of the residual has no smooth part left; its centre is the spike.
+    """
+    found = torch.zeros(problem.n, dtype=torch.bool)
+    if problem.order is None:
+        return found
+    for places in problem.sequences:
+        if len(places) < 10:
+            continue
+        r = residual[places]
+        if sd is not None:
+            r = r / sd[problem.index[places]]
+        padded = torch.cat([r[1:2], r, r[-2:-1]])
+        bend = r - 0.5 * (padded[:-2] + padded[2:])
+        robust = 1.4826 * float(bend.abs().median())
+        if sd is not None:
+            robust = max(robust, math.sqrt(1.5))
+        if robust <= 0:
+            continue
+        high = bend.abs() / robust
+        # The neighbours of a spike bend the other way by half as much.
+        around = torch.cat([high[1:2], high, high[-2:-1]])
+        found[places] = (high > SPIKE) & (high >= around[:-2]) & (high >= around[2:])
+    return found

@@ -1,0 +1,189 @@
+"""Recording and bound simulator as one least-squares problem, and the whitening of its residuals."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchcal.data import Recording
+from torchcal.errors import SimulatorError
+from torchcal.simulators import Parameter, Simulator, Trajectories
+
+__all__ = ["Problem", "Whitening"]
+
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """Turns residuals into independent ones of unit variance.
+
+    Every output of every run is a sequence. With an AR(1) coefficient φ and a distance of d sampling intervals between
+    neighbours their correlation is φ^d.
+
+    Attributes:
+        sd: Noise sd, ``(n,)``.
+        correlation: φ^d with the sample before, ``(n,)``; 0 for the first.
+        before: Place of the sample before, ``(n,)``.
+    """
+
+    sd: Tensor
+    correlation: Tensor
+    before: Tensor
+
+    def __call__(self, values: Tensor) -> Tensor:
+        """Whitened ``(*batch, n, columns)``."""
+        scaled = values / self.sd[:, None]
+        if not bool((self.correlation != 0).any()):
+            return scaled
+        rho = self.correlation[:, None]
+        return (scaled - rho * scaled[..., self.before, :]) / (1 - rho.square()).sqrt()
+
+    def vector(self, values: Tensor) -> Tensor:
+        """Whitened ``(*batch, n)``."""
+        return self(values.unsqueeze(-1)).squeeze(-1)
+
+    @property
+    def log_det(self) -> float:
+        """log |W| of the whitening matrix W."""
+        return float(-self.sd.log().sum() - 0.5 * (1 - self.correlation.square()).log().sum())
+
+    def scaled(self, factor: float) -> "Whitening":
+        """With another size of the noise."""
+        return dataclasses.replace(self, sd=self.sd * factor)
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """What is compared with what.
+
+    Attributes:
+        simulator: Bound to the recording.
+        recording: All data.
+        keep: Which of the n_total outputs are used, bool ``(n_total,)``.
+    """
+
+    simulator: Simulator
+    recording: Recording
+    keep: Tensor
+
+    @classmethod
+    def of(cls, simulator: Simulator, recording: Recording) -> "Problem":
+        """The problem of all observed data."""
+        return cls(simulator.bind(recording), recording, recording.observed.clone())
+
+    def with_simulator(self, simulator: Simulator) -> "Problem":
+        """Another simulator of the same data."""
+        return dataclasses.replace(self, simulator=simulator)
+
+    def keeping(self, keep: Tensor) -> "Problem":
+        """The same with fewer data."""
+        return dataclasses.replace(self, keep=self.keep & keep)
+
+    @cached_property
+    def index(self) -> Tensor:
+        """Places of the used data in ``recording.y``, ``(n,)``."""
+        return self.keep.nonzero()[:, 0]
+
+    @property
+    def n(self) -> int:
+        """Number of used data."""
+        return len(self.index)
+
+    @cached_property
+    def y(self) -> Tensor:
+        """Used data, ``(n,)``."""
+        return self.recording.y[self.index]
+
+    @cached_property
+    def output_of(self) -> Tensor:
+        """Number of the output of each used datum, ``(n,)``."""
+        return self.index // self.recording.n
+
+    @cached_property
+    def condition_of(self) -> Tensor:
+        """Number of the condition of each used datum, ``(n,)``."""
+        return self.index % self.recording.n
+
+    @property
+    def in_time(self) -> bool:
+        """Whether the recording is one in time."""
+        return self.recording.runs is not None
+
+    @cached_property
+    def order(self) -> Tensor | None:
+        """What neighbouring data follow each other in: time, or the only condition; None where nothing does."""
+        x = self.recording.x
+        if isinstance(x, dict):
+            if self.in_time:
+                return x["time"]
+            return next(iter(x.values())) if len(x) == 1 else None
+        return x
+
+    @cached_property
+    def sequences(self) -> list[Tensor]:
+        """Places (among the used data) of each output of each run, in order."""
+        run = self.recording.x["run"] if self.in_time else torch.zeros(self.recording.n)  # type: ignore[index]
+        found = []
+        for output in range(len(self.recording.outputs)):
+            for r in run.unique():
+                places = ((self.output_of == output) & (run[self.condition_of] == r)).nonzero()[:, 0]
+                if self.order is not None:
+                    places = places[self.order[self.condition_of[places]].argsort(stable=True)]
+                if len(places):
+                    found.append(places)
+        return found
+
+    def whitening(self, sd: Tensor, correlation: Tensor) -> Whitening:
+        """Of noise with sd ``(n_total,)`` and an AR(1) coefficient for each output, ``(outputs,)``."""
+        rho = torch.zeros(self.n, dtype=torch.float64)
+        before = torch.arange(self.n)
+        if bool((correlation != 0).any()) and self.order is not None:
+            for places in self.sequences:
+                if len(places) < 2:
+                    continue
+                at = self.order[self.condition_of[places]]
+                gaps = at.diff()
+                usual = gaps.median().clamp_min(1e-300)
+                phi = float(correlation[int(self.output_of[places[0]])])
+                rho[places[1:]] = phi ** (gaps / usual).clamp(1e-3, 1e3) if phi > 0 else 0.0
+                before[places[1:]] = places[:-1]
+        return Whitening(sd[self.index], rho.clamp_max(0.999), before)
+
+    # --- parameters ---------------------------------------------------------------------------------------
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The simulator's, unknown initial states among them."""
+        return self.simulator.parameters
+
+    def limits(self) -> tuple[Tensor, Tensor]:
+        """Physical bounds, ``(P,)`` twice."""
+        low = [-math.inf if q.low is None else q.low for q in self.parameters]
+        high = [math.inf if q.high is None else q.high for q in self.parameters]
+        return torch.tensor(low, dtype=torch.float64), torch.tensor(high, dtype=torch.float64)
+
+    def evaluate(self, values: Tensor, columns: list[int], warm: Any = None) -> tuple[Tensor, Tensor, Any]:
+        """Outputs at the used data ``(H, n)``, their derivatives ``(H, n, columns)``, and a warm start."""
+        found = self.simulator.linearise(
+            self.recording.x, values, self.recording.outputs, columns, warm
+        )
+        if found.y.shape[-1] != len(self.recording.y):
+            raise SimulatorError(
+                f"Expected {len(self.recording.y)} output values, as in the recording. Got {found.y.shape[-1]}."
+            )
+        return found.y[:, self.index], found.jacobian[:, self.index], found.warm
+
+    def drivers(self, values: Tensor, warm: Any) -> dict[str, Tensor]:
+        """What a change may vary with at every datum, ``(n_total conditions,)`` each: conditions, or time, states and
+        inputs."""
+        if not self.in_time:
+            x = self.recording.x
+            return dict(x) if isinstance(x, dict) else {"x": x}
+        bound = self.simulator
+        if not isinstance(bound, Trajectories):
+            return {"t": self.recording.x["time"]}  # type: ignore[index]
+        found = bound.along(values, warm)
+        return {name: table[bound._run_of, bound._node_of] for name, table in found.items()}

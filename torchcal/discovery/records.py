@@ -1,0 +1,317 @@
+"""Frozen records that a diagnosis is made of, and the list that prints them as a table."""
+
+import dataclasses
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+from torch import Tensor
+
+from torchcal.errors import MissingDependencyError
+
+__all__ = [
+    "Estimate",
+    "Experiment",
+    "Fit",
+    "Hypothesis",
+    "Limit",
+    "Location",
+    "MissingRate",
+    "NeededShift",
+    "NoiseModel",
+    "Score",
+    "Scores",
+    "Table",
+]
+
+Record = TypeVar("Record")
+
+
+class Table(list[Record], Generic[Record]):
+    """A list of frozen records that prints as a table and turns into a pandas frame."""
+
+    def __init__(self, records: Iterable[Record] = (), columns: tuple[str, ...] = ()) -> None:
+        super().__init__(records)
+        self.columns = columns
+
+    def rows(self) -> list[dict[str, Any]]:
+        """One dict per record, of the table's columns."""
+        return [{name: getattr(record, name) for name in self.columns} for record in self]
+
+    def to_frame(self) -> Any:
+        """The table as a ``pandas.DataFrame``."""
+        try:
+            import pandas
+        except ImportError as error:
+            raise MissingDependencyError(
+                "Expected pandas for to_frame(). Got no such package (pip install pandas)."
+            ) from error
+        return pandas.DataFrame(self.rows(), columns=list(self.columns))
+
+    def __str__(self) -> str:
+        if not self:
+            return "(empty)"
+        cells = [[_text(value) for value in row.values()] for row in self.rows()]
+        heads = [name.replace("_", " ") for name in self.columns]
+        widths = [max(len(head), *(len(row[i]) for row in cells)) for i, head in enumerate(heads)]
+        lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
+                 for row in [heads, *cells]]  # fmt: skip
+        return "\n".join(lines)
+
+    __repr__ = __str__
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, tuple | list):
+        return ", ".join(_text(item) for item in value)
+    return str(value)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter's estimate.
+
+    Attributes:
+        name: For a term's own parameter ``"term.parameter"``.
+        value: In ``unit``.
+        sd: Standard deviation; infinite where the data do not say.
+        unit: Its unit, where known.
+        at_bound: Whether the estimate lies on a bound that it wants to cross.
+    """
+
+    name: str
+    value: float
+    sd: float
+    unit: str | None = None
+    at_bound: bool = False
+
+    def __str__(self) -> str:
+        text = f"{self.name} = {self.value:.4g} ± {self.sd:.2g}"
+        text += f" {self.unit}" if self.unit else ""
+        return text + (" (at its bound)" if self.at_bound else "")
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """What is taken for noise, by output.
+
+    Attributes:
+        sd: Standard deviation of the noise by output, in its unit.
+        correlation: Correlation of neighbouring samples (AR(1) coefficient) by output; 0 is white.
+        source: ``"given"``, ``"replicates"``, ``"estimated"`` or ``"none"`` (a detailed simulation).
+        outliers: Number of samples that were set aside as outliers.
+        quantisation: Step by output where the recording is quantised.
+    """
+
+    sd: dict[str, float]
+    correlation: dict[str, float]
+    source: str
+    outliers: int = 0
+    quantisation: dict[str, float] = dataclasses.field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A model fitted to the recording.
+
+    Attributes:
+        terms: The terms that it holds beside the base.
+        estimates: Every free parameter, unknown initial states among them.
+        prediction: Fitted outputs ``(n_total,)``, in the order of ``recording.y``.
+        residual: ``y − prediction``, NaN where not observed, ``(n_total,)``.
+        chi2: Whitened squared misfit.
+        p_white: Probability of so much structure in the residual by noise alone.
+    """
+
+    terms: tuple[str, ...]
+    estimates: tuple[Estimate, ...]
+    prediction: Tensor
+    residual: Tensor
+    chi2: float
+    p_white: float
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One row of the ranking.
+
+    Attributes:
+        terms: Names of the terms added to the base; empty for the base itself, ``("none of these",)`` for
+            something that is not in the library.
+        log_evidence: Relative to the base, natural logarithm, penalties included.
+        probability: Among all hypotheses considered.
+        estimates: Of the terms' parameters.
+        physical: Whether signs and ranges are physically possible.
+        misfit_removed: Share of the squared misfit beyond noise that it removes.
+        p_white: Probability of so much structure in what is left by noise alone.
+        held_out_rmse: RMSE on held-out data; None where it was not tried.
+        score: Screening statistic z of its tangent.
+        refitted: Whether base and terms were refitted together; otherwise the numbers are the screening's.
+        region: Where a local term acts, in words; None where it acts everywhere.
+        aliases: Other candidates with the same projected tangent.
+        note: Anything that speaks against it, in words.
+    """
+
+    terms: tuple[str, ...]
+    log_evidence: float
+    probability: float
+    estimates: tuple[Estimate, ...] = ()
+    physical: bool = True
+    misfit_removed: float = 0.0
+    p_white: float | None = None
+    held_out_rmse: float | None = None
+    score: float | None = None
+    refitted: bool = False
+    region: str | None = None
+    aliases: tuple[str, ...] = ()
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where a share of the mismatch sits.
+
+    Attributes:
+        kind: ``"equation"``, ``"output"`` or ``"parameter"``.
+        target: Name of that equation (its state), output or parameter.
+        driver: What the mismatch varies with: a condition, ``"t"``, a state or an input.
+        spans: Ranges of the driver in which it sits, ``((low, high), …)``.
+        share: Share of the misfit beyond noise that a change there, varying with the driver, can remove.
+        evidence: Log evidence of a smooth unknown change there against none.
+    """
+
+    kind: str
+    target: str
+    driver: str
+    spans: tuple[tuple[float, float], ...]
+    share: float
+    evidence: float
+
+
+@dataclass(frozen=True)
+class Limit:
+    """The smallest effect that these data could have shown.
+
+    Attributes:
+        term: The candidate.
+        parameter: Its amplitude.
+        smallest: Smallest detectable magnitude, in ``unit``; infinite where the data cannot tell at all.
+        unit: Unit of the amplitude.
+        power: Probability with which an effect of this size is detected.
+        estimate: What was found, where the term was fitted.
+        note: ``"already in the base model"`` or the like.
+    """
+
+    term: str
+    parameter: str
+    smallest: float
+    unit: str | None
+    power: float
+    estimate: float | None = None
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Score:
+    """How well a model predicts some data.
+
+    Attributes:
+        rmse: Root mean squared error in units of each output's spread where there are several, else in its unit.
+        log_score: Mean log predictive density a datum.
+        coverage: Share of the data within the 95 % predictive interval.
+        n: Number of data.
+    """
+
+    rmse: float
+    log_score: float
+    coverage: float
+    n: int
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """A model's scores on the data it was fitted to and on those held out.
+
+    Attributes:
+        fitted: All data, final fit.
+        held_out: Data that the fit never saw; None where none could be held out.
+        prediction: What the fit without the held-out data predicts, ``(n_total,)``.
+        model_error_sd: Embedded model-error sd, root mean square over the data, outputs' unit.
+    """
+
+    fitted: Score
+    held_out: Score | None
+    prediction: Tensor | None
+    model_error_sd: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class NeededShift:
+    """The shift of one parameter that each stretch of data would need.
+
+    Attributes:
+        parameter: Which parameter.
+        unit: Its unit.
+        driver: What it varies with most.
+        values: Values of the driver, ``(m,)``.
+        shift: Needed shift there, ``(m,)``.
+        sd: Its standard deviation, ``(m,)``.
+        correlation: Rank correlation of shift and driver.
+    """
+
+    parameter: str
+    unit: str | None
+    driver: str
+    values: Tensor
+    shift: Tensor
+    sd: Tensor
+    correlation: float
+
+
+@dataclass(frozen=True, eq=False)
+class MissingRate:
+    """A non-parametric estimate of what is missing, as a smooth function of one driver.
+
+    Attributes:
+        kind: ``"equation"``: a rate added to an equation; ``"output"``: a shift of an output.
+        target: Name of that equation (its state) or output.
+        driver: What it is drawn against.
+        values: Driver values, ascending, ``(m,)``.
+        rate: Estimate there, ``(m,)``, in ``unit``.
+        sd: Its standard deviation, ``(m,)``.
+        unit: Unit of the rate.
+        time: Times of the grid along the calibrated trajectory, ``(T,)``; conditions' index for a static one.
+        along: Estimate along that grid, ``(T,)``.
+    """
+
+    kind: str
+    target: str
+    driver: str
+    values: Tensor
+    rate: Tensor
+    sd: Tensor
+    unit: str | None
+    time: Tensor
+    along: Tensor
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A new condition that would tell tied hypotheses apart.
+
+    Attributes:
+        description: In words.
+        separation: Predicted distance of the two nearest tied models there, in noise sd (root of the expected
+            χ² difference).
+        conditions: The conditions, initial states and inputs of the experiment, ready for a new recording.
+    """
+
+    description: str
+    separation: float
+    conditions: dict[str, Any] = dataclasses.field(default_factory=dict)

@@ -1,0 +1,199 @@
+"""Screening in the tangent space: a score statistic, a detection limit and the ties of every candidate.
+
+.. math:: z_i = s_i^\\perp \\cdot r / \\lVert s_i^\\perp \\rVert
+
+with the whitened residual r of the calibrated base and the whitened tangent s of a candidate's amplitude at its neutral
+value, projected off the tangents of everything that was calibrated. Linear: it screens and does not decide.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.candidates import Candidate
+from torchcal.discovery.channels import responses
+from torchcal.discovery.structure import Residual
+from torchcal.simulators import Trajectories
+
+__all__ = ["Screening", "Window", "contributions", "screen", "windows"]
+
+#: A tangent whose projection keeps less than this share of it says nothing new.
+VANISHED = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class Screening:
+    """All candidates in the tangent space.
+
+    Attributes:
+        columns: Unit tangents ``(n, m)``: every candidate's amplitudes at every shape.
+        owner: Number of the candidate of each column, ``(m,)``.
+        shape: Number of its shape, ``(m,)``.
+        amplitude: Number of its amplitude, ``(m,)``.
+        norm: ‖s⊥‖, ``(m,)``.
+        z: Score statistics, one-sided where physics is, ``(m,)``.
+        best: Best column of every candidate; −1 where its tangent vanishes.
+        null: Largest score in each simulated residual, ``(draws,)``.
+        vanished: Candidates without a tangent of their own.
+    """
+
+    columns: Tensor
+    owner: Tensor
+    shape: Tensor
+    amplitude: Tensor
+    norm: Tensor
+    z: Tensor
+    best: list[int]
+    null: Tensor
+    vanished: list[bool]
+
+    def score(self, i: int) -> float:
+        """Largest score of a candidate."""
+        return 0.0 if self.best[i] < 0 else float(self.z[self.best[i]])
+
+    def correlation(self, i: int, j: int) -> float:
+        """Of the best tangents of two candidates."""
+        if self.best[i] < 0 or self.best[j] < 0:
+            return 0.0
+        return float(self.columns[:, self.best[i]] @ self.columns[:, self.best[j]])
+
+
+def screen(residual: Residual, candidates: Sequence[Candidate]) -> Screening:
+    """Score every candidate against the residual of a fit."""
+    blocks, owner, shape, amplitude, sign = [], [], [], [], []
+    for i, candidate in enumerate(candidates):
+        for g in range(len(candidate.shapes)):
+            for a, place in enumerate(candidate.amplitudes):
+                blocks.append(candidate.tangents[g, :, a])
+                owner.append(i)
+                shape.append(g)
+                amplitude.append(a)
+                sign.append(candidate.one_sided(place))
+    raw = torch.stack(blocks, dim=-1) if blocks else residual.e.new_zeros(len(residual.e), 0)
+    whole = residual.found.whitening(raw)
+    columns = residual.project(whole)
+    norm = columns.norm(dim=0)
+    good = norm > VANISHED * whole.norm(dim=0).clamp_min(1e-300)
+    norm = torch.where(good, norm, torch.zeros_like(norm))
+    columns = torch.where(good, columns / norm.clamp_min(1e-300), torch.zeros_like(columns))
+    direction = torch.tensor(sign, dtype=torch.float64)
+
+    def scores(values: Tensor) -> Tensor:
+        z = columns.T @ values
+        sided = (direction[:, None] * z).clamp_min(0.0)
+        return torch.where(direction[:, None] == 0, z.abs(), sided)
+
+    z = scores(residual.e[:, None])[:, 0]
+    owners = torch.tensor(owner, dtype=torch.long)
+    best, vanished = [], []
+    for i in range(len(candidates)):
+        mine = (owners == i).nonzero()[:, 0]
+        usable = mine[good[mine]]
+        vanished.append(len(usable) == 0)
+        best.append(int(usable[z[usable].argmax()]) if len(usable) else -1)
+    null = scores(residual.null).amax(0) if columns.shape[1] else torch.zeros(residual.null.shape[1])
+    return Screening(columns, owners, torch.tensor(shape), torch.tensor(amplitude), norm, z, best, null, vanished)
+
+
+@dataclass(frozen=True)
+class Window:
+    """A candidate that acts in a range of one driver only.
+
+    Attributes:
+        candidate: Its number.
+        driver: The driver.
+        low: Lower end, −inf where open.
+        high: Upper end.
+        z: Score statistic.
+        amplitude: Linear estimate of the amplitude.
+    """
+
+    candidate: int
+    driver: str
+    low: float
+    high: float
+    z: float
+    amplitude: float
+
+
+def contributions(
+    residual: Residual, candidates: Sequence[Candidate], screening: Screening
+) -> tuple[dict[int, Tensor], dict[str, Tensor]]:
+    """What a candidate's amplitude does to the data from each part of the trajectory (or each condition) alone.
+
+    Returns responses ``(n, K)`` by candidate and the drivers ``(K,)``. Terms with hidden states, which remember, and
+    terms that free a parameter are left out.
+    """
+    found = residual.found
+    bound = found.problem.simulator
+    chosen, parts = [], []
+    for i, candidate in enumerate(candidates):
+        column = screening.best[i]
+        if column < 0 or any(term.states or term.frees for term in candidate.terms):
+            continue
+        values = candidate.begin.clone()
+        values[candidate.own] = candidate.shapes[int(screening.shape[column])]
+        place = candidate.amplitudes[int(screening.amplitude[column])]
+        extended = candidate.problem.simulator
+        if not isinstance(extended, Trajectories):
+            chosen.append(i)
+            parts.append(candidate.tangents[int(screening.shape[column]), :, int(screening.amplitude[column])])
+        elif not any(term.outputs for term in candidate.terms) and found.warm is not None:
+            chosen.append(i)
+            with torch.no_grad():
+                parts.append(extended._step_derivatives(values[None], found.warm, [place])[2][0])
+    if not chosen:
+        return {}, {}
+    if isinstance(bound, Trajectories):
+        response, drivers, _ = responses(found.problem, found, torch.cat(parts, dim=-1))
+        return {i: response[:, :, k] for k, i in enumerate(chosen)}, drivers
+    at = found.problem.drivers(found.values[None], None)
+    drivers = {name: v[found.problem.condition_of] for name, v in at.items()}
+    return {i: torch.diag(tangent) for i, tangent in zip(chosen, parts, strict=True)}, drivers
+
+
+def windows(
+    residual: Residual, candidates: Sequence[Candidate], screening: Screening
+) -> tuple[list[Window], Tensor]:
+    """Score candidates that act only in a range of time, a state, an input or a condition.
+
+    Returns the best window of every candidate and driver, and the largest score in each simulated residual.
+    """
+    found: list[Window] = []
+    null = torch.zeros(residual.null.shape[1], dtype=torch.float64)
+    parts, drivers = contributions(residual, candidates, screening)
+    for i, response in parts.items():
+        column = screening.best[i]
+        response = residual.tangent(response)
+        total = float(response.sum(1).norm())
+        sign = candidates[i].one_sided(candidates[i].amplitudes[int(screening.amplitude[column])])
+        for name, driver in drivers.items():
+            order = driver.argsort(stable=True)
+            if not float(driver[order[-1]]) > float(driver[order[0]]):
+                continue
+            running = torch.cat([response.new_zeros(len(response), 1), response[:, order].cumsum(1)], dim=1)
+            cuts = torch.linspace(0, len(order), 13).round().long().unique()
+            edges = [(int(a), int(b)) for x, a in enumerate(cuts) for b in cuts[x + 1 :] if (int(a), int(b)) != (0, len(order))]
+            if name != "t":
+                edges = [(a, b) for a, b in edges if a == 0 or b == len(order)]
+            columns = torch.stack([running[:, b] - running[:, a] for a, b in edges], dim=-1)
+            norm = columns.norm(dim=0)
+            keep = norm > max(VANISHED * total, 1e-300)
+            if not bool(keep.any()):
+                continue
+            unit = torch.where(keep, columns / norm.clamp_min(1e-300), torch.zeros_like(columns))
+            z = unit.T @ residual.e
+            simulated = unit.T @ residual.null
+            if sign:
+                z, simulated = (sign * z).clamp_min(0), (sign * simulated).clamp_min(0)
+            null = torch.maximum(null, simulated.abs().amax(0))
+            k = int(z.abs().argmax())
+            a, b = edges[k]
+            ordered = driver[order]
+            low = -math.inf if a == 0 else float(0.5 * (ordered[a - 1] + ordered[a]))
+            high = math.inf if b == len(order) else float(0.5 * (ordered[b - 1] + ordered[min(b, len(order) - 1)]))
+            found.append(Window(i, name, low, high, float(z[k].abs()), float((unit[:, k] @ residual.e) / norm[k])))
+    return found, null

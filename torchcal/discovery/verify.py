@@ -1,0 +1,142 @@
+"""Data that the fit never saw: chosen before the fit, outside the fitted range where the recording allows one."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchcal.data import Recording
+from torchcal.discovery.fitting import Fitted, fit
+from torchcal.discovery.noise import Noise
+from torchcal.discovery.records import Score
+from torchcal.errors import DomainError
+
+__all__ = ["HeldOut", "choose", "compare", "held_out_fit", "score"]
+
+#: Share of the data that is held out.
+SHARE = 0.25
+#: Fewer data than this a free parameter are too few to hold any out.
+LEAST_PER_PARAMETER = 4
+
+
+def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None:
+    """Which of the n_total outputs are held out, bool; None where there are too few data.
+
+    Of a recording in time the last quarter of every run; of several runs with several conditions each run's end all the
+    same, since every run may have initial states of its own. Of one condition its upper end, of several the data
+    farthest from their centre.
+
+    Args:
+        recording: The data.
+        holdout: None for the above, False for none, a share between 0 and 1, or a bool array ``(n,)`` or
+            ``(n_total,)``, True where held out.
+        parameters: Number of free parameters.
+
+    Raises:
+        DomainError: If ``holdout`` is none of these, or leaves too little.
+    """
+    if holdout is False:
+        return None
+    share = SHARE
+    if holdout is not None and not isinstance(holdout, float):
+        mask = holdout if isinstance(holdout, Tensor) else torch.as_tensor(np.asarray(holdout))
+        if mask.dtype != torch.bool or mask.shape not in ((recording.n,), recording.y.shape):
+            raise DomainError(
+                f"Expected holdout as False, a share, or a bool array of shape ({recording.n},), True where held out. "
+                f"Got {mask.dtype} of shape {tuple(mask.shape)}."
+            )
+        mask = mask.repeat(len(recording.outputs)) if len(mask) == recording.n and len(recording.outputs) > 1 else mask
+        if int((recording.observed & ~mask).sum()) <= parameters or not bool((recording.observed & mask).any()):
+            raise DomainError(
+                f"Expected holdout to leave more than {parameters} data and to hold out at least one. Got "
+                f"{int((recording.observed & ~mask).sum())} left (hold out less)."
+            )
+        return mask
+    if isinstance(holdout, float):
+        if not 0 < holdout < 1:
+            raise DomainError(f"Expected holdout as a share between 0 and 1. Got {holdout}.")
+        share = holdout
+    if int(recording.observed.sum()) * (1 - share) < LEAST_PER_PARAMETER * parameters:
+        return None
+    x = recording.x
+    if recording.runs is not None and isinstance(x, dict):
+        mask = torch.zeros(recording.n, dtype=torch.bool)
+        for r in x["run"].unique():
+            mine = (x["run"] == r).nonzero()[:, 0]
+            mask[mine[math.ceil((1 - share) * len(mine)) :]] = True
+    else:
+        columns = torch.stack(list(x.values()), dim=-1) if isinstance(x, dict) else x[:, None]
+        if columns.shape[1] == 1:
+            distance = columns[:, 0]
+        else:
+            middle = 0.5 * (columns.amax(0) + columns.amin(0))
+            half = 0.5 * (columns.amax(0) - columns.amin(0)).clamp_min(1e-300)
+            distance = ((columns - middle) / half).square().sum(-1)
+        count = max(1, int(share * len(distance)))
+        mask = torch.zeros(recording.n, dtype=torch.bool)
+        mask[distance.argsort(descending=True, stable=True)[:count]] = True
+    return mask.repeat(len(recording.outputs))
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """A model fitted without the held-out data.
+
+    Attributes:
+        fitted: The fit.
+        prediction: Of all outputs, ``(n_total,)``.
+        sd: Predictive sd, noise and parameters, ``(n_total,)``.
+    """
+
+    fitted: Fitted
+    prediction: Tensor
+    sd: Tensor
+
+
+def predict(found: Fitted, noise: Noise) -> tuple[Tensor, Tensor]:
+    """Prediction of all outputs and its sd, ``(n_total,)`` each."""
+    whole = found.problem.recording
+    result = found.problem.simulator.linearise(whole.x, found.values[None], whole.outputs, found.free, found.warm)
+    spread = ((result.jacobian[0] @ found.covariance()) * result.jacobian[0]).sum(-1).clamp_min(0)
+    return result.y[0], (spread + noise.sd.square()).sqrt()
+
+
+def held_out_fit(found: Fitted, noise: Noise, mask: Tensor) -> HeldOut | None:
+    """The same model from the same start, fitted without the data in ``mask``."""
+    problem = found.problem.keeping(~mask)
+    again = fit(problem, noise.whitening(problem), found.values[None], found.free, warm=found.warm)
+    if again is None:
+        return None
+    prediction, sd = predict(again, noise)
+    return HeldOut(again, prediction, sd)
+
+
+def score(recording: Recording, prediction: Tensor, sd: Tensor, mask: Tensor) -> Score:
+    """RMSE, mean log density and coverage of 95 % intervals over the data in ``mask``."""
+    y = recording.y[mask]
+    error = y - prediction[mask]
+    unit = recording.spread[mask] if len(recording.outputs) > 1 else torch.ones_like(error)
+    standard = error / sd[mask]
+    density = -0.5 * standard.square() - sd[mask].log() - 0.5 * math.log(2 * math.pi)
+    return Score(
+        rmse=float((error / unit).square().mean().sqrt()),
+        log_score=float(density.mean()),
+        coverage=float((standard.abs() <= 1.959964).double().mean()),
+        n=int(mask.sum()),
+    )
+
+
+def compare(recording: Recording, before: Tensor, after: Tensor, noise: Noise, mask: Tensor) -> tuple[float, float]:
+    """Mean gain in squared error over the held-out data, in noise variances, and its standard error.
+
+    Neighbours err together: the standard error comes from block means.
+    """
+    sd = noise.sd[mask]
+    y = recording.y[mask]
+    gain = ((y - before[mask]) / sd).square() - ((y - after[mask]) / sd).square()
+    blocks = min(len(gain), max(4, int(math.sqrt(len(gain)))))
+    means = torch.stack([part.mean() for part in gain.tensor_split(blocks)])
+    return float(gain.mean()), float(means.std() / math.sqrt(blocks)) if blocks > 1 else math.inf

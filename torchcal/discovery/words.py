@@ -1,0 +1,153 @@
+"""A diagnosis in words: a paragraph that could go into a report."""
+
+import math
+import textwrap
+from typing import Any
+
+__all__ = ["paragraph", "percent"]
+
+
+def percent(share: float) -> str:
+    """A share as text."""
+    if not math.isfinite(share):
+        return "an unknown share"
+    return f"{100 * share:.0f} %" if share >= 0.095 or share < 0.001 else f"{100 * share:.1f} %"
+
+
+def _probability(p: float) -> str:
+    return f"{p:.2g}" if p >= 0.001 else "< 0.001"
+
+
+def _and(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
+
+
+def paragraph(d: Any) -> str:
+    """The finding, with its numbers. ``d`` is a Diagnosis."""
+    parts = {
+        "consistent": _consistent,
+        "named": _named,
+        "ambiguous": _ambiguous,
+        "unexplained": _unexplained,
+    }[d.verdict](d)
+    lines = [_headline(d), ""]
+    text = " ".join(part for part in [_detected(d), *parts] if part)
+    lines += textwrap.wrap(text, 100)
+    for title, rows in (("Equation", d.equations), ("Symptoms", d.symptoms), ("Not identified", d.identifiability)):
+        if rows:
+            lines += ["", f"{title}:"]
+            for row in rows:
+                lines += textwrap.wrap(row, 100, initial_indent="  ", subsequent_indent="    ")
+    shown = type(d.ranking)(d.ranking[:8], ("terms", "log_evidence", "probability", "misfit_removed", "physical", "note"))
+    lines += ["", "Hypotheses, the best first:", textwrap.indent(str(shown), "  ")]
+    return "\n".join(lines)
+
+
+def _headline(d: Any) -> str:
+    if d.verdict == "consistent":
+        return "Verdict: consistent (nothing is missing that these data could show)"
+    if d.verdict == "named":
+        return f"Verdict: named: {_and([_with_region(d, name) for name in d.terms])}"
+    if d.verdict == "ambiguous":
+        return "Verdict: ambiguous: " + ", or ".join(" with ".join(tied) for tied in d.tied)
+    return "Verdict: unexplained (something is missing that is not in this library)"
+
+
+def _with_region(d: Any, name: str) -> str:
+    for row in d.ranking:
+        if row.refitted and tuple(row.terms) == tuple(d.terms) and row.region:
+            return f"{name}, where {row.region}"
+    return name
+
+
+def _detected(d: Any) -> str:
+    noise = d.noise
+    sd = ", ".join(f"{name} {value:.3g}" for name, value in noise.sd.items())
+    if noise.source == "none":
+        return f"The recording is declared free of noise; the calibrated base leaves an RMSE of {d.before.fitted.rmse:.4g}."
+    text = f"Noise sd ({noise.source}): {sd}"
+    correlated = [f"{name} {c:.2f}" for name, c in noise.correlation.items() if c >= 0.05]
+    text += f", correlated from sample to sample ({', '.join(correlated)})" if correlated else ""
+    text += f", {noise.outliers} outliers set aside" if noise.outliers else ""
+    text += f". The calibrated base leaves an RMSE of {d.before.fitted.rmse:.4g}; "
+    return text + f"noise alone would leave so much structure with probability {_probability(d.p_detect)}."
+
+
+def _consistent(d: Any) -> list[str]:
+    limits = [limit for limit in d.detection_limit if math.isfinite(limit.smallest)]
+    if not limits:
+        return ["There is no sign of missing physics."]
+    shown = ", ".join(f"{limit.term} {limit.smallest:.3g} {limit.unit or ''}".rstrip() for limit in limits[:6])
+    return [
+        "There is no sign of missing physics. The smallest effects that these data could have shown "
+        f"(with probability {limits[0].power:.0%}): {shown}."
+    ]
+
+
+def _where(d: Any) -> str:
+    if not d.where:
+        return ""
+    place = d.where[0]
+    spans = ", ".join(f"{low:.4g} to {high:.4g}" for low, high in place.spans)
+    return (
+        f"The mismatch sits in the {place.kind} {place.target} and varies with {place.driver} (mostly {spans}): a change there "
+        f"removes {percent(place.share)} of the misfit beyond noise."
+    )
+
+
+def _proof(d: Any) -> str:
+    if d.after is None:
+        return ""
+    text = f"RMSE falls from {d.before.fitted.rmse:.4g} to {d.after.fitted.rmse:.4g}"
+    if d.before.held_out is not None and d.after.held_out is not None:
+        b, a = d.before.held_out, d.after.held_out
+        text += (
+            f"; on {b.n} data that the fit never saw from {b.rmse:.4g} to {a.rmse:.4g} (log score {b.log_score:.3g} to "
+            f"{a.log_score:.3g}, 95 % intervals hold {percent(b.coverage)}, then {percent(a.coverage)})"
+        )
+    if d.before.model_error_sd is not None and d.after.model_error_sd is not None:
+        text += f". The embedded model-error sd shrinks from {d.before.model_error_sd:.3g} to {d.after.model_error_sd:.3g}"
+    return text + "."
+
+
+def _named(d: Any) -> list[str]:
+    top = next((row for row in d.ranking if list(row.terms) == list(d.terms)), d.ranking[0])
+    estimates = "; ".join(str(estimate) for estimate in top.estimates)
+    rival = next((row for row in d.ranking if row is not top and row.terms and row.refitted), None)
+    parts = [
+        _where(d),
+        f"Adding {_and([_with_region(d, name) for name in d.terms])} and refitting everything removes {percent(top.misfit_removed)} of the misfit beyond "
+        f"noise (probability {top.probability:.3f}; {estimates}).",
+    ]
+    if rival is not None:
+        parts.append(f"The next best, {_and(list(rival.terms))}, stands {top.log_evidence - rival.log_evidence:.1f} natural-log units of evidence behind.")
+    parts.append(_proof(d))
+    if d.remaining > 0.005:
+        parts.append(f"{percent(d.remaining)} of the misfit remains unexplained.")
+    return parts
+
+
+def _ambiguous(d: Any) -> list[str]:
+    parts = [_where(d), f"{len(d.tied)} hypotheses explain it equally well and these data cannot tell them apart."]
+    if d.experiment is not None:
+        parts.append(
+            f"What would tell them apart: {d.experiment.description} (predicted distance {d.experiment.separation:.1f} noise sd)."
+        )
+    return parts
+
+
+def _unexplained(d: Any) -> list[str]:
+    parts = [_where(d)]
+    best = next((row for row in d.ranking if row.terms and row.refitted), None)
+    if best is not None:
+        parts.append(
+            f"The best of the library, {_and(list(best.terms))}, removes {percent(best.misfit_removed)} of the misfit beyond noise"
+            + (f" ({best.note})" if best.note else "")
+            + "."
+        )
+    if d.settings.get("withdrawn"):
+        parts.append(d.settings["withdrawn"])
+    if d.missing is not None:
+        size = float(d.missing.rate.abs().max())
+        parts.append(f"The missing change of {d.missing.target} against {d.missing.driver} reaches {size:.3g} {d.missing.unit or ''}.")
+    return parts

@@ -1,0 +1,111 @@
+"""Simulators in time: ordinary differential equations with inputs, several runs and unknown initial states."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from torch import Tensor
+
+from torchcal.data import Recording
+from torchcal.errors import DomainError, SimulatorError
+from torchcal.simulators.parameter import Parameter
+from torchcal.simulators.static import Conditions, Simulator, check_parameters
+from torchcal.simulators.trajectories import Trajectories
+
+__all__ = ["ODESimulator"]
+
+Rates = Callable[[Any, dict[str, Tensor], dict[str, Tensor], dict[str, Tensor]], Mapping[str, Any]]
+
+
+class ODESimulator(Simulator):
+    r"""A model ds/dt = rates(t, s; p, u) written with torch operations, observed through functions of its states.
+
+    Write the rates elementwise: ``s[name]`` has shape ``(*batch, R)`` for R runs, ``u[name]`` ``(R,)``, ``t`` is a
+    scalar or ``(R,)``, and ``p[name]`` has shape ``(*batch, 1)`` (``(*batch, R)`` for per-run parameters). A returned
+    rate is expanded to its state's shape. Solved by the classical fourth-order Runge–Kutta method with steps that
+    end at every sample; `Trajectories` says how.
+
+    Args:
+        rates: ``rates(t, s, p, u)`` returns the rate of every state by name.
+        states: Units by state name, in order; a sequence of names where units do not matter.
+        parameters: In the order in which results list them.
+        observe: States that are observed, or a dict from output names to functions ``f(t, s, p, u)``. By default
+            every state.
+        initial: Initial values that the model itself knows, by state: a number, the name of another state whose
+            initial value it takes, or a function ``f(s, p)`` of the other states' initial values. What a run gives
+            comes first; what neither gives is calibrated.
+        max_step: Longest time step. By default steps are halved until the solution stops changing.
+
+    Raises:
+        DomainError: If something is not as described.
+
+    >>> decay = ODESimulator(lambda t, s, p, u: {"c": -p["k"] * s["c"]}, {"c": "mol/L"}, [Parameter("k")])
+    >>> decay.outputs
+    ('c',)
+    """
+
+    def __init__(
+        self,
+        rates: Rates,
+        states: Mapping[str, str | None] | Sequence[str],
+        parameters: Sequence[Parameter],
+        *,
+        observe: Sequence[str] | Mapping[str, Callable[..., Any]] | None = None,
+        initial: Mapping[str, float | str | Callable[..., Any]] | None = None,
+        max_step: float | None = None,
+    ) -> None:
+        if not callable(rates):
+            raise DomainError(f"Expected rates as a function f(t, s, p, u). Got {type(rates).__name__}.")
+        if isinstance(states, str) or not states or any(not isinstance(name, str) or not name for name in states):
+            raise DomainError(f"Expected states as a dict from names to units. Got {states!r}.")
+        if max_step is not None and not max_step > 0:
+            raise DomainError(f"Expected max_step > 0 or None. Got {max_step!r}.")
+        self.rates = rates
+        self.states: dict[str, str | None] = (
+            dict(states) if isinstance(states, Mapping) else dict.fromkeys(states)
+        )
+        self.parameters = check_parameters(parameters)
+        self.degree = None
+        self.initial = dict(initial or {})
+        self.max_step = max_step
+        if unknown := [name for name in self.initial if name not in self.states]:
+            raise DomainError(f"Expected initial values of states {list(self.states)}. Got {unknown}.")
+        self.observe = self._observed(observe)
+
+    def _observed(self, observe: Any) -> dict[str, Callable[..., Any]]:
+        if observe is None:
+            observe = tuple(self.states)
+        if isinstance(observe, str):
+            observe = (observe,)
+        if isinstance(observe, Mapping):
+            if not observe or not all(callable(function) for function in observe.values()):
+                raise DomainError("Expected observe as {output: function(t, s, p, u)}. Got something else in it.")
+            return dict(observe)
+        if unknown := [name for name in observe if name not in self.states]:
+            raise DomainError(f"Expected observed states among {list(self.states)}. Got {unknown}.")
+        if not observe:
+            raise DomainError("Expected at least one observed state. Got none.")
+        return {name: _state(name) for name in observe}
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of what can be observed."""
+        return tuple(self.observe)
+
+    def bind(self, recording: Recording) -> "Trajectories":
+        """The simulator of this recording's outputs: its runs, inputs, times and unknown initial states.
+
+        Its parameters are this simulator's (one for each run where ``per_run``) and behind them the initial states
+        that nobody knows, as ``"x(0)"``, or ``"x(0)[run]"`` where there are several runs.
+        """
+        return Trajectories(self, recording)
+
+    def at(self, x: Conditions, outputs: Sequence[str] | None = None) -> Callable[[Tensor], Tensor]:
+        """Not possible without runs: bind a recording first."""
+        raise SimulatorError(
+            "Expected a recording in time for an ODESimulator. Got conditions alone. Use simulator.bind(recording), "
+            "with a Recording(runs=[Run(...)])."
+        )
+
+
+def _state(name: str) -> Callable[..., Tensor]:
+    return lambda t, s, p, u: s[name]

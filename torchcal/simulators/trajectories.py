@@ -1,0 +1,507 @@
+"""An ODE simulator bound to the runs of a recording: outputs and exact sensitivities, parallel in time.
+
+Runge–Kutta steps are all taken at once from a guessed trajectory; Newton's method on the whole trajectory removes the
+gaps between them. Each pass costs one batched step, whatever the length of the recording, and its derivatives are the
+exact derivatives of the discrete solution.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+from torch.autograd import forward_ad
+
+from torchcal.data import Recording
+from torchcal.errors import DomainError, RecordingError, SimulatorError
+from torchcal.simulators.parameter import Parameter
+from torchcal.simulators.static import Conditions, Linearisation, Simulator
+
+if TYPE_CHECKING:
+    from torchcal.simulators.ode import ODESimulator
+
+__all__ = ["Trajectories"]
+
+#: A run is first solved with at least this many steps.
+MIN_STEPS = 48
+#: Gaps in a trajectory, relative to the state's size, below which Newton's method stops.
+GAP = 1e-9
+#: Gaps whose square is below `GAP`: after one more correction nothing is left to check.
+QUADRATIC = 1e-5
+#: Newton passes before the trajectory is solved step by step instead.
+MAX_PASSES = 8
+
+
+class Trajectories(Simulator):
+    """`ODESimulator` for the runs of one recording. Its conditions are the recording's, and no others.
+
+    Args:
+        ode: The simulator.
+        recording: Made from runs.
+        subdivide: Steps are this many times shorter than the coarsest that the samples allow.
+    """
+
+    def __init__(self, ode: "ODESimulator", recording: Recording, *, subdivide: int = 1) -> None:
+        if not isinstance(recording, Recording) or recording.runs is None:
+            raise RecordingError(
+                "Expected a recording in time, Recording(runs=[Run(...)]). Got "
+                f"{'a static recording' if isinstance(recording, Recording) else type(recording).__name__}."
+            )
+        if unknown := [name for name in recording.outputs if name not in ode.observe]:
+            raise SimulatorError(
+                f"Expected recorded outputs among {list(ode.observe)}. Got {unknown} "
+                "(give observe={output: function(t, s, p, u)})."
+            )
+        self.ode = ode
+        self.recording = recording
+        self.subdivide = subdivide
+        self.degree = None
+        self.runs = recording.runs
+        self._states = tuple(ode.states)
+        self._lay_grid()
+        self._lay_parameters()
+
+    # --- layout ------------------------------------------------------------------------------------------
+
+    def _lay_grid(self) -> None:
+        """Steps of every run, padded to one number with steps of length zero."""
+        grids, picks = [], []
+        for run in self.runs:
+            gaps = run.time.diff()
+            longest = float(run.time[-1] - run.time[0]) / MIN_STEPS
+            if self.ode.max_step is not None:
+                longest = min(longest, self.ode.max_step)
+            counts = (gaps / (longest * (1 + 1e-9))).ceil().clamp_min(1).long() * self.subdivide
+            if int(counts.sum()) > 2_000_000:
+                raise DomainError(
+                    f"Expected at most 2 000 000 steps a run. Got {int(counts.sum())} (give a longer max_step)."
+                )
+            start = torch.repeat_interleave(run.time[:-1], counts)
+            h = torch.repeat_interleave(gaps / counts, counts)
+            offset = torch.arange(len(start)) - torch.repeat_interleave(counts.cumsum(0) - counts, counts)
+            start = start + offset * h
+            grids.append((start, h, run))
+            picks.append(torch.cat([counts.new_zeros(1), counts.cumsum(0)]))
+        most = max(len(h) for _, h, _ in grids)
+        self.num_steps = most
+        steps, starts, nodes = [], [], []
+        inputs: dict[str, list[Tensor]] = {name: [] for name in self.runs[0].inputs}
+        for start, h, run in grids:
+            pad = most - len(h)
+            steps.append(torch.cat([h, h.new_zeros(pad)]))
+            starts.append(torch.cat([start, run.time[-1].expand(pad)]))
+            nodes.append(torch.cat([starts[-1], (starts[-1][-1] + steps[-1][-1])[None]]))
+            ends = torch.cat([start[1:], run.time[-1:]])
+            stages = [run.inputs_at(start), run.inputs_at(0.5 * (start + ends)), run.inputs_at(ends, side="left")]
+            for name, table in inputs.items():
+                rows = torch.stack([stage[name] for stage in stages])
+                table.append(torch.cat([rows, rows[:, -1:].expand(3, pad)], dim=1))
+        self._h = torch.stack(steps)  # (R, K)
+        self._t = torch.stack(starts)
+        self.node_times = torch.stack(nodes)  # (R, K + 1)
+        self._u = {name: torch.stack(table, dim=1) for name, table in inputs.items()}  # (3, R, K)
+        self._run_of = torch.cat([torch.full((len(run.time),), r) for r, run in enumerate(self.runs)])
+        self._node_of = torch.cat(picks)
+        self._data_t = torch.cat([run.time for run in self.runs])
+        self._data_u = {name: torch.cat([run.inputs[name] for run in self.runs]) for name in inputs}
+        self.x = self.recording.x
+
+    def _lay_parameters(self) -> None:
+        """Free numbers: the simulator's parameters, each run's own, and unknown initial states."""
+        count = len(self.runs)
+        parameters: list[Parameter] = []
+        self._columns: dict[str, list[int]] = {}
+        for parameter in self.ode.parameters:
+            first = len(parameters)
+            if parameter.per_run and count > 1:
+                self._columns[parameter.name] = [first + r for r in range(count)]
+                parameters += [_renamed(parameter, f"{parameter.name}[{r}]") for r in range(count)]
+            else:
+                self._columns[parameter.name] = [first]
+                parameters.append(parameter)
+        self._initial: list[dict[str, Any]] = []
+        self.initial_names: list[str] = []
+        for r, run in enumerate(self.runs):
+            if unknown := [name for name in run.initial if name not in self._states]:
+                raise RecordingError(f"Expected initial values of states {list(self._states)}. Got {unknown}.")
+            known: dict[str, Any] = {}
+            for state, unit in self.ode.states.items():
+                if state in run.initial:
+                    known[state] = float(run.initial[state])
+                elif state in self.ode.initial:
+                    known[state] = self.ode.initial[state]
+                else:
+                    name = f"{state}(0)" if count == 1 else f"{state}(0)[{r}]"
+                    known[state] = ("free", len(parameters))
+                    self.initial_names.append(name)
+                    parameters.append(Parameter(name, unit=unit, initial=self._first_guess(state, r)))
+            self._initial.append(known)
+        self.parameters = tuple(parameters)
+
+    def _first_guess(self, state: str, r: int) -> float | None:
+        """The first recorded value of a state that is itself an output."""
+        if state not in self.recording.outputs or state not in self.ode.outputs:
+            return None
+        values = self.runs[r].outputs.get(state)
+        if values is None:
+            return None
+        seen = values[~torch.isnan(values)]
+        return float(seen[0]) if len(seen) else None
+
+    def bind(self, recording: Recording) -> "Trajectories":
+        """These trajectories, if the recording is theirs; else those of the other recording."""
+        if recording is self.recording:
+            return self
+        return Trajectories(self.ode, recording, subdivide=self.subdivide)
+
+    def refined(self, factor: int = 2) -> "Trajectories":
+        """The same with shorter steps."""
+        return Trajectories(self.ode, self.recording, subdivide=self.subdivide * factor)
+
+    # --- evaluation --------------------------------------------------------------------------------------
+
+    def at(self, x: Conditions, outputs: Sequence[str] | None = None) -> Callable[[Tensor], Tensor]:
+        """Outputs as a function of parameter values, differentiable by autograd; x must be the recording's."""
+        self._check_conditions(x)
+        wanted = tuple(outputs) if outputs is not None else self.recording.outputs
+
+        def evaluate(values: Tensor) -> Tensor:
+            batch = values.shape[:-1]
+            flat = values.reshape(-1, values.shape[-1])
+            plain = flat.detach().to(device="cpu", dtype=torch.float64)
+            if torch.is_grad_enabled() and values.requires_grad:
+                found = self.linearise(x, plain, wanted)
+                result: Tensor = _WithJacobian.apply(flat, found.y.to(flat), found.jacobian.to(flat))
+            else:
+                result = self.outputs_of(plain, self.solve(plain), wanted).to(flat)
+            return result.reshape(*batch, result.shape[-1])
+
+        return evaluate
+
+    def _check_conditions(self, x: Conditions) -> None:
+        same = isinstance(x, Mapping) and "time" in x and "run" in x and len(x["time"]) == len(self._data_t)
+        if not (same and bool(torch.equal(x["time"].cpu().to(torch.float64), self._data_t))):
+            raise DomainError(
+                "Expected the conditions of the recording that the simulator was bound to. Got others "
+                "(bind another recording: simulator.bind(recording))."
+            )
+
+    def linearise(
+        self,
+        x: Conditions,
+        values: Tensor,
+        outputs: Sequence[str] | None = None,
+        columns: Sequence[int] | None = None,
+        warm: Any = None,
+    ) -> Linearisation:
+        """Outputs and their derivatives; ``warm`` is the trajectory of an earlier, nearby call."""
+        wanted = tuple(outputs) if outputs is not None else self.recording.outputs
+        values = values.detach()
+        columns = list(range(values.shape[-1])) if columns is None else list(columns)
+        with torch.no_grad():
+            states = self._solve(values, warm)
+            tangents = self._sensitivities(values, states, columns) if columns else None
+            y, jacobian = self._observe(values, states, wanted, columns, tangents)
+        return Linearisation(y, jacobian, states)
+
+    def solve(self, values: Tensor, warm: Any = None) -> Tensor:
+        """States at the ends of all steps, ``(H, R, K + 1, states)``; infinite where the solution blows up."""
+        with torch.no_grad():
+            return self._solve(values.detach(), warm)
+
+    def outputs_of(self, values: Tensor, states: Tensor, outputs: Sequence[str] | None = None) -> Tensor:
+        """Outputs ``(H, n_total)`` of solved states."""
+        wanted = tuple(outputs) if outputs is not None else self.recording.outputs
+        with torch.no_grad():
+            return self._observe(values.detach(), states, wanted)[0]
+
+    def along(self, values: Tensor, states: Tensor) -> dict[str, Tensor]:
+        """Time, states and inputs at the ends of all steps, each ``(R, K + 1)``; one row of values."""
+        found = {"t": self.node_times}
+        found |= {name: states[0, ..., i] for i, name in enumerate(self._states)}
+        found |= {name: torch.cat([table[0], table[2][:, -1:]], dim=1) for name, table in self._u.items()}
+        return found
+
+    def _p(self, values: Tensor, run_of: Tensor | None = None) -> dict[str, Tensor]:
+        """Parameters by name, ``(H, 1)``, or spread over runs and picked by ``run_of``."""
+        found = {}
+        for name, places in self._columns.items():
+            block = values[..., places]
+            found[name] = block if len(places) == 1 or run_of is None else block[..., run_of]
+        return found
+
+    def _start(self, values: Tensor) -> Tensor:
+        """Initial states ``(H, R, states)``."""
+        rows = []
+        for r, known in enumerate(self._initial):
+            entries: dict[str, Tensor] = {}
+            own = {name: values[..., places[0 if len(places) == 1 else r], None]
+                   for name, places in self._columns.items()}  # fmt: skip
+            for state, value in known.items():
+                if isinstance(value, tuple):
+                    entries[state] = values[..., value[1], None]
+                elif isinstance(value, float | int):
+                    entries[state] = values.new_full((*values.shape[:-1], 1), float(value))
+            for state, value in known.items():
+                if isinstance(value, str):
+                    entries[state] = entries[value]
+                elif callable(value):
+                    entries[state] = value(entries, own) + torch.zeros_like(values[..., :1])
+            rows.append(torch.cat([entries[state] for state in self._states], dim=-1))
+        return torch.stack(rows, dim=-2)
+
+    def _slope(self, t: Tensor, s: Tensor, p: dict[str, Tensor], u: dict[str, Tensor]) -> Tensor:
+        """Rates ``(H, M, states)`` at states ``(H, M, states)``."""
+        named = {name: s[..., i] for i, name in enumerate(self._states)}
+        try:
+            rates = self.ode.rates(t, named, p, u)
+        except SimulatorError:
+            raise
+        except Exception as error:
+            raise SimulatorError(
+                f"Expected rates(t, s, p, u) to return the rates by state. It raised {type(error).__name__}: {error}. "
+                f"It was called with states of shape {tuple(s.shape[:-1])} and parameters "
+                f"{', '.join(p)} of shape {tuple(next(iter(p.values())).shape)}."
+            ) from error
+        if not isinstance(rates, Mapping) or set(rates) != set(self._states):
+            got = list(rates) if isinstance(rates, Mapping) else type(rates).__name__
+            raise SimulatorError(f"Expected the rates of {list(self._states)} as a dict. Got {got}.")
+        columns = []
+        for name in self._states:
+            rate = rates[name]
+            if not isinstance(rate, Tensor):
+                rate = torch.as_tensor(float(rate), dtype=s.dtype)
+            try:
+                columns.append(rate.expand(s.shape[:-1]) if rate.shape != s.shape[:-1] else rate)
+            except RuntimeError as error:
+                raise SimulatorError(
+                    f"Expected the rate of {name!r} of shape {tuple(s.shape[:-1])} (batch, runs). "
+                    f"Got {tuple(rate.shape)}. Write the rates elementwise."
+                ) from error
+        return torch.stack(columns, dim=-1)
+
+    def _step(self, s: Tensor, t: Tensor, h: Tensor, p: dict[str, Tensor], u: dict[str, Tensor]) -> Tensor:
+        """One Runge–Kutta step of every point ``(H, M, states)``; t, h ``(M,)``, u ``(3, M)``."""
+        first, middle, last = ({name: table[i] for name, table in u.items()} for i in range(3))
+        half, full = (0.5 * h)[:, None], h[:, None]
+        k1 = self._slope(t, s, p, first)
+        k2 = self._slope(t + 0.5 * h, s + half * k1, p, middle)
+        k3 = self._slope(t + 0.5 * h, s + half * k2, p, middle)
+        k4 = self._slope(t + h, s + full * k3, p, last)
+        return s + (full / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
+
+    def _solve(self, values: Tensor, warm: Any = None) -> Tensor:
+        if warm is not None and warm.shape[0] == values.shape[0]:
+            states = self._newton(values, warm)
+            if states is not None:
+                return states
+        return self._march(values)
+
+    def _march(self, values: Tensor) -> Tensor:
+        """Step by step."""
+        state = self._start(values)
+        p = self._p(values)
+        found = [state]
+        for k in range(self.num_steps):
+            u = {name: table[:, :, k] for name, table in self._u.items()}
+            state = self._step(state, self._t[:, k], self._h[:, k], p, u)
+            found.append(state)
+        states = torch.stack(found, dim=-2)
+        return torch.where(torch.isfinite(states), states, torch.full_like(states, math.inf))
+
+    def _newton(self, values: Tensor, guess: Tensor) -> Tensor | None:
+        """Newton's method on whole trajectories; None where it does not settle at once."""
+        states = guess.clone()
+        states[:, :, 0] = self._start(values)
+        size = states.abs().amax(dim=(0, 1, 2)).clamp_min(1e-300)
+        if not bool(torch.isfinite(size).all()):
+            return None
+        last = math.inf
+        for _ in range(MAX_PASSES):
+            ends, flow, _ = self._step_derivatives(values, states, ())
+            gap = ends - states[:, :, 1:]
+            worst = float((gap.abs().amax(dim=(0, 1, 2)) / size).max())
+            if worst < GAP:
+                return states
+            if not worst < 4.0 * last or not math.isfinite(worst):
+                return None
+            last = worst
+            change = _recur(flow, gap.unsqueeze(-1))[..., 0]
+            states = torch.cat([states[:, :, :1], states[:, :, 1:] + change], dim=2)
+            if worst < QUADRATIC:
+                return states
+        return None
+
+    def _step_derivatives(
+        self, values: Tensor, states: Tensor, columns: Sequence[int]
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Ends of all steps begun at ``states``, and their derivatives by the states and by some parameters.
+
+        Returns ends ``(H, R, K, S)``, flow ``(H, R, K, S, S)`` and forcing ``(H, R, K, S, len(columns))``.
+        """
+        hyper, runs, _, size = states.shape
+        steps = self.num_steps
+        begin = states[:, :, :-1].reshape(hyper, runs * steps, size)
+        directions = size + len(columns)
+        run_of = torch.arange(runs).repeat_interleave(steps)
+        t, h = self._t.reshape(-1), self._h.reshape(-1)
+        u = {name: table.reshape(3, -1) for name, table in self._u.items()}
+        s_tangent = begin.new_zeros(directions, *begin.shape)
+        for i in range(size):
+            s_tangent[i, ..., i] = 1.0
+        v_tangent = values.new_zeros(directions, *values.shape)
+        for j, column in enumerate(columns):
+            v_tangent[size + j, :, column] = 1.0
+        spread = values.expand(directions, -1, -1).contiguous()
+        ends, tangent = self._step_forward(begin, s_tangent, spread, v_tangent, t, h, run_of, u)
+        tangent = tangent.reshape(directions, hyper, runs, steps, size).permute(1, 2, 3, 4, 0)
+        return ends.reshape(hyper, runs, steps, size), tangent[..., :size], tangent[..., size:]
+
+    def _step_forward(
+        self,
+        s: Tensor,
+        ds: Tensor,
+        values: Tensor,
+        d_values: Tensor,
+        t: Tensor,
+        h: Tensor,
+        run_of: Tensor,
+        u: dict[str, Tensor],
+    ) -> tuple[Tensor, Tensor]:
+        """`_step` and its tangents. Only the rates go through automatic differentiation.
+
+        What has no tangent gets one of zeros: PyTorch's implicit zeros cost many times the operation itself.
+        """
+        half, full = (0.5 * h)[:, None], h[:, None]
+        total, d_total, k, dk = torch.zeros_like(s), torch.zeros_like(ds), s, ds
+        for stage, (share, weight) in enumerate(((None, 1.0), (half, 2.0), (half, 2.0), (full, 1.0))):
+            at, d_at = (s, ds) if share is None else (s + share * k, ds + share * dk)
+            when = t if share is None else t + share[:, 0]
+            inputs = {name: table[(stage + 1) // 2] for name, table in u.items()}
+            with forward_ad.dual_level():
+                v = forward_ad.make_dual(values, d_values)
+                dual = forward_ad.make_dual(at.expand(d_at.shape).contiguous(), d_at)
+                known = {name: forward_ad.make_dual(x.contiguous(), torch.zeros_like(x)) for name, x in inputs.items()}
+                out = forward_ad.unpack_dual(self._slope(when, dual, self._p(v, run_of), known))
+                k = out.primal[0]
+                dk = torch.zeros_like(out.primal) if out.tangent is None else out.tangent
+            total, d_total = total + weight * k, d_total + weight * dk
+        return s + full / 6.0 * total, ds + full / 6.0 * d_total
+
+    def _sensitivities(self, values: Tensor, states: Tensor, columns: Sequence[int]) -> Tensor:
+        """∂ states / ∂ parameters at the ends of all steps, ``(H, R, K + 1, S, len(columns))``."""
+        _, flow, forcing = self._step_derivatives(values, states, columns)
+        tangent = values.new_zeros(len(columns), *values.shape)
+        for j, column in enumerate(columns):
+            tangent[j, :, column] = 1.0
+        with forward_ad.dual_level():
+            v = forward_ad.make_dual(values.expand(len(columns), -1, -1).contiguous(), tangent)
+            begin = forward_ad.unpack_dual(self._start(v)).tangent
+        if begin is None:
+            begin = values.new_zeros(len(columns), values.shape[0], len(self.runs), len(self._states))
+        begin = begin.permute(1, 2, 3, 0)
+        forcing = forcing.clone()
+        forcing[:, :, 0] += flow[:, :, 0] @ begin
+        return torch.cat([begin.unsqueeze(2), _recur(flow, forcing)], dim=2)
+
+    def flow(self, values: Tensor, states: Tensor) -> Tensor:
+        """Derivative of the end of every step by its beginning, ``(H, R, K, S, S)``."""
+        with torch.no_grad():
+            return self._step_derivatives(values, states, ())[1]
+
+    def _observe(
+        self,
+        values: Tensor,
+        states: Tensor,
+        outputs: Sequence[str],
+        columns: Sequence[int] = (),
+        tangents: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Outputs ``(H, n_total)`` and their derivatives ``(H, n_total, len(columns))``."""
+        seen = states[:, self._run_of, self._node_of]  # (H, n, S)
+        if tangents is None:
+            found = self._measure(values, seen, outputs)
+            return found, found.new_zeros(*found.shape, 0)
+        moved = tangents[:, self._run_of, self._node_of].permute(3, 0, 1, 2)
+        v_tangent = values.new_zeros(len(columns), *values.shape)
+        for j, column in enumerate(columns):
+            v_tangent[j, :, column] = 1.0
+        with forward_ad.dual_level():
+            s = forward_ad.make_dual(seen.expand(len(columns), -1, -1, -1).contiguous(), moved.contiguous())
+            v = forward_ad.make_dual(values.expand(len(columns), -1, -1).contiguous(), v_tangent)
+            out = forward_ad.unpack_dual(self._measure(v, s, outputs))
+            y = out.primal[0]
+            tangent = out.tangent if out.tangent is not None else torch.zeros_like(out.primal)
+        return y, tangent.permute(1, 2, 0)
+
+    def _measure(self, values: Tensor, seen: Tensor, outputs: Sequence[str]) -> Tensor:
+        s = {name: seen[..., i] for i, name in enumerate(self._states)}
+        p = self._p(values, self._run_of)
+        parts = []
+        for name in outputs:
+            try:
+                value = self.ode.observe[name](self._data_t, s, p, self._data_u)
+            except Exception as error:
+                raise SimulatorError(
+                    f"Expected the output {name!r} as a tensor. Its function raised {type(error).__name__}: {error}."
+                ) from error
+            parts.append(torch.as_tensor(value, dtype=seen.dtype).expand(seen.shape[:-1]))
+        return torch.cat(parts, dim=-1)
+
+
+class _WithJacobian(torch.autograd.Function):
+    """Outputs that are known already, tied to the parameters by their Jacobian."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, y: Tensor, jacobian: Tensor) -> Tensor:
+        ctx.save_for_backward(jacobian)
+        return y.clone()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> Any:
+        (jacobian,) = ctx.saved_tensors
+        return (grads[0].unsqueeze(-2) @ jacobian)[..., 0, :], None, None
+
+
+def _recur(flow: Tensor, forcing: Tensor) -> Tensor:
+    """x₁ … x_K of x_{k+1} = flow_k x_k + forcing_k with x₀ = 0, in blocks that run side by side.
+
+    Args:
+        flow: ``(H, R, K, S, S)``.
+        forcing: ``(H, R, K, S, C)``.
+    """
+    steps = flow.shape[2]
+    block = max(1, math.ceil(math.sqrt(steps)))
+    count = math.ceil(steps / block)
+    pad = count * block - steps
+    if pad:
+        eye = torch.eye(flow.shape[-1], dtype=flow.dtype).expand(*flow.shape[:2], pad, -1, -1)
+        flow = torch.cat([flow, eye], dim=2)
+        forcing = torch.cat([forcing, forcing.new_zeros(*forcing.shape[:2], pad, *forcing.shape[3:])], dim=2)
+    # Columns of the identity ride along: they carry what enters a block to every step of it.
+    flow = flow.unflatten(2, (count, block))
+    forcing = forcing.unflatten(2, (count, block))
+    size = flow.shape[-1]
+    carried = torch.cat([torch.zeros_like(flow[:, :, :, 0]), forcing.new_zeros(*forcing[:, :, :, 0].shape)], dim=-1)
+    carried[..., :size] += torch.eye(size, dtype=flow.dtype)
+    inside = []
+    zeros = torch.zeros_like(carried[..., :size])
+    for k in range(block):
+        carried = flow[:, :, :, k] @ carried + torch.cat([zeros, forcing[:, :, :, k]], dim=-1)
+        inside.append(carried)
+    within = torch.stack(inside, dim=3)  # (H, R, count, block, S, S + C)
+    entering = [forcing.new_zeros(*forcing.shape[:2], size, forcing.shape[-1])]
+    for j in range(count - 1):
+        end = within[:, :, j, -1]
+        entering.append(end[..., :size] @ entering[-1] + end[..., size:])
+    enters = torch.stack(entering, dim=2).unsqueeze(3)
+    found = within[..., :size] @ enters + within[..., size:]
+    return found.flatten(2, 3)[:, :, :steps]
+
+
+def _renamed(parameter: Parameter, name: str) -> Parameter:
+    import dataclasses
+
+    return dataclasses.replace(parameter, name=name)

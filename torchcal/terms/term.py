@@ -1,0 +1,297 @@
+"""A candidate piece of physics, and a simulator with such pieces added."""
+
+import copy
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchcal.errors import DomainError
+from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories
+
+__all__ = ["Term", "extend"]
+
+Function = Callable[..., Any]
+
+
+@dataclass(frozen=True, init=False, repr=False, eq=False)
+class Term:
+    """A candidate: named parameters with a neutral value at which the simulator is unchanged, and what they do.
+
+    A term's parameters are its own. In its functions ``p`` gives the term's first and the simulator's behind them;
+    elsewhere they are called ``"term.parameter"``. A parameter is neutral at 0 unless given. Parameters that have no
+    effect while the others are neutral (thresholds, widths, times) are its shape.
+
+    Args:
+        name: Of the physics, as the field calls it.
+        equation: State whose rate it adds to.
+        rate: ``rate(t, s, p, u)``, added to that equation.
+        rates: The same for several equations, and for its own states, by state.
+        states: Hidden states of its own, with their units.
+        initial: Their initial values: a number, the name of another state, or ``f(s, p)``; 0 by default.
+        outputs: By output ``f(t, s, p, u, y)`` in place of the simulated output y; ``f(x, p, y)`` for a static
+            simulator.
+        shifts: By parameter of the simulator ``f(t, s, p, u)``, added to it; ``f(x, p)`` for a static simulator.
+        frees: Dormant parameters of the simulator that it frees.
+        parameters: Its own parameters.
+        formula: One line, as a scientist writes it.
+        description: One plain sentence.
+        scales: For shape parameters without bounds: the state, input, condition or output (``"t"`` for time) on
+            whose scale they are measured; they are then sought between 0.02 and 1 of its largest magnitude.
+
+    Raises:
+        DomainError: If it does nothing, or its parts do not fit together.
+
+    >>> Term("drag", equation="v", rate=lambda t, s, p, u: -p["c"] * s["v"], parameters=[Parameter("c")])
+    Term('drag': c)
+    """
+
+    name: str
+    rates: dict[str, Function]
+    states: dict[str, str | None]
+    initial: dict[str, Any]
+    outputs: dict[str, Function]
+    shifts: dict[str, Function]
+    frees: tuple[str, ...]
+    parameters: tuple[Parameter, ...]
+    formula: str
+    description: str
+    scales: dict[str, str] = field(default_factory=dict)
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        equation: str | None = None,
+        rate: Function | None = None,
+        rates: Mapping[str, Function] | None = None,
+        states: Mapping[str, str | None] | None = None,
+        initial: Mapping[str, Any] | None = None,
+        outputs: Mapping[str, Function] | None = None,
+        shifts: Mapping[str, Function] | None = None,
+        frees: Sequence[str] = (),
+        parameters: Sequence[Parameter] = (),
+        formula: str = "",
+        description: str = "",
+        scales: Mapping[str, str] | None = None,
+    ) -> None:
+        if not isinstance(name, str) or not name:
+            raise DomainError(f"Expected a term's name (a non-empty string). Got {name!r}.")
+        if (equation is None) != (rate is None):
+            raise DomainError(f"Expected equation= and rate= together for the term {name!r}. Got one of them.")
+        every = dict(rates or {})
+        if equation is not None and rate is not None:
+            if equation in every:
+                raise DomainError(f"Expected one rate for {equation!r} in the term {name!r}. Got two.")
+            every[equation] = rate
+        if isinstance(frees, str):
+            frees = (frees,)
+        parts = [*every.values(), *(outputs or {}).values(), *(shifts or {}).values()]
+        if not parts and not frees:
+            raise DomainError(
+                f"Expected the term {name!r} to do something. Got none of rate=, rates=, outputs=, shifts=, frees=."
+            )
+        if not all(callable(part) for part in parts):
+            raise DomainError(f"Expected functions in the term {name!r}. Got something that cannot be called.")
+        if parts and not parameters:
+            raise DomainError(
+                f"Expected parameters=[Parameter(...)] for the term {name!r}. Got none, so that nothing could be "
+                "fitted; an effect needs a coefficient that is 0 where it is absent."
+            )
+        names = [parameter.name for parameter in parameters]
+        if len(set(names)) < len(names):
+            raise DomainError(f"Expected every parameter of the term {name!r} named once. Got {names}.")
+        for state in states or {}:
+            if state not in every:
+                raise DomainError(f"Expected a rate for the hidden state {state!r} of the term {name!r}. Got none.")
+        for parameter in scales or {}:
+            if parameter not in names:
+                raise DomainError(f"Expected scales of parameters {names} of the term {name!r}. Got {parameter!r}.")
+        put = object.__setattr__
+        put(self, "name", name)
+        put(self, "rates", every)
+        put(self, "states", dict(states or {}))
+        put(self, "initial", {state: (initial or {}).get(state, 0.0) for state in states or {}})
+        put(self, "outputs", dict(outputs or {}))
+        put(self, "shifts", dict(shifts or {}))
+        put(self, "frees", tuple(frees))
+        put(self, "parameters", tuple(parameters))
+        put(self, "formula", formula)
+        put(self, "description", description)
+        put(self, "scales", dict(scales or {}))
+
+    def __repr__(self) -> str:
+        return f"Term({self.name!r}: {', '.join([p.name for p in self.parameters] + list(self.frees))})"
+
+    def full(self, parameter: str) -> str:
+        """How results call one of its own parameters."""
+        return f"{self.name}.{parameter}"
+
+    def own(self, p: Mapping[str, Any]) -> dict[str, Any]:
+        """``p`` as the term's functions see it."""
+        return {**p, **{parameter.name: p[self.full(parameter.name)] for parameter in self.parameters}}
+
+    @property
+    def is_sensor(self) -> bool:
+        """Whether it changes what is seen and nothing else."""
+        return bool(self.outputs) and not (self.rates or self.shifts or self.frees)
+
+
+def extend(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
+    """The simulator with terms added, their parameters free behind its own; a new object.
+
+    Raises:
+        DomainError: If a term names an equation, output or parameter that the simulator does not have.
+    """
+    if isinstance(simulator, Trajectories):
+        return Trajectories(
+            _extend_ode(simulator.ode, terms), simulator.recording, subdivide=simulator.subdivide
+        )
+    if not terms:
+        return simulator
+    if isinstance(simulator, ODESimulator):
+        return _extend_ode(simulator, terms)
+    return _extend_static(simulator, terms)
+
+
+def _parameters(simulator: Simulator, terms: Sequence[Term]) -> tuple[Parameter, ...]:
+    freed = {name for term in terms for name in term.frees}
+    names = [parameter.name for parameter in simulator.parameters]
+    for term in terms:
+        for name in (*term.frees, *term.shifts):
+            if name not in names:
+                raise DomainError(f"Expected the term {term.name!r} to name a parameter of {names}. Got {name!r}.")
+    found = [
+        dataclasses.replace(parameter, neutral=None, initial=parameter.initial or parameter.neutral)
+        if parameter.name in freed
+        else parameter
+        for parameter in simulator.parameters
+    ]
+    for term in terms:
+        for parameter in term.parameters:
+            found.append(dataclasses.replace(parameter, name=term.full(parameter.name), neutral=None))
+    return tuple(found)
+
+
+def _extend_ode(simulator: ODESimulator, terms: Sequence[Term]) -> ODESimulator:
+    if not terms:
+        return simulator
+    states = dict(simulator.states)
+    initial = dict(simulator.initial)
+    for term in terms:
+        for state, unit in term.states.items():
+            if state in states:
+                raise DomainError(f"Expected a new name for the hidden state of {term.name!r}. Got {state!r}.")
+            states[state] = unit
+            initial[state] = _initial_of(term, term.initial[state])
+    for term in terms:
+        for place in term.rates:
+            if place not in states:
+                raise DomainError(
+                    f"Expected the term {term.name!r} in an equation of {list(states)}. Got {place!r}."
+                )
+        for place in term.outputs:
+            if place not in simulator.observe:
+                raise DomainError(
+                    f"Expected the term {term.name!r} on an output of {list(simulator.observe)}. Got {place!r}."
+                )
+    shifting = [term for term in terms if term.shifts]
+
+    def shifted(t: Any, s: dict[str, Tensor], p: dict[str, Tensor], u: dict[str, Tensor]) -> dict[str, Tensor]:
+        if not shifting:
+            return p
+        moved = dict(p)
+        for term in shifting:
+            own = term.own(p)
+            for name, function in term.shifts.items():
+                moved[name] = moved[name] + function(t, s, own, u)
+        return moved
+
+    def rates(t: Any, s: dict[str, Tensor], p: dict[str, Tensor], u: dict[str, Tensor]) -> dict[str, Any]:
+        found = dict(simulator.rates(t, s, shifted(t, s, p, u), u))
+        for term in terms:
+            own = term.own(p)
+            for state, function in term.rates.items():
+                value = function(t, s, own, u)
+                found[state] = value if state in term.states else found[state] + value
+        return found
+
+    observe: dict[str, Function] = {}
+    for name, function in simulator.observe.items():
+        observe[name] = _sensed(name, function, [term for term in terms if name in term.outputs], shifted)
+    return ODESimulator(
+        rates,
+        states,
+        _parameters(simulator, terms),
+        observe=observe,
+        initial=initial,
+        max_step=simulator.max_step,
+    )
+
+
+def _initial_of(term: Term, value: Any) -> Any:
+    if not callable(value):
+        return value
+    return lambda s, p: value(s, term.own(p))
+
+
+def _sensed(name: str, function: Function, sensors: Sequence[Term], shifted: Function) -> Function:
+    def observe(t: Any, s: dict[str, Tensor], p: dict[str, Tensor], u: dict[str, Tensor]) -> Any:
+        y = function(t, s, shifted(t, s, p, u), u)
+        for term in sensors:
+            y = term.outputs[name](t, s, term.own(p), u, y)
+        return y
+
+    return observe
+
+
+def _extend_static(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
+    for term in terms:
+        if term.rates or term.states:
+            raise DomainError(
+                f"Expected a term without rates for a static simulator. Got {term.name!r} (give shifts=, outputs= or "
+                "frees=, or write the model as an ODESimulator)."
+            )
+    parameters = _parameters(simulator, terms)
+    if not any(term.shifts or term.outputs for term in terms):
+        freed = copy.copy(simulator)
+        freed.parameters = parameters
+        return freed
+    plain = simulator.names
+
+    def function(x: Any, p: dict[str, Tensor]) -> Any:
+        moved = {name: p[name] for name in plain}
+        for term in terms:
+            own = term.own(p)
+            for name, shift in term.shifts.items():
+                moved[name] = moved[name] + shift(x, own)
+        result = simulator.function(x, moved)
+        if not any(term.outputs for term in terms):
+            return result
+        found = dict(result) if isinstance(result, Mapping) else {"y": result}
+        for term in terms:
+            for name, sensor in term.outputs.items():
+                place = name if name in found else "y" if not isinstance(result, Mapping) else name
+                if place not in found:
+                    raise DomainError(
+                        f"Expected the term {term.name!r} on an output of {list(found)}. Got {name!r}."
+                    )
+                found[place] = sensor(x, term.own(p), found[place])
+        return found if isinstance(result, Mapping) else found["y"]
+
+    return Simulator(function, parameters)
+
+
+def neutral_of(parameter: Parameter) -> float | None:
+    """The neutral value of a term's parameter: as given, else 0 where its bounds allow, else none."""
+    if parameter.neutral is not None:
+        return parameter.neutral
+    return 0.0 if parameter.transform != "log" and parameter.contains(0.0) else None
+
+
+def expand_like(value: Any, like: Tensor) -> Tensor:
+    """A number or tensor in the shape of another tensor."""
+    return torch.as_tensor(value, dtype=like.dtype).expand(like.shape)
