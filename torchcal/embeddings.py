@@ -10,6 +10,7 @@ its mean (the leading coefficient) first.
 Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 6-10.
 """
 
+import dataclasses
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -130,8 +131,8 @@ class Embedding:
     """Base class of the embeddings: the parameters that carry model error, and an expansion order.
 
     Args:
-        parameters: Names of the uncertain parameters; None for all free ones. The other free parameters are
-            inferred as plain unknowns.
+        parameters: Names of the uncertain parameters; None for all free ones (in time: but initial states, and
+            parameters that each run has one of). The other free parameters are inferred as plain unknowns.
     """
 
     parameters: Sequence[str] | None = None
@@ -139,6 +140,22 @@ class Embedding:
     order = 1
     germ = "hermite"
     triangular = True
+
+    def sparing(self, names: Sequence[str], nuisance: Sequence[str]) -> "Embedding":
+        """The same embedding; where it names no parameters, of ``names`` without those of ``nuisance``.
+
+        Raises:
+            EmbeddingError: If nothing would be left to embed.
+        """
+        if self.parameters is not None or self.order == 0 or not any(name in nuisance for name in names):
+            return self
+        left = tuple(name for name in names if name not in nuisance)
+        if not left:
+            raise EmbeddingError(
+                f"Expected a free parameter besides initial states and those of single runs to embed. Got {list(names)} "
+                "alone. Name those that are to carry model error: parameters=(...)."
+            )
+        return dataclasses.replace(self, parameters=left)
 
     def bind(self, names: Sequence[str]) -> Pattern:
         """Lay α out for the free parameters ``names``.

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.problem import Problem
@@ -80,16 +79,7 @@ def responses(problem: Problem, found: Fitted, forcing: Tensor) -> tuple[Tensor,
         states = bound.solve(values)
     flow = bound.flow(values, states)[0]  # (R, K, S, S)
     size = flow.shape[-1]
-    seen = states[:, bound._run_of, bound._node_of]
-    with torch.no_grad(), forward_ad.dual_level():
-        tangent = torch.zeros(size, *seen.shape, dtype=torch.float64)
-        for i in range(size):
-            tangent[i, ..., i] = 1.0
-        dual = forward_ad.make_dual(seen.expand(size, -1, -1, -1).contiguous(), tangent)
-        plain = values.expand(size, -1, -1)
-        out = forward_ad.unpack_dual(bound._measure(plain, dual, problem.recording.outputs)).tangent
-    rows = torch.zeros(size, len(problem.recording.y), dtype=torch.float64) if out is None else out[:, 0]
-    rows = rows.T[problem.index]  # (n, S)
+    rows = bound.observation_slopes(values, states, problem.recording.outputs)[problem.index]  # (n, S)
     run_of, node_of = bound._run_of[problem.condition_of], bound._node_of[problem.condition_of]
     bins, count = _binning(bound)
     result = torch.zeros(problem.n, count, forcing.shape[-1], dtype=torch.float64)

@@ -363,6 +363,7 @@ def _result(
         library=[term.name for term in terms],
         settings={"seed": seed, "withdrawn": decision.withdrawn, "solver": _solver(search.problem.simulator)},
         seconds=time.perf_counter() - begun,
+        drivers=search._drivers(),
     )
 
 

@@ -61,6 +61,7 @@ class Diagnosis:
         library: Names of all candidates.
         settings: Numbers that the diagnosis was run with.
         seconds: How long it took.
+        drivers: Conditions, or time, states and inputs of the calibrated base, at every condition of the recording.
     """
 
     verdict: str
@@ -90,6 +91,7 @@ class Diagnosis:
     library: list[str]
     settings: Mapping[str, Any]
     seconds: float
+    drivers: Mapping[str, Tensor]
 
     def __str__(self) -> str:
         return words.paragraph(self)

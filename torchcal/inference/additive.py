@@ -45,7 +45,7 @@ def calibrate_additive(
     with more data, however wrong the model is.
 
     Args:
-        simulator: The model.
+        simulator: The model, as for `torchcal.calibrate`.
         recording: The data. A known noise sd s adds s² to σ².
         fixed: Parameters to hold.
         num_samples: Posterior draws a chain; 0 for the MAP alone.
@@ -67,7 +67,7 @@ def calibrate_additive(
     """
     plan = Plan(num_samples, num_chains, num_warmup, sampler, seed, dtype, target_accept, progress)
     check_run(num_starts, device)
-    free, _ = check_inputs(simulator, recording, fixed)
+    simulator, free = check_inputs(simulator, recording, fixed)
     observed = recording.observed
     count = int(observed.sum())
     if count <= len(free):
@@ -77,6 +77,7 @@ def calibrate_additive(
             "hold parameters fixed, or use torchcal.calibrate."
         )
     fit = least_squares(simulator, recording, fixed, seed=seed)
+    simulator = fit.simulator
     if fit.relative < 1e-7 and recording.noise_sd is None:
         raise ImproperPosteriorError(
             f"Expected residuals for the additive likelihood. Got a fit that is exact to {fit.relative:.1e} of the "

@@ -1,6 +1,8 @@
 """The maximum a posteriori from many starts, its curvature, and directions that the data do not see."""
 
+import dataclasses
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -10,7 +12,10 @@ from tqdm.auto import tqdm
 from torchcal.errors import ConvergenceError, ConvergenceWarning, IdentifiabilityWarning, ShapeError
 from torchcal.inference.newton import Minima, hessian, minimise
 from torchcal.inference.randomness import preserve_random_state
+from torchcal.inference.tangent import minimise_by_tangents
 from torchcal.models import Problem
+from torchcal.propagation import NISP
+from torchcal.simulators import Trajectories
 
 __all__ = ["Estimate", "Laplace", "check_starts", "laplace", "maximise"]
 
@@ -20,6 +25,10 @@ behind the Hessian are good to about 1e-9 of its largest entry."""
 
 AGREEMENT = 1e-6
 """Relative difference of objectives up to which two starts count as the same maximum."""
+
+TOLERANCE_IN_TIME = 1e-5
+"""Change of the moments of trajectories, relative to the output's scale, with which enough nodes are found. Long
+oscillations take many nodes for less, and the default tolerance ε is a hundred times as large."""
 
 SAME_MEANS = 1e-3
 """Difference of scaled means up to which two starts ended at one maximum."""
@@ -91,16 +100,19 @@ def maximise(
     if starts is None:
         starts = _starting_points(problem, leading.to(like), num_starts, seed)
 
-    def objective(u: Tensor) -> Tensor:
-        return -problem.log_prob(transform.bound(u))
-
+    in_time = isinstance(problem.propagate.simulator, Trajectories)
     bar = tqdm(desc="maximum", unit="step", disable=not progress, leave=False)
 
     def show(_iteration: int, values: Tensor) -> None:
         bar.update(1)
         bar.set_postfix(objective=f"{float(values.min()):.6g}")
 
-    found = minimise(objective, transform.unbound(starts), progress=show)
+    def search(points: Tensor) -> Minima:
+        if in_time:
+            return minimise_by_tangents(_objective(problem), problem.propagate, points, progress=show)
+        return minimise(lambda u: -problem.log_prob(transform.bound(u)), points, progress=show)
+
+    found = search(transform.unbound(starts))
     if not bool(torch.isfinite(found.values[0])):
         raise ConvergenceError(
             f"Expected a finite posterior at some starting point. Got none at {len(starts)}. Check the "
@@ -111,9 +123,9 @@ def maximise(
     if problem.propagate.pattern.num_germs:
         for _ in range(4):  # a maximum found with too few nodes may move with more of them
             best = transform.bound(found.points[:1])[..., : problem.propagate.num_alpha]
-            if not problem.propagate.refine(best):
+            if not problem.propagate.refine(best, tolerance=TOLERANCE_IN_TIME if in_time else 1e-7):
                 break
-            found = minimise(objective, found.points[: max(4, total // 4)], progress=show)
+            found = search(found.points[: 2 if in_time else max(4, total // 4)])
     bar.close()
     best, ties = _first_of_the_tied(problem, found)
     if agreeing < 2 <= total:
@@ -149,6 +161,16 @@ def maximise(
         unseen=unseen,
         improper=_unheld(problem, unseen),
     )
+
+
+def _objective(problem: Problem) -> Callable[[NISP, Tensor], Tensor]:
+    """The negative log-posterior in unbounded coordinates, for any propagation in place of the problem's."""
+
+    def objective(propagate: NISP, u: Tensor) -> Tensor:
+        other = dataclasses.replace(problem, propagate=propagate)
+        return -other.log_prob(problem.prior.transform.bound(u))
+
+    return objective
 
 
 def _unseen_means(problem: Problem, alpha: Tensor, curvature: Tensor) -> tuple[str, ...]:

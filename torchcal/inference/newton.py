@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["Minima", "gradient", "hessian", "minimise"]
+__all__ = ["Minima", "directions", "gradient", "hessian", "join", "minimise"]
 
 Objective = Callable[[Tensor], Tensor]
 
@@ -16,6 +16,15 @@ Hessian is good to 1e-7 of its largest entry, and Newton steps need no more."""
 
 _SAME = 1e-8
 """Relative difference of two objectives below which two starts are taken to be in one basin."""
+
+_LADDER = [0.0, 1e-12, 1e-10, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 1e3]
+"""Dampings, relative to the largest curvature."""
+
+_LENGTHS = [2.0, 4.0, 0.5, 0.25]
+"""Of undamped steps."""
+
+_ALONG = [1e-3, 1e-2, 1e-1, 0.5]
+"""Steps along the most negative curvature, either way."""
 
 
 @dataclass(frozen=True)
@@ -85,15 +94,6 @@ def minimise(
     stalls = torch.zeros(len(points), dtype=torch.long, device=points.device)
     active = torch.isfinite(values)
     leader = torch.arange(len(points), device=points.device)
-    ladder = torch.tensor(
-        [0.0, 1e-12, 1e-10, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 1e3],
-        dtype=points.dtype,
-        device=points.device,
-    )
-    lengths = torch.tensor([1.0] * len(ladder) + [2.0, 4.0, 0.5, 0.25], dtype=points.dtype, device=points.device)
-    ladder = torch.cat([ladder, ladder.new_zeros(4)])
-    along = torch.tensor([1e-3, 1e-2, 1e-1, 0.5], dtype=points.dtype, device=points.device)
-    along = torch.cat([along, -along])
     iteration = 0
     for iteration in range(1, max_iterations + 1):
         rows = active.nonzero()[:, 0]
@@ -101,13 +101,7 @@ def minimise(
             break
         here = points[rows]
         _, slope = gradient(objective, here)
-        curvature, vectors = torch.linalg.eigh(torch.nan_to_num(hessian(objective, here)))
-        top = curvature.abs().amax(-1).clamp_min(1e-300)[:, None, None]
-        weight = curvature.abs()[:, None, :] + ladder[:, None] * top + 1e-15 * top
-        rotated = torch.einsum("bij,bi->bj", vectors, slope)
-        steps = -torch.einsum("bij,bcj->bci", vectors, rotated[:, None] / weight) * lengths[:, None]
-        down = torch.where(curvature[:, :1] < 0, 1.0, 0.0)[..., None] * vectors[:, :, 0][:, None]
-        tries = here[:, None] + torch.cat([steps, along[:, None] * down], dim=1)
+        tries = here[:, None] + directions(slope, hessian(objective, here))
         with torch.no_grad():
             found = torch.nan_to_num(objective(tries.reshape(-1, size)), nan=torch.inf, posinf=torch.inf)
         found = found.reshape(tries.shape[:2])
@@ -120,7 +114,7 @@ def minimise(
         stalls[rows] = torch.where(small, stalls[rows] + 1, 0)
         active[rows] = (stalls[rows] < 3) & (better | (stalls[rows] < 1))
         if iteration % 4 == 0:
-            _join(values, active, leader)
+            join(values, active, leader)
         if progress is not None:
             progress(iteration, values)
     for _ in range(len(points)):  # a leader may itself have joined another
@@ -130,7 +124,23 @@ def minimise(
     return Minima(points[order], values[order], iteration)
 
 
-def _join(values: Tensor, active: Tensor, leader: Tensor) -> None:
+def directions(slope: Tensor, curvature: Tensor) -> Tensor:
+    """Steps to try, ``(B, 26, P)``, for gradients ``(B, P)`` and Hessians ``(B, P, P)``; see `minimise`."""
+    ladder = slope.new_tensor(_LADDER)
+    lengths = slope.new_tensor([1.0] * len(_LADDER) + _LENGTHS)
+    ladder = torch.cat([ladder, ladder.new_zeros(len(_LENGTHS))])
+    along = slope.new_tensor(_ALONG)
+    along = torch.cat([along, -along])
+    values, vectors = torch.linalg.eigh(torch.nan_to_num(curvature))
+    top = values.abs().amax(-1).clamp_min(1e-300)[:, None, None]
+    weight = values.abs()[:, None, :] + ladder[:, None] * top + 1e-15 * top
+    rotated = torch.einsum("bij,bi->bj", vectors, slope)
+    steps = -torch.einsum("bij,bcj->bci", vectors, rotated[:, None] / weight) * lengths[:, None]
+    down = torch.where(values[:, :1] < 0, 1.0, 0.0)[..., None] * vectors[:, :, 0][:, None]
+    return torch.cat([steps, along[:, None] * down], dim=1)
+
+
+def join(values: Tensor, active: Tensor, leader: Tensor) -> None:
     """Starts whose objectives agree run towards one minimum: let one of them finish for all."""
     rows = active.nonzero()[:, 0]
     rows = rows[values[rows].argsort()]

@@ -4,15 +4,17 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from torchcal import likelihoods
 from torchcal.data import Recording
 from torchcal.embeddings import Embedding
 from torchcal.errors import DomainError, EmbeddingError, ImproperPosteriorError, RecordingError, SimulatorError
+from torchcal.inference.fitting import allowed_solver_error
 from torchcal.models import Problem
 from torchcal.priors import CoefficientPrior
 from torchcal.propagation import NISP
-from torchcal.simulators import Parameter, Scaling, Simulator, free_parameters
+from torchcal.simulators import Parameter, Scaling, Simulator, Trajectories, free_parameters
 
 __all__ = ["PriorMaker", "check_inputs", "check_run", "embedded_problem"]
 
@@ -21,8 +23,13 @@ PriorMaker = Callable[[NISP], CoefficientPrior]
 
 def check_inputs(
     simulator: Simulator, recording: Recording, fixed: Mapping[str, float] | None
-) -> tuple[tuple[Parameter, ...], dict[str, float]]:
-    """Raise for what cannot be calibrated, before any long work; return free and held parameters."""
+) -> tuple[Simulator, tuple[Parameter, ...]]:
+    """Raise for what cannot be calibrated, before any long work.
+
+    Returns:
+        The simulator, in time bound to the recording and with time steps that work at the first guess; and its free
+        parameters.
+    """
     if not isinstance(simulator, Simulator):
         raise DomainError(
             f"Expected a torchcal.Simulator. Got {type(simulator).__name__}. Wrap the function: "
@@ -33,6 +40,7 @@ def check_inputs(
             f"Expected a torchcal.Recording. Got {type(recording).__name__}. Wrap the data: "
             "torchcal.Recording(x=x, y=y)."
         )
+    simulator = simulator.bind(recording)
     free, held = free_parameters(simulator.parameters, fixed)
     scaling = Scaling.from_parameters(free)
     generator = torch.Generator().manual_seed(0)
@@ -45,13 +53,42 @@ def check_inputs(
     columns = {parameter.name: physical[:, i] for i, parameter in enumerate(free)}
     columns |= {name: torch.full((32,), value, dtype=torch.float64) for name, value in held.items()}
     values = torch.stack([columns[name] for name in simulator.names], dim=-1)
-    count = simulator.check(recording.x, values, recording.outputs)
+    if isinstance(simulator, Trajectories):
+        guess = values[0].clone()
+        for parameter in free:
+            if parameter.initial is not None:
+                guess[simulator.names.index(parameter.name)] = parameter.initial
+        simulator = _begin(simulator, guess[None], 100 * allowed_solver_error(recording))
+    try:
+        count = simulator.check(recording.x, values, recording.outputs)
+    except SimulatorError as error:
+        if recording.runs is None or isinstance(simulator, Trajectories):
+            raise
+        raise SimulatorError(
+            f"{error} The recording is one in time and the simulator static: it is called with x['time'] and "
+            "x['run']. Use torchcal.ODESimulator for a model of rates."
+        ) from error
     if count != len(recording.y):
         raise SimulatorError(
             f"Expected {len(recording.y)} output values, as in the recording ({recording.n} conditions × "
             f"{len(recording.outputs)} outputs). Got {count} from the simulator."
         )
-    return free, held
+    return simulator, free
+
+
+def _begin(simulator: Trajectories, guess: Tensor, allowed: Tensor) -> Trajectories:
+    """Steps with which the solution at the first guess is finite and roughly right, if any are."""
+    if simulator.ode.max_step is not None:
+        return simulator
+    finer = simulator
+    while not bool(torch.isfinite(finer.outputs_of(guess, finer.solve(guess))).all()):
+        if finer.subdivide >= 64 * simulator.subdivide:
+            return simulator
+        finer = finer.refined(4)
+    try:
+        return finer.settled(guess, allowed)
+    except SimulatorError:  # the estimate may lie elsewhere; there it must settle
+        return finer
 
 
 def check_run(num_starts: int, device: torch.device | str | None) -> None:
@@ -102,7 +139,8 @@ def embedded_problem(
         scaling=scaling,
         order=order,
         rule=rule,
-        trial_spread=0.2,  # enough to start with: the rule is refined at the maximum
+        # Enough to start with: the rule is refined at the maximum.
+        trial_spread=0.02 if isinstance(simulator, Trajectories) else 0.2,
     )
     germs = propagate.pattern.num_germs
     if germs == 0 and likelihood.needs != "mean":

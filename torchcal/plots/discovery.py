@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from torchcal.data import Recording
@@ -354,8 +355,6 @@ def driver_values(recording: Recording, driver: str, fitted: Any = None) -> Tens
         return recording.split(recording.y if fitted is None else getattr(fitted, "prediction", fitted))[driver]
     runs = getattr(recording, "runs", None)
     if runs and all(driver in run.inputs for run in runs):
-        import torch
-
         return torch.cat([run.inputs[driver] for run in runs])
     return None
 

@@ -31,6 +31,12 @@ GAP = 1e-9
 QUADRATIC = 1e-5
 #: Newton passes before the trajectory is solved step by step instead.
 MAX_PASSES = 8
+#: Points whose derivatives are computed at once: about what a processor's cache holds.
+POINTS = 2**15
+#: Numbers of trajectories kept at once, 64 MiB.
+NUMBERS = 2**23
+#: How often steps are halved at most.
+HALVINGS = 7
 
 
 class Trajectories(Simulator):
@@ -120,6 +126,11 @@ class Trajectories(Simulator):
             else:
                 self._columns[parameter.name] = [first]
                 parameters.append(parameter)
+        # Which parameter, and which run's, each column is; initial states act on no rate.
+        self._owner: dict[int, tuple[str, int | None]] = {
+            place: (name, None if len(places) == 1 else r)
+            for name, places in self._columns.items() for r, place in enumerate(places)
+        }  # fmt: skip
         self._initial: list[dict[str, Any]] = []
         self.initial_names: list[str] = []
         for r, run in enumerate(self.runs):
@@ -138,6 +149,13 @@ class Trajectories(Simulator):
                     parameters.append(Parameter(name, unit=unit, initial=self._first_guess(state, r)))
             self._initial.append(known)
         self.parameters = tuple(parameters)
+
+    @property
+    def nuisance(self) -> tuple[str, ...]:
+        """What each run has for itself: unknown initial states and per-run parameters; not embedded by default."""
+        own = {name for name, run in self._owner.values() if run is not None}
+        columns = [i for name in own for i in self._columns[name]]
+        return (*(self.names[i] for i in sorted(columns)), *self.initial_names)
 
     def _first_guess(self, state: str, r: int) -> float | None:
         """The first recorded value of a state that is itself an output."""
@@ -159,6 +177,74 @@ class Trajectories(Simulator):
         """The same with shorter steps."""
         return Trajectories(self.ode, self.recording, subdivide=self.subdivide * factor)
 
+    def settled(self, values: Tensor, allowed: Tensor) -> "Trajectories":
+        """These trajectories, with steps so short that halving them changes no output by more than ``allowed``.
+
+        A solution that is infinite with both steps counts as settled. Where the simulator has a ``max_step``, the
+        steps stay as they are.
+
+        Args:
+            values: Parameter values to look at, ``(H, d)``, physical units.
+            allowed: Largest change of each output, ``(n_total,)``.
+
+        Raises:
+            SimulatorError: If it still changes after `HALVINGS` halvings.
+        """
+        if self.ode.max_step is not None:
+            return self
+        here = self
+        y = here.outputs_of(values, here.solve(values))
+        for _ in range(HALVINGS):
+            finer = here.refined(2)
+            z = finer.outputs_of(values, finer.solve(values))
+            change = torch.where(torch.isfinite(y) | torch.isfinite(z), (z - y).abs(), torch.zeros_like(y))
+            if bool((change <= allowed).all()):
+                return here
+            here, y = finer, z
+        share = float((change / allowed).nan_to_num(nan=math.inf).max())
+        raise SimulatorError(
+            f"Expected the solution to settle when time steps are halved. Got a change {share:.2g} times as large as "
+            f"allowed after {HALVINGS} times (a stiff or discontinuous model: smooth it, rescale it, replace a fast "
+            "state by its equilibrium, or give max_step=)."
+        )
+
+    def check(self, x: Conditions, values: Tensor, outputs: Sequence[str] | None = None) -> int:
+        """As for any simulator; rates must also be written elementwise, and with torch operations alone.
+
+        Raises:
+            SimulatorError: As `Simulator.check`; if the rates at many times at once differ from those at one time
+                after another, or if the outputs change with a parameter by which they have no derivative.
+        """
+        total = super().check(x, values, outputs)
+        wanted = tuple(outputs) if outputs is not None else self.recording.outputs
+        good = torch.isfinite(self.outputs_of(values, self.solve(values), wanted)).all(-1)
+        point = values[good.nonzero()[:1, 0]].detach()
+        states = self.solve(point)
+        with torch.no_grad():
+            ends = self._step_derivatives(point, states, ())[0]
+        size = states.abs().amax(dim=(0, 1, 2)).clamp_min(1e-300)
+        gap = float(((ends - states[:, :, 1:]).abs() / size).max())
+        if not gap <= 1e-9:
+            raise SimulatorError(
+                f"Expected the same rates at many times at once as at one time. Got a difference of {gap:.3g}. Write "
+                "the rates elementwise: s[name] has shape (*batch, R), p[name] (*batch, 1), u[name] (R,), t is a "
+                "scalar or (R,); leave sums over them, random numbers and branches on t out of it."
+            )
+        found = self.linearise(x, point, wanted)
+        step = 1e-6 * point.abs().clamp_min(1e-3)
+        with torch.no_grad():
+            moved = torch.cat([point + torch.diag_embed(step[0]), point - torch.diag_embed(step[0])])
+            up, down = self.outputs_of(moved, self.solve(moved), wanted).chunk(2)
+        change = (up - down).abs().amax(-1)
+        dead = (found.jacobian[0] == 0).all(0) & (change > 1e-8 * found.y.abs().max()) & torch.isfinite(change)
+        if bool(dead.any()):
+            name = self.names[int(dead.nonzero()[0])]
+            raise SimulatorError(
+                f"Expected outputs that depend on {name!r} through torch operations. Got outputs that change with it "
+                "and have no derivative. Avoid .item(), .detach() and numpy in the rates."
+            )
+        return total
+
     # --- evaluation --------------------------------------------------------------------------------------
 
     def at(self, x: Conditions, outputs: Sequence[str] | None = None) -> Callable[[Tensor], Tensor]:
@@ -166,18 +252,22 @@ class Trajectories(Simulator):
         self._check_conditions(x)
         wanted = tuple(outputs) if outputs is not None else self.recording.outputs
 
+        size = max(1, NUMBERS // self.node_times.numel() // len(self._states))
+
         def evaluate(values: Tensor) -> Tensor:
             batch = values.shape[:-1]
-            flat = values.reshape(-1, values.shape[-1])
-            plain = flat.detach().to(device="cpu", dtype=torch.float64)
-            if torch.is_grad_enabled() and values.requires_grad:
-                found = self.linearise(x, plain, wanted)
-                result: Tensor = _WithJacobian.apply(flat, found.y.to(flat), found.jacobian.to(flat))
-            else:
-                result = self.outputs_of(plain, self.solve(plain), wanted).to(flat)
-            return result.reshape(*batch, result.shape[-1])
+            flat = values.reshape(-1, values.shape[-1]).to(device="cpu", dtype=torch.float64)
+            result = torch.cat([self._differentiable(piece, wanted) for piece in flat.split(size)])
+            return result.to(values).reshape(*batch, result.shape[-1])
 
         return evaluate
+
+    def _differentiable(self, values: Tensor, outputs: Sequence[str]) -> Tensor:
+        if not (torch.is_grad_enabled() and values.requires_grad):
+            return self.outputs_of(values, self.solve(values), outputs)
+        found = self.linearise(self.x, values, outputs)
+        result: Tensor = _WithJacobian.apply(values, found.y, found.jacobian)
+        return result
 
     def _check_conditions(self, x: Conditions) -> None:
         same = isinstance(x, Mapping) and "time" in x and "run" in x and len(x["time"]) == len(self._data_t)
@@ -199,11 +289,14 @@ class Trajectories(Simulator):
         wanted = tuple(outputs) if outputs is not None else self.recording.outputs
         values = values.detach()
         columns = list(range(values.shape[-1])) if columns is None else list(columns)
+        found = []
         with torch.no_grad():
             states = self._solve(values, warm)
-            tangents = self._sensitivities(values, states, columns) if columns else None
-            y, jacobian = self._observe(values, states, wanted, columns, tangents)
-        return Linearisation(y, jacobian, states)
+            size = max(1, POINTS // self.node_times.numel())
+            for v, s in zip(values.split(size), states.split(size), strict=True):
+                tangents = self._sensitivities(v, s, columns) if columns else None
+                found.append(self._observe(v, s, wanted, columns, tangents))
+        return Linearisation(torch.cat([y for y, _ in found]), torch.cat([j for _, j in found]), states)
 
     def solve(self, values: Tensor, warm: Any = None) -> Tensor:
         """States at the ends of all steps, ``(H, R, K + 1, states)``; infinite where the solution blows up."""
@@ -342,52 +435,56 @@ class Trajectories(Simulator):
         """
         hyper, runs, _, size = states.shape
         steps = self.num_steps
-        begin = states[:, :, :-1].reshape(hyper, runs * steps, size)
-        directions = size + len(columns)
         run_of = torch.arange(runs).repeat_interleave(steps)
         t, h = self._t.reshape(-1), self._h.reshape(-1)
         u = {name: table.reshape(3, -1) for name, table in self._u.items()}
-        s_tangent = begin.new_zeros(directions, *begin.shape)
-        for i in range(size):
-            s_tangent[i, ..., i] = 1.0
-        v_tangent = values.new_zeros(directions, *values.shape)
-        for j, column in enumerate(columns):
-            v_tangent[size + j, :, column] = 1.0
-        spread = values.expand(directions, -1, -1).contiguous()
-        ends, tangent = self._step_forward(begin, s_tangent, spread, v_tangent, t, h, run_of, u)
-        tangent = tangent.reshape(directions, hyper, runs, steps, size).permute(1, 2, 3, 4, 0)
-        return ends.reshape(hyper, runs, steps, size), tangent[..., :size], tangent[..., size:]
+        with torch.enable_grad():
+            begin = states[:, :, :-1].reshape(hyper, runs * steps, size).detach().requires_grad_(True)
+            leaves = self._leaves(values, run_of, columns)
+            ends = self._step(begin, t, h, leaves, u)
+            flow, forcing = self._backward(ends, begin, leaves, run_of, columns)
+        shape = (hyper, runs, steps, size)
+        return ends.detach().reshape(shape), flow.reshape(*shape, size), forcing.reshape(*shape, len(columns))
 
-    def _step_forward(
-        self,
-        s: Tensor,
-        ds: Tensor,
-        values: Tensor,
-        d_values: Tensor,
-        t: Tensor,
-        h: Tensor,
-        run_of: Tensor,
-        u: dict[str, Tensor],
+    def _leaves(self, values: Tensor, run_of: Tensor, columns: Sequence[int]) -> dict[str, Tensor]:
+        """Parameters spread over points ``(H, M)``; those that are derived by are leaves of a graph."""
+        wanted = set(columns)
+        found = {}
+        for name, places in self._columns.items():
+            block = values[..., places]
+            spread = block.expand(-1, len(run_of)) if len(places) == 1 else block[..., run_of]
+            found[name] = spread.clone().requires_grad_(True) if wanted & set(places) else block if len(places) == 1 else spread
+        return found
+
+    def _backward(
+        self, result: Tensor, begin: Tensor, leaves: dict[str, Tensor], run_of: Tensor, columns: Sequence[int]
     ) -> tuple[Tensor, Tensor]:
-        """`_step` and its tangents. Only the rates go through automatic differentiation.
+        """Derivatives of pointwise results ``(H, M, O)`` by states ``(H, M, O, S)`` and columns ``(H, M, O, C)``.
 
-        What has no tangent gets one of zeros: PyTorch's implicit zeros cost many times the operation itself.
+        Every point depends on its own state and parameters alone, so that one backward pass for each component of the
+        result gives the derivatives at all points.
         """
-        half, full = (0.5 * h)[:, None], h[:, None]
-        total, d_total, k, dk = torch.zeros_like(s), torch.zeros_like(ds), s, ds
-        for stage, (share, weight) in enumerate(((None, 1.0), (half, 2.0), (half, 2.0), (full, 1.0))):
-            at, d_at = (s, ds) if share is None else (s + share * k, ds + share * dk)
-            when = t if share is None else t + share[:, 0]
-            inputs = {name: table[(stage + 1) // 2] for name, table in u.items()}
-            with forward_ad.dual_level():
-                v = forward_ad.make_dual(values, d_values)
-                dual = forward_ad.make_dual(at.expand(d_at.shape).contiguous(), d_at)
-                known = {name: forward_ad.make_dual(x.contiguous(), torch.zeros_like(x)) for name, x in inputs.items()}
-                out = forward_ad.unpack_dual(self._slope(when, dual, self._p(v, run_of), known))
-                k = out.primal[0]
-                dk = torch.zeros_like(out.primal) if out.tangent is None else out.tangent
-            total, d_total = total + weight * k, d_total + weight * dk
-        return s + full / 6.0 * total, ds + full / 6.0 * d_total
+        names = [name for name, leaf in leaves.items() if leaf.requires_grad]
+        inputs = [begin, *(leaves[name] for name in names)]
+        by_state, by_column = [], []
+        for k in range(result.shape[-1]):
+            part = result[..., k]
+            grads: Sequence[Tensor | None] = [None] * len(inputs)
+            if part.requires_grad:
+                keep = k + 1 < result.shape[-1]
+                grads = torch.autograd.grad(part.sum(), inputs, retain_graph=keep, allow_unused=True)
+            by_state.append(torch.zeros_like(begin) if grads[0] is None else grads[0])
+            own = dict(zip(names, grads[1:], strict=True))
+            rows = []
+            for column in columns:
+                name, run = self._owner.get(column, ("", None))
+                grad = own.get(name)
+                if grad is None:
+                    rows.append(torch.zeros_like(part))
+                else:
+                    rows.append(grad if run is None else grad * (run_of == run))
+            by_column.append(torch.stack(rows, dim=-1) if rows else part.new_zeros(*part.shape, 0))
+        return torch.stack(by_state, dim=-2), torch.stack(by_column, dim=-2)
 
     def _sensitivities(self, values: Tensor, states: Tensor, columns: Sequence[int]) -> Tensor:
         """∂ states / ∂ parameters at the ends of all steps, ``(H, R, K + 1, S, len(columns))``."""
@@ -421,23 +518,30 @@ class Trajectories(Simulator):
         """Outputs ``(H, n_total)`` and their derivatives ``(H, n_total, len(columns))``."""
         seen = states[:, self._run_of, self._node_of]  # (H, n, S)
         if tangents is None:
-            found = self._measure(values, seen, outputs)
+            found = self._measure(self._p(values, self._run_of), seen, outputs)
             return found, found.new_zeros(*found.shape, 0)
-        moved = tangents[:, self._run_of, self._node_of].permute(3, 0, 1, 2)
-        v_tangent = values.new_zeros(len(columns), *values.shape)
-        for j, column in enumerate(columns):
-            v_tangent[j, :, column] = 1.0
-        with forward_ad.dual_level():
-            s = forward_ad.make_dual(seen.expand(len(columns), -1, -1, -1).contiguous(), moved.contiguous())
-            v = forward_ad.make_dual(values.expand(len(columns), -1, -1).contiguous(), v_tangent)
-            out = forward_ad.unpack_dual(self._measure(v, s, outputs))
-            y = out.primal[0]
-            tangent = out.tangent if out.tangent is not None else torch.zeros_like(out.primal)
-        return y, tangent.permute(1, 2, 0)
+        moved = tangents[:, self._run_of, self._node_of]  # (H, n, S, C)
+        with torch.enable_grad():
+            begin = seen.detach().requires_grad_(True)
+            leaves = self._leaves(values, self._run_of, columns)
+            y = self._measure(leaves, begin, outputs)  # (H, outputs * n)
+            parts = torch.stack(y.split(seen.shape[1], dim=-1), dim=-1)
+            by_state, by_column = self._backward(parts, begin, leaves, self._run_of, columns)
+        jacobian = by_state @ moved + by_column  # (H, n, outputs, C)
+        return y.detach(), jacobian.transpose(1, 2).flatten(1, 2)
 
-    def _measure(self, values: Tensor, seen: Tensor, outputs: Sequence[str]) -> Tensor:
+    def observation_slopes(self, values: Tensor, states: Tensor, outputs: Sequence[str]) -> Tensor:
+        """∂ output / ∂ state at every datum, ``(n_total, S)``; one row of values."""
+        seen = states[:, self._run_of, self._node_of]
+        with torch.enable_grad():
+            begin = seen.detach().requires_grad_(True)
+            y = self._measure(self._p(values, self._run_of), begin, outputs)
+            parts = torch.stack(y.split(seen.shape[1], dim=-1), dim=-1)
+            by_state, _ = self._backward(parts, begin, {}, self._run_of, ())
+        return by_state[0].transpose(0, 1).flatten(0, 1)
+
+    def _measure(self, p: dict[str, Tensor], seen: Tensor, outputs: Sequence[str]) -> Tensor:
         s = {name: seen[..., i] for i, name in enumerate(self._states)}
-        p = self._p(values, self._run_of)
         parts = []
         for name in outputs:
             try:

@@ -132,7 +132,7 @@ def _warburg(v: str, label: str | None, time: str) -> Term:
     return Term(
         name, rates=rates, states=dict.fromkeys(hidden, "V"), initial=dict.fromkeys(hidden, v),
         parameters=[amplitude("k", f"1/{time}", low=0.0), shape("tau", time)], scales={"tau": "t"},
-        formula=f"d{v}/dt ∋ -k Σ wj ({v} - zj), dzj/dt = ({v} - zj)/(nj tau), zj(0) = {v}(0), nj = 1, 8, 64: ∝ k/√t",
+        formula=f"d{v}/dt ∋ -k Σ wj ({v} - zj), dzj/dt = ({v} - zj)/(nj tau), zj(0) = {v}(0), nj = 1, 8, 64",
         description="Diffusion of ions or carriers, whose current after a step falls as one over the root of time.",
     )  # fmt: skip
 

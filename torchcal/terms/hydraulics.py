@@ -100,7 +100,7 @@ def _second(h: str, label: str | None, units: Units) -> Term:
 
 
 def _inflow(inflow: str, h: str, downstream: str | None, label: str | None, units: Units) -> list[Term]:
-    unit = f"{units(-1, 1)}/[{inflow}]"
+    unit = f"{units.length}/({units.time} [{inflow}])"
     lag = titled("pump lag", label)
     hidden = f"{lag}: {inflow}"
     rates: dict[str, Callable[..., Any]] = {h: lambda t, s, p, u: -p["b"] * u[inflow]}

@@ -77,10 +77,10 @@ def kinetics(
     terms = [
         _onward("reverse reaction", a, b, amplitude("k", f"1/{time}", low=0.0), lambda s, made: -made,
                 f"-k {b}" if b else "-k P", "The product turns back into the reactant.", amount, label),
-        _onward("autocatalysis", a, b, amplitude("k", f"1/({amount} {time})", low=0.0), lambda s, made: s[a] * made,
+        _onward("autocatalysis", a, b, amplitude("k", f"1/({time} {amount})", low=0.0), lambda s, made: s[a] * made,
                 f"k {a} {b}" if b else f"k {a} P", "The product catalyses its own formation.", amount, label),
         Term(titled("second-order decay", label), equation=a, rate=lambda t, s, p, u: -p["k"] * s[a].square(),
-             parameters=[amplitude("k", f"1/({amount} {time})", low=0.0)], formula=f"d{a}/dt ∋ -k {a}²",
+             parameters=[amplitude("k", f"1/({time} {amount})", low=0.0)], formula=f"d{a}/dt ∋ -k {a}²",
              description="Two molecules of the reactant react with each other and are lost."),
         Term(titled("second branch", label), equation=a, rate=lambda t, s, p, u: -p["k"] * s[a],
              parameters=[amplitude("k", f"1/{time}", low=0.0)], formula=f"d{a}/dt ∋ -k {a}",

@@ -166,7 +166,7 @@ def _viscoelastic(v: str, label: str | None, units: Units) -> Term:
 def _actuator(force: str, v: str, label: str | None, units: Units) -> list[Term]:
     lag = titled("actuator lag", label)
     hidden = f"{lag}: {force}"
-    unit = f"{units(-1, 2)}/[{force}]"
+    unit = f"{units.length}/({units.time}^2 [{force}])"
     return [
         Term(titled("actuator gain error", label), equation=v, rate=lambda t, s, p, u: p["g"] * u[force],
              parameters=[amplitude("g", unit)], formula=f"d{v}/dt ∋ g {force}",
@@ -183,6 +183,7 @@ def _actuator(force: str, v: str, label: str | None, units: Units) -> list[Term]
 
 def _in_space(x: tuple[str, ...], v: tuple[str, ...], units: Units, label: str | None) -> list[Term]:
     """The terms of a body in a plane or in space."""
+
     def add(name: str, factor: Callable[..., Any], along: tuple[str, ...], parameters: list[Parameter], formula: str,
             description: str, scales: Mapping[str, str] | None = None) -> Term:  # fmt: skip
         def part(component: str) -> Callable[..., Any]:

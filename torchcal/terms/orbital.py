@@ -95,9 +95,7 @@ def orbital(
         r = tuple(s[name] for name in x)
         return r, magnitude(*r)
 
-    def add(
-        name: str, field: Field, parameters: list[Parameter], formula: str, description: str, **more: Any
-    ) -> Term:
+    def add(name: str, field: Field, parameters: list[Parameter], formula: str, description: str, **more: Any) -> Term:
         return Term(
             titled(name, label), rates={**_components(v, field), **more.pop("rates", {})}, parameters=parameters,
             formula=f"dv/dt ∋ {formula}", description=description, **more,

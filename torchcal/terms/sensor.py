@@ -32,8 +32,12 @@ def sensor(
     r"""Errors of the instrument behind every output: offset, gain, non-linearity, saturation, drift, lag and delay.
 
     A lag is an instrument of first order, :math:`y + a (z - y)` with :math:`\dot z = (y - z) \ln 10 / t_{90}`: a = 1 in
-    nature, and t90 is the time to 90 % of a step. A delay by D is the Padé approximant of second order of
-    :math:`e^{-D s}`, exact to a few per cent for changes slower than D; a = 1 in nature.
+    nature, and t90 is the time to 90 % of a step. A delay by D (a = 1 in nature) is the Padé approximant
+
+    .. math:: e^{-D s} \approx \frac{1 - D s/3}{1 + 2 D s/3 + (D s)^2/6},
+
+    within 3 % for signals of angular frequencies up to 1.2/D. Its poles, of magnitude 2.45/D, allow longer time steps
+    than those of the all-pass of the same order, 3.46/D.
 
     Args:
         outputs: Names of the outputs. Lag and delay follow the state of the same name; for an output that is a
@@ -154,8 +158,8 @@ def _dynamic(output: str, unit: str, time: str, signal: Signal) -> list[Term]:
     smooth = f"{delay}: smooth"
 
     def bend(t: Any, s: Any, p: Any, u: Any) -> Any:
-        wanted = signal(t, s, p, u) - s[smooth] - 0.5 * p["D"] * s[slope]
-        return 12.0 * wanted / p["D"].square()
+        wanted = signal(t, s, p, u) - s[smooth] - p["D"] * s[slope] / 1.5
+        return 6.0 * wanted / p["D"].square()
 
     return [
         Term(lag,
@@ -168,7 +172,7 @@ def _dynamic(output: str, unit: str, time: str, signal: Signal) -> list[Term]:
         Term(delay,
              rates={smooth: lambda t, s, p, u: s[slope], slope: bend},
              states={smooth: unit, slope: f"{unit}/{time}"}, initial={smooth: first, slope: 0.0},
-             outputs={output: lambda t, s, p, u, y: y - p["a"] * p["D"] * s[slope]},
+             outputs={output: lambda t, s, p, u, y: y + p["a"] * (s[smooth] - p["D"] * s[slope] / 3.0 - y)},
              parameters=[amplitude("a", "1", low=0.0, high=1.5), shape("D", time)], scales={"D": "t"},
              formula=f"{output}(t) → {output}(t) + a ({output}(t - D) - {output}(t)), exp(-Ds) by its Padé approximant",
              description="The signal arrives after a dead time D; a = 1 in nature."),
