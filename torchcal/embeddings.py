@@ -152,8 +152,8 @@ class Embedding:
         left = tuple(name for name in names if name not in nuisance)
         if not left:
             raise EmbeddingError(
-                f"Expected a free parameter besides initial states and those of single runs to embed. Got {list(names)} "
-                "alone. Name those that are to carry model error: parameters=(...)."
+                "Expected a free parameter besides initial states and those of single runs to embed. Got "
+                f"{list(names)} alone. Name those that are to carry model error: parameters=(...)."
             )
         return dataclasses.replace(self, parameters=left)
 

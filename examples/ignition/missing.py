@@ -80,13 +80,10 @@ CANDIDATES = (
         description="A constant error of the initial temperature.",
     ),
     tc.Term(
-        "low-temperature branch",
-        shifts={"lnA": lambda x, p: torch.log1p(p["share"] * torch.exp(p["slope"] * (1150.0 / x["T0"] - 1.0)))},
-        parameters=[
-            tc.Parameter("share", low=0.0, high=10.0),
-            tc.Parameter("slope", low=2.0, high=30.0),
-        ],
-        formula="A (1 + share exp(slope (1150 K/T0 - 1)))",
-        description="A second path with a lower activation energy, which takes over in the cold.",
+        "pressure error",
+        shifts={"lnA": lambda x, p: p["log_ratio"] * torch.ones_like(x["T0"])},
+        parameters=[tc.Parameter("log_ratio", low=-0.5, high=0.5)],
+        formula="rate ∝ (1 + error)",
+        description="A constant error of the pressure, which the calibrated A takes up: no data can show it.",
     ),
 )

@@ -4,10 +4,11 @@ A car that brakes with a constant deceleration a from the speed v stops after
 
 .. math:: d = \frac{v^2}{2 a}.
 
-A driver needs a reaction time t_r first, which adds v t_r: this is certain. The 50 stopping distances scatter by 4.5 m,
-though, and the calibrated deceleration has taken most of the reaction into itself: 2.14 m/s², where 3.6 m/s² belongs to
-a reaction time of 0.84 ± 0.38 s. Two standard deviations; BIC prefers the reaction by an odds of 1.6 to 1. So the honest
-answer is not a name: ``consistent`` with the smallest reaction time that these data could have shown, or ``ambiguous``.
+A driver needs a reaction time t_r first, which adds v t_r: this is certain. The 50 stopping distances scatter by
+4.5 m, though, and the calibrated deceleration has taken most of the reaction into itself: 2.14 m/s², where 3.6 m/s²
+belongs to a reaction time of 0.84 ± 0.38 s. Two standard deviations; BIC prefers the reaction at odds of 1.6 to 1. So
+the honest answer is not a name: ``consistent``, with the smallest reaction time that these data could have shown, or
+``ambiguous``.
 
 Recording: typed in (see `data.cars` for the source), in m and m/s. The noise is not known.
 

@@ -46,14 +46,14 @@ def recording() -> tc.Recording:
 
 def einstein(u: Tensor) -> Tensor:
     """Heat capacity of Einstein's solid, in units of 3 k per atom, of u = θ_E/T."""
+    # u² e^u / (e^u - 1)², written so that nothing overflows or cancels.
     return (u / (2 * torch.sinh(u / 2))) ** 2
 
 
 def debye(u: Tensor) -> Tensor:
     """Heat capacity of Debye's solid, in units of 3 k per atom, of u = θ_D/T."""
     z = u.unsqueeze(-1) * (0.5 * (NODES.to(u) + 1))
-    # (z / (2 sinh(z/2)))² is z² e^z / (e^z - 1)², written so that nothing overflows or cancels.
-    return 1.5 / u**2 * ((z * (z / (2 * torch.sinh(z / 2))) ** 2 * z) * WEIGHTS.to(u)).sum(-1)
+    return 1.5 / u**2 * (z**2 * einstein(z) * WEIGHTS.to(u)).sum(-1)
 
 
 def simulator(spectrum: str = "einstein") -> tc.Simulator:

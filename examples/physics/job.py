@@ -47,9 +47,7 @@ def run(
         kept = {} if holdout is None else {"holdout": holdout()}
     except tc.errors.MissingDependencyError as error:
         sys.exit(str(error))
-    diagnosis = tc.diagnose(
-        simulator(), data, candidates(), seed=options.seed, progress=not options.quiet, **kept
-    )
+    diagnosis = tc.diagnose(simulator(), data, candidates(), seed=options.seed, progress=not options.quiet, **kept)
     options.out.mkdir(parents=True, exist_ok=True)
     sys.stdout.write(f"{diagnosis}\n\n{diagnosis.ranking}\n\n")
     with warnings.catch_warnings():

@@ -10,15 +10,16 @@ with a coefficient γ = 1 that is calibrated here. The recording is where Mercur
 which was fitted to radar and spacecraft. Calibration hides the effect: position and velocity at the start and the mass
 of the Sun are free. Calibrated to 20 years, Newton misses the next 20 by 817 km; with relativity it is 5 km, at
 γ = 1.0004. (The Sun's oblateness, which turns the perihelion too, makes most of the difference to 1.) Already over
-2 + 2 years, the small version, it is 83 km and 0.05 km.
+2 + 2 years, the small version, it is 83 km and 0.04 km.
 
-Hall's law of gravitation of 1894, a force with r^-(2+δ), turned the perihelion just as well with δ = 1.6e-7, and was
-dropped because of the Moon. Over 4 years it leaves 0.40 km where relativity leaves 0.004, because DE421 has no noise;
-it is a candidate on request. An oblate Sun leaves 2.9 km and needs 30 times the oblateness that the Sun has.
+Others turn the perihelion too. Hall's law of gravitation of 1894, a force with r^-(2+δ), does so with δ = 1.58e-7 (Hall
+found 1.6e-7; the Moon ruled it out). It leaves 0.40 km over 4 years where relativity leaves 0.003, because DE421 has no
+noise; to first order the two are the same, so that the screening may list one as an alias of the other. An oblate Sun
+leaves 2.9 km in the fitted half and 10 km later, and would need a J2 of 3.3e-4, 1700 times the real one.
 
 States are the deviations from a fixed ellipse, in km (Encke's method): the ellipse itself is known exactly, and what is
-left is a ten-thousandth of the orbit, so that steps of half a day do. Coordinates are DE421's, equatorial. Planets are
-where the ephemeris has them, as inputs.
+left is a ten-thousandth of the orbit, so that steps of a quarter of a day do. The axes are those of the Sun's equator.
+Planets are where the ephemeris has them, as inputs.
 
 Recording: DE421 by the packages ``de421`` and ``jplephem`` (see `data.ephemeris`).
 
@@ -92,9 +93,10 @@ class Ellipse:
             anomaly = anomaly - (anomaly - self.e * anomaly.sin() - mean) / (1 - self.e * anomaly.cos())
         cos, sin, flat = anomaly.cos(), anomaly.sin(), (1 - self.e**2) ** 0.5
         rate = self.motion / (1 - self.e * cos)
-        along = [self.a * (float(p) * (cos - self.e) + flat * float(q) * sin) for p, q in zip(self.p, self.q, strict=True)]
-        speed = [self.a * rate * (flat * float(q) * cos - float(p) * sin) for p, q in zip(self.p, self.q, strict=True)]
-        return along, speed
+        axes = [(float(p), float(q)) for p, q in zip(self.p, self.q, strict=True)]
+        place = [self.a * (p * (cos - self.e) + flat * q * sin) for p, q in axes]
+        speed = [self.a * rate * (flat * q * cos - p * sin) for p, q in axes]
+        return place, speed
 
 
 @cache
@@ -111,9 +113,8 @@ def _orbit(years: float) -> tuple[data.Ephemeris, Ellipse]:
     step = np.array([10.0, 10.0, 10.0, 1.0, 1.0, 1.0])
     for _ in range(6):
         columns = [((path(start + h) - path(start - h)) / 2).ravel() for h in np.diag(step)]
-        start = start + step * np.linalg.lstsq(
-            np.stack(columns, 1), (found.mercury - path(start)).ravel(), rcond=None
-        )[0]
+        gap = (found.mercury - path(start)).ravel()
+        start = start + step * np.linalg.lstsq(np.stack(columns, 1), gap, rcond=None)[0]
     return found, Ellipse.through(start, found.sun)
 
 
@@ -122,9 +123,7 @@ def recording(years: float = YEARS) -> tc.Recording:
     found, ellipse = _orbit(years)
     position = torch.stack(ellipse.at(torch.from_numpy(found.time))[0]).numpy()
     inputs = {
-        f"{name} {axis}": row
-        for name, place in found.planets.items()
-        for axis, row in zip(AXES, place, strict=True)
+        f"{name} {axis}": row for name, place in found.planets.items() for axis, row in zip(AXES, place, strict=True)
     }
     run = tc.Run(
         time=found.time,
@@ -152,14 +151,14 @@ def simulator(years: float = YEARS) -> tc.ODESimulator:
         place = [s[axis] + path for axis, path in zip(AXES, kepler, strict=True)]
         others = [torch.stack([u[f"{name} {axis}"] for name in planets], dim=-1) for axis in AXES]
         apart = [there - here.unsqueeze(-1) for there, here in zip(others, place, strict=True)]
-        pull, drag_along = mass / _length(apart) ** 3, mass / _length(others) ** 3
+        pull, carried = mass / _length(apart) ** 3, mass / _length(others) ** 3
         sun, ideal = mu * p["sun"] / _length(place) ** 3, mu / _length(kepler) ** 3
-        found = {axis: s[f"v{axis}"] for axis in AXES}
+        change = {axis: s[f"v{axis}"] for axis in AXES}
         for i, axis in enumerate(AXES):
             # The planets pull at the Sun as well, which carries the origin along.
-            planetary = (pull * apart[i] - drag_along * others[i]).sum(-1)
-            found[f"v{axis}"] = ideal * kepler[i] - sun * place[i] + planetary
-        return found
+            planetary = (pull * apart[i] - carried * others[i]).sum(-1)
+            change[f"v{axis}"] = ideal * kepler[i] - sun * place[i] + planetary
+        return change
 
     return tc.ODESimulator(
         rates,

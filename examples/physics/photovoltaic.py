@@ -10,10 +10,11 @@ ideality n of 2.26, where a junction has between 1 and 2, and errs by 13 mA. The
 The shunt alone wants a negative conductance (12 mA): it is hidden until the resistance is there. Both together leave
 0.77 mA, at R_s = 0.0365 Ω and 1/G_sh = 53 Ω, as published.
 
-Two kinds of shunt cannot be told apart here: an ohmic one leaves 0.773 mA and a leakage limited by its own space charge,
--g V_j |V_j|, 0.769 mA. The textbook has the ohmic one, and so have the candidates; with the other among them as well
-the honest verdict is ``ambiguous``. A photocurrent that falls with the voltage (I_ph + m V) is not among the candidates: with R_s in the model it is the
-shunt in other words, m = -G_sh up to a factor 1 - R_s G_sh, and no measurement of I against V can tell them apart.
+Two kinds of shunt cannot be told apart here: an ohmic one leaves 0.773 mA, and a leakage limited by its own space
+charge, -g V_j |V_j|, 0.769 mA. The textbook has the ohmic one, and so have the candidates; with the other among them
+as well the honest verdict is ``ambiguous``. A photocurrent that falls with the voltage (I_ph + m V) is no candidate:
+with R_s in the model it is the shunt in other words, m = -G_sh up to a factor 1 + R_s G_sh, and no measurement of I
+against V can tell them apart.
 
 Recording: the cell of R.T.C. France, 26 points, typed in (see `data.photovoltaic` for the source). The implicit
 equation is solved for V_j by Newton's method from above, where it converges without overshooting.

@@ -8,7 +8,7 @@ with c the concentration of the substrate. Real enzymes may cooperate (Hill expo
 substrate, or let some react without them, and a counter has a background. None of it shows here: the twelve rates are
 six pairs at equal concentration, whose differences give a noise sd of 10.8 counts/min² without any model, and the
 fitted curve leaves 10.9. The background is the closest: 32 ± 13 counts/min², one in thirty by chance for a single
-look, and five candidates are five looks. The verdict must be ``consistent``.
+look, and every candidate is a look. The verdict must be ``consistent``.
 
 Recording: typed in (see `data.puromycin` for the source). The noise is not known, but there are replicates.
 

@@ -21,8 +21,10 @@ BENT = 3.0
 
 
 def estimates(found: Fitted, places: Sequence[int]) -> tuple[Estimate, ...]:
-    """Estimates of some parameters."""
+    """Estimates of some parameters. Without noise the misfit takes its place."""
     sd = found.sd()
+    if isinstance(found.problem.recording.noise, str):
+        sd = sd * misfit_size(found)
     bound = {i for i, at in zip(found.free, found.at_bound.tolist(), strict=True) if at}
     result = []
     for i in places:
@@ -33,6 +35,11 @@ def estimates(found: Fitted, places: Sequence[int]) -> tuple[Estimate, ...]:
             spread = math.inf
         result.append(Estimate(q.name, value, spread, q.unit, i in bound))
     return tuple(result)
+
+
+def misfit_size(found: Fitted) -> float:
+    """Root of χ² per degree of freedom."""
+    return math.sqrt(found.chi2 / max(found.problem.n - len(found.free), 1))
 
 
 def fit_record(found: Fitted, structure: Structure | None, terms: tuple[str, ...]) -> Fit:

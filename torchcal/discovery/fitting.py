@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.problem import Problem, Whitening
+from torchcal.simulators import Trajectories
 
 __all__ = ["Fitted", "fit", "starts"]
 
@@ -31,6 +32,8 @@ class Fitted:
         at_bound: Which of the free ones lie on a bound that they want to cross, bool ``(free,)``.
         warm: Warm start.
         agreeing: Share of the starts that came to this χ².
+        ends: Where every start ended, ``(H, P)``.
+        ends_chi2: With which χ², ``(H,)``.
     """
 
     problem: Problem
@@ -43,6 +46,8 @@ class Fitted:
     at_bound: Tensor
     warm: Any
     agreeing: float = 1.0
+    ends: Tensor | None = None
+    ends_chi2: Tensor | None = None
 
     @property
     def residual(self) -> Tensor:
@@ -96,6 +101,52 @@ def starts(problem: Problem, count: int, seed: int, fixed: dict[int, float] | No
     return torch.stack(columns, dim=-1)
 
 
+def follow_slopes(problem: Problem, begin: Tensor) -> Tensor:
+    """Unknown initial states moved so that observed states begin with the slope that was recorded.
+
+    An unobserved velocity, say, is then the recorded position's slope, whatever the other parameters are.
+    """
+    bound = problem.simulator
+    if not isinstance(bound, Trajectories) or not bound.initial_names:
+        return begin
+    names = list(bound.ode.states)
+    targets: list[tuple[int, int, float, float]] = []
+    for r, run in enumerate(bound.runs):
+        for name, y in run.outputs.items():
+            if name not in names or name not in problem.recording.outputs:
+                continue
+            seen = (~torch.isnan(y)).nonzero()[:12, 0]
+            if len(seen) < 4:
+                continue
+            t = run.time[seen] - run.time[seen[0]]
+            design = torch.stack([torch.ones_like(t), t, t.square()], dim=-1)
+            slope = float(torch.linalg.lstsq(design, y[seen][:, None]).solution[1, 0])
+            scale = float((y[seen] - y[seen].mean()).abs().max() / t[-1].clamp_min(1e-300))
+            targets.append((r, names.index(name), slope, max(scale, 1e-12)))
+    if not targets:
+        return begin
+    places = [i for i, q in enumerate(problem.parameters) if q.name in bound.initial_names and q.initial is None]
+    if not places:
+        return begin
+    values = begin.clone()
+    for _ in range(3):
+        with torch.enable_grad():
+            leaf = values[:, places].clone().requires_grad_(True)
+            full = values.clone()
+            full[:, places] = leaf
+            rates = bound.slopes(full, bound._start(full))
+            left = torch.stack([(rates[:, r, i] - slope) / scale for r, i, slope, scale in targets], dim=-1)
+            rows = [torch.autograd.grad(left[:, k].sum(), leaf, retain_graph=True, allow_unused=True)[0]
+                    if left.requires_grad else None for k in range(left.shape[1])]  # fmt: skip
+        jacobian = torch.stack([torch.zeros_like(leaf) if row is None else row for row in rows], dim=-2)
+        change = torch.linalg.pinv(jacobian, rtol=1e-6) @ left.detach().unsqueeze(-1)
+        moved = values[:, places] - change[..., 0]
+        good = torch.isfinite(moved).all(-1)
+        values[good] = values[good].index_copy(1, torch.tensor(places), moved[good])
+    low, high = problem.limits()
+    return values.clamp(low, high)
+
+
 def fit(
     problem: Problem,
     whitening: Whitening,
@@ -117,8 +168,8 @@ def fit(
     values = begin.clone()
     values[:, free] = values[:, free].clamp(low, high)
 
-    def evaluate(points: Tensor, warm: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, Any]:
-        y, jacobian, warm = problem.evaluate(points, free, warm)
+    def evaluate(points: Tensor, warm: Any, march: bool = True) -> tuple[Tensor, Tensor, Tensor, Tensor, Any]:
+        y, jacobian, warm = problem.evaluate(points, free, warm, march=march)
         residual = target - whitening.vector(y)
         chi2 = residual.square().sum(-1)
         bad = ~torch.isfinite(chi2) | ~torch.isfinite(jacobian).flatten(1).all(-1)
@@ -134,6 +185,7 @@ def fit(
     damping = torch.full_like(chi2, 1e-3)
     size = torch.zeros(len(values), len(free), dtype=torch.float64)
     done = torch.zeros(len(values), dtype=torch.bool)
+    lost = torch.zeros(len(values), dtype=torch.long)
     for _ in range(max_steps):
         if not free:
             break
@@ -156,7 +208,9 @@ def fit(
         trial[:, free] = torch.where(done[:, None], now, moved)
         step = torch.where(log, (trial[:, free] / now).log(), trial[:, free] - now)
         predicted = 2 * (step * gradient).sum(-1) - (step.unsqueeze(1) @ normal @ step.unsqueeze(-1))[:, 0, 0]
-        y_new, jacobian_new, residual_new, chi2_new, warm_new = evaluate(trial, warm)
+        # A step from which the trajectory cannot be mended at once is too long; only if that goes on is it marched.
+        y_new, jacobian_new, residual_new, chi2_new, warm_new = evaluate(trial, warm, bool((lost >= 3).any()))
+        lost = torch.where(torch.isfinite(chi2_new) | (lost >= 3), torch.zeros_like(lost), lost + 1)
         gain = (chi2 - chi2_new) / predicted.clamp_min(1e-300)
         better = (chi2_new < chi2) & ~done
         small = predicted <= TOLERANCE * (chi2 + 1e-3 * problem.n)
@@ -190,6 +244,8 @@ def fit(
         chi2=float(chi2[best]),
         at_bound=at_bound,
         warm=warm[best : best + 1] if isinstance(warm, Tensor) else None,
+        ends=values,
+        ends_chi2=chi2,
         agreeing=float((chi2 <= chi2[best] * (1 + 1e-3) + 0.1).double().mean()),
     )
 

@@ -25,6 +25,8 @@ SMOOTH_SHARE = 1.0 / 3.0
 SPIKE = 4.5
 #: Weight against correlation: log prior density of φ is −SHRINK·φ.
 SHRINK = 2.0
+#: Quantile of its posterior at which a clear correlation is taken.
+CAUTION = 0.8
 #: How much larger the noise found may be than the noise given before the given one is doubted.
 EXCESS = 1.5
 
@@ -128,7 +130,7 @@ def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor |
     sd = known.clone()
     freedom, doubted = math.inf, 1.0
     for output in range(outputs):
-        parts = [places for places in problem.sequences if int(problem.output_of[places[0]]) == output]
+        parts = [places for places in problem.recorded if int(problem.output_of[places[0]]) == output]
         n = sum(len(places) for places in parts)
         if n == 0:
             continue
@@ -145,7 +147,7 @@ def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor |
                 f"Expected enough data to tell noise from misfit. Got {n} of output {recording.outputs[output]!r}. "
                 "Give noise= its standard deviation."
             )
-        correlated = problem.order is not None and problem.in_time and n >= 40
+        correlated = n >= 40 and (replicated is None)
         logs, sizes = [], []
         for rho in GRID if correlated else GRID[:1]:
             square, log_det, count = 0.0, 0.0, 0
@@ -163,6 +165,9 @@ def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor |
         weight = (likelihood - likelihood.max()).exp()
         posterior[output, : len(weight)] = weight / weight.sum()
         best = int(likelihood.argmax())
+        tail = posterior[output].cumsum(0)
+        if float(tail[1]) < 0.05:  # clearly correlated: too little of it would pass noise off as physics
+            best = int((tail < CAUTION).sum())
         correlation[output] = GRID[best]
         scale = math.sqrt(sizes[best])
         mask = torch.arange(len(recording.y)) // recording.n == output
@@ -229,26 +234,43 @@ def _quantisation(problem: Problem) -> dict[str, float]:
 def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
     """Used data that stick out alone from their neighbours, bool ``(n,)``.
 
-    The second difference of the residual has no smooth part left; its centre is the spike.
+    Along one order the second difference of the residual has no smooth part left, and its centre is the spike. Among
+    several conditions the residual of a robust smooth fit takes its place.
     """
     found = torch.zeros(problem.n, dtype=torch.bool)
-    if problem.order is None:
-        return found
     for places in problem.sequences:
         if len(places) < 10:
             continue
         r = residual[places]
         if sd is not None:
             r = r / sd[problem.index[places]]
-        padded = torch.cat([r[1:2], r, r[-2:-1]])
-        bend = r - 0.5 * (padded[:-2] + padded[2:])
-        robust = 1.4826 * float(bend.abs().median())
+        if problem.order is None:
+            left = _robust_left(smooth_columns(problem, places), r)
+            size = max(1.4826 * float(left.abs().median()), 0.0 if sd is None else 1.0)
+            found[places] = left.abs() > SPIKE * size if size > 0 else False
+            continue
+        bend = torch.cat([r.new_zeros(1), r[1:-1] - 0.5 * (r[:-2] + r[2:]), r.new_zeros(1)])
+        robust = 1.4826 * float(bend[1:-1].abs().median())
         if sd is not None:
             robust = max(robust, math.sqrt(1.5))
         if robust <= 0:
             continue
-        high = bend.abs() / robust
-        # The neighbours of a spike bend the other way by half as much.
-        around = torch.cat([high[1:2], high, high[-2:-1]])
-        found[places] = (high > SPIKE) & (high >= around[:-2]) & (high >= around[2:])
+        # The neighbours of a spike bend the other way by half as much; those of a curve bend the same way.
+        around = torch.stack([bend.roll(1), bend.roll(-1)]) / torch.where(bend == 0, torch.ones_like(bend), bend)
+        around[0, 1] = around[1, -2] = -0.5
+        alone = (around < -0.2).all(0) & (around > -1.0).all(0)
+        found[places] = (bend.abs() > SPIKE * robust) & alone
     return found
+
+
+def _robust_left(columns: Tensor, values: Tensor) -> Tensor:
+    """What a smooth fit with Tukey's biweight leaves."""
+    columns = columns[:, : max(1, len(values) // 8)]
+    weight = torch.ones_like(values)
+    left = values - values.median()
+    for _ in range(10):
+        size = max(1.4826 * float(left.abs().median()), 1e-300)
+        weight = (1 - (left / (4.685 * size)).square()).clamp_min(0)
+        solution = torch.linalg.lstsq(columns * weight[:, None], (values * weight)[:, None], driver="gelsd").solution
+        left = values - (columns @ solution)[:, 0]
+    return left

@@ -136,15 +136,20 @@ class Problem:
                     found.append(places)
         return found
 
+    @cached_property
+    def recorded(self) -> list[Tensor]:
+        """The same in the order in which they were recorded, in which noise is correlated."""
+        return [places.sort().values for places in self.sequences] if not self.in_time else self.sequences
+
     def whitening(self, sd: Tensor, correlation: Tensor) -> Whitening:
         """Of noise with sd ``(n_total,)`` and an AR(1) coefficient for each output, ``(outputs,)``."""
         rho = torch.zeros(self.n, dtype=torch.float64)
         before = torch.arange(self.n)
-        if bool((correlation != 0).any()) and self.order is not None:
-            for places in self.sequences:
+        if bool((correlation != 0).any()):
+            for places in self.recorded:
                 if len(places) < 2:
                     continue
-                at = self.order[self.condition_of[places]]
+                at = self.order[self.condition_of[places]] if self.in_time else places.double()  # type: ignore[index]
                 gaps = at.diff()
                 usual = gaps.median().clamp_min(1e-300)
                 phi = float(correlation[int(self.output_of[places[0]])])
@@ -165,10 +170,12 @@ class Problem:
         high = [math.inf if q.high is None else q.high for q in self.parameters]
         return torch.tensor(low, dtype=torch.float64), torch.tensor(high, dtype=torch.float64)
 
-    def evaluate(self, values: Tensor, columns: list[int], warm: Any = None) -> tuple[Tensor, Tensor, Any]:
+    def evaluate(
+        self, values: Tensor, columns: list[int], warm: Any = None, *, march: bool = True
+    ) -> tuple[Tensor, Tensor, Any]:
         """Outputs at the used data ``(H, n)``, their derivatives ``(H, n, columns)``, and a warm start."""
         found = self.simulator.linearise(
-            self.recording.x, values, self.recording.outputs, columns, warm
+            self.recording.x, values, self.recording.outputs, columns, warm, march=march
         )
         if found.y.shape[-1] != len(self.recording.y):
             raise SimulatorError(

@@ -177,8 +177,6 @@ def windows(
             running = torch.cat([response.new_zeros(len(response), 1), response[:, order].cumsum(1)], dim=1)
             cuts = torch.linspace(0, len(order), 13).round().long().unique()
             edges = [(int(a), int(b)) for x, a in enumerate(cuts) for b in cuts[x + 1 :] if (int(a), int(b)) != (0, len(order))]
-            if name != "t":
-                edges = [(a, b) for a, b in edges if a == 0 or b == len(order)]
             columns = torch.stack([running[:, b] - running[:, a] for a, b in edges], dim=-1)
             norm = columns.norm(dim=0)
             keep = norm > max(VANISHED * total, 1e-300)

@@ -4,13 +4,12 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchcal.discovery.candidates import Candidate, base_columns, drivers_scale, prepare
-from torchcal.discovery.fitting import Fitted, fit, refit, starts
+from torchcal.discovery.fitting import Fitted, fit, follow_slopes, refit, starts
 from torchcal.discovery.local import localised, region_text
 from torchcal.discovery.noise import Noise, estimate, spikes
 from torchcal.discovery.problem import Problem
@@ -27,7 +26,9 @@ PRIOR = {"base": 0.30, "single": 0.40, "local": 0.10, "several": 0.08, "none": 0
 #: Prior odds against an estimate on a physical bound that it wants to cross.
 UNPHYSICAL = math.log(1e-3)
 #: Refits at most: single terms, windows, pairs.
-MOST = {"single": 40, "local": 5, "pairs": 16}
+MOST = {"single": 40, "local": 5, "pairs": 12}
+#: Correlation of projected tangents above which two candidates are one.
+SAME = 0.9999
 #: The solver's error against the noise.
 SOLVER_SHARE = 0.05
 
@@ -90,6 +91,8 @@ class Search:
     local: list[Window] = field(init=False, default_factory=list)
     models: list[Model] = field(init=False, default_factory=list)
     aliases: dict[int, list[str]] = field(init=False, default_factory=dict)
+    twins: dict[int, int] = field(init=False, default_factory=dict)
+    gone: set[int] = field(init=False, default_factory=set)
     p_detect: float = field(init=False, default=1.0)
     outliers: int = 0
 
@@ -110,7 +113,7 @@ class Search:
         begin = starts(self.problem, self.num_starts, self.seed, held)
         for i, value in held.items():
             begin[:, i] = value
-        found = fit(self.problem, self.problem.whitening(rough, outputs), begin, free)
+        found = self._from_starts(begin, free, rough, outputs)
         if found is None:
             raise ConvergenceError(
                 "Expected finite outputs of the base at one of the starting values at least. Got none in "
@@ -135,6 +138,27 @@ class Search:
             self.base = refit(self.base, self.noise.whitening(self.base.problem))
             self.base = self._sharpen(self.base)
             self.problem = self.base.problem
+
+    def _from_starts(self, begin: Tensor, free: list[int], rough: Tensor, outputs: Tensor) -> Fitted | None:
+        """The best fit from many starts: over the first part of the runs, then over all, as phases tell one from another."""
+        problem = self.problem
+        if not problem.in_time:
+            return fit(problem, problem.whitening(rough, outputs), begin, free)
+        guided = follow_slopes(problem, begin)
+        begin = torch.cat([guided, begin[: max(2, len(begin) // 4)]])
+        keep = torch.zeros(problem.recording.n, dtype=torch.bool)
+        run = problem.recording.x["run"]  # type: ignore[index]
+        for r in run.unique():
+            mine = (run == r).nonzero()[:, 0]
+            keep[mine[: max(8, len(mine) // 4)]] = True
+        early = problem.keeping(keep.repeat(len(problem.recording.outputs)))
+        ends = begin
+        if early.n >= 3 * len(free):
+            first = fit(early, early.whitening(rough, outputs), begin, free, max_steps=15)
+            if first is not None and first.ends is not None and first.ends_chi2 is not None:
+                order = first.ends_chi2.argsort()
+                ends = torch.cat([first.ends[order[: max(4, len(order) // 2)]], guided[:4]])
+        return fit(problem, problem.whitening(rough, outputs), ends, free)
 
     def _again(self, found: Fitted, keep: Tensor) -> Fitted:
         problem = dataclasses.replace(found.problem, keep=keep)
@@ -179,8 +203,8 @@ class Search:
         for term in self.terms:
             self.tick(f"screen {term.name}")
             self.candidates.append(prepare(self.base.problem, self.base, [term], self.fixed, scale))
-        self._merge()
         self.screening = screen(self.residual, self.candidates)
+        self._alike()
         self.structure = analyse(self.residual, every=True)
         self.local, local_null = windows(self.residual, self.candidates, self.screening)
         nulls = [self.screening.null, self.structure.null_best, local_null]
@@ -192,27 +216,38 @@ class Search:
         ]
         self.p_detect = _joint(nulls, seen)
 
-    def _merge(self) -> None:
-        """Candidates with the same projected tangent become one, under the first name."""
-        first = screen(self.residual, self.candidates)
-        kept: list[int] = []
+    def _alike(self) -> None:
+        """Which candidates have the same projected tangent as an earlier one."""
+        self.twins = {}
+        single = [c for c in range(len(self.candidates))
+                  if len(self.candidates[c].shapes) == 1 and len(self.candidates[c].amplitudes) == 1]  # fmt: skip
+        for i in single:
+            for k in single:
+                if k < i and k not in self.twins and abs(self.screening.correlation(i, k)) > SAME:
+                    self.twins[i] = k
+                    break
+
+    def merge(self) -> None:
+        """Candidates with the same projected tangent whose refits cannot be told apart become one, under the first name."""
+        plain = {m.numbers[0]: m for m in self.models if len(m.numbers) == 1 and m.window is None}
         self.aliases = {}
-        names: dict[int, list[str]] = {}
-        for i, candidate in enumerate(self.candidates):
-            simple = len(candidate.amplitudes) == 1 and len(candidate.shapes) == 1
-            twin = next(
-                (k for k in kept
-                 if simple and len(self.candidates[k].shapes) == 1 and len(self.candidates[k].amplitudes) == 1
-                 and abs(first.correlation(i, k)) > 0.9999),
-                None,
-            )  # fmt: skip
-            if twin is None:
-                kept.append(i)
-                names[i] = []
-            else:
-                names[twin].append(candidate.name)
-        self.aliases = {place: names[i] for place, i in enumerate(kept)}
-        self.candidates = [self.candidates[i] for i in kept]
+        gone: set[int] = set()
+        for i, k in self.twins.items():
+            a, b = plain.get(i), plain.get(k)
+            if a is not None and b is not None and (a.physical != b.physical or abs(a.found.chi2 - b.found.chi2) > 0.5):
+                continue
+            self.aliases.setdefault(k, []).append(self.candidates[i].name)
+            gone.add(i)
+        self.models = [m for m in self.models if not gone & set(m.numbers)]
+        self.gone = gone
+
+    def duplicate(self, i: int, name: str) -> bool:
+        """Whether an alias is the same formula in the same place, under another name."""
+        j = next(k for k, c in enumerate(self.candidates) if c.name == name)
+        a, b = self.candidates[i], self.candidates[j]
+        places = [(*c.terms[0].rates, "|", *c.terms[0].outputs, "|", *c.terms[0].shifts, *c.terms[0].frees) for c in (a, b)]
+        u, v = a.tangents[0, :, 0], b.tangents[0, :, 0]
+        return places[0] == places[1] and float((u @ v).abs()) >= (1 - 1e-12) * float(u.norm() * v.norm())
 
     # --- refits -----------------------------------------------------------------------------------------
 
@@ -228,6 +263,7 @@ class Search:
             if model is not None:
                 self.models.append(model)
         self._reweigh()
+        self.merge()
         self._refit_local()
 
     def _refit_local(self) -> None:
@@ -235,7 +271,7 @@ class Search:
         gains = {model.numbers[0]: 2 * model.log_evidence + math.log(self.problem.n) for model in self.models}
         promising = [
             w for w in self.local
-            if w.z**2 > max(gains.get(w.candidate, 0.0), self.screening.score(w.candidate) ** 2) + 6.0 and w.z > 3.5
+            if w.candidate not in self.gone and w.z**2 > max(gains.get(w.candidate, 0.0), self.screening.score(w.candidate) ** 2) + 6.0 and w.z > 3.5
         ]  # fmt: skip
         promising.sort(key=lambda w: -w.z)
         prior = math.log(PRIOR["local"] / max(len(self.candidates), 1))
@@ -430,7 +466,7 @@ class Search:
                     self.models.append(model)
 
     def _linear_pairs(self) -> list[tuple[int, int]]:
-        usable = [i for i in range(len(self.candidates)) if self.screening.best[i] >= 0]
+        usable = [i for i in range(len(self.candidates)) if self.screening.best[i] >= 0 and i not in self.gone]
         if len(usable) < 2:
             return []
         columns = self.screening.columns[:, [self.screening.best[i] for i in usable]]
@@ -447,7 +483,7 @@ class Search:
         scale = drivers_scale(model.found.problem, model.found)
         scores = []
         for j, other in enumerate(self.candidates):
-            if j in model.numbers:
+            if j in model.numbers or j in self.gone:
                 continue
             self.tick(f"screen {other.name} after {', '.join(model.names)}")
             try:

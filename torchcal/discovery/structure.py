@@ -72,7 +72,7 @@ def _noise_draws(found: Fitted, noise: Noise, draws: int, seed: int) -> Tensor:
         each = math.ceil(draws / groups)
         for output in range(len(noise.posterior)):
             chosen = torch.multinomial(noise.posterior[output], groups, replacement=True, generator=generator)
-            for places in problem.sequences:
+            for places in problem.recorded:
                 if int(problem.output_of[places[0]]) != output:
                     continue
                 rho = GRID[chosen].repeat_interleave(each)[:draws]

@@ -38,7 +38,8 @@ def paragraph(d: Any) -> str:
             lines += ["", f"{title}:"]
             for row in rows:
                 lines += textwrap.wrap(row, 100, initial_indent="  ", subsequent_indent="    ")
-    shown = type(d.ranking)(d.ranking[:8], ("terms", "log_evidence", "probability", "misfit_removed", "physical", "note"))
+    columns = ("terms", "region", "log_evidence", "probability", "misfit_removed", "physical", "note")
+    shown = type(d.ranking)(d.ranking[:8], columns)
     lines += ["", "Hypotheses, the best first:", textwrap.indent(str(shown), "  ")]
     return "\n".join(lines)
 
@@ -64,7 +65,8 @@ def _detected(d: Any) -> str:
     noise = d.noise
     sd = ", ".join(f"{name} {value:.3g}" for name, value in noise.sd.items())
     if noise.source == "none":
-        return f"The recording is declared free of noise; the calibrated base leaves an RMSE of {d.before.fitted.rmse:.4g}."
+        rmse = d.before.fitted.rmse
+        return f"The recording is declared free of noise; the calibrated base leaves an RMSE of {rmse:.4g}."
     text = f"Noise sd ({noise.source}): {sd}"
     correlated = [f"{name} {c:.2f}" for name, c in noise.correlation.items() if c >= 0.05]
     text += f", correlated from sample to sample ({', '.join(correlated)})" if correlated else ""
@@ -88,10 +90,10 @@ def _where(d: Any) -> str:
     if not d.where:
         return ""
     place = d.where[0]
-    spans = ", ".join(f"{low:.4g} to {high:.4g}" for low, high in place.spans)
+    spans = ", ".join(f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}" for low, high in place.spans[:3])
     return (
-        f"The mismatch sits in the {place.kind} {place.target} and varies with {place.driver} (mostly {spans}): a change there "
-        f"removes {percent(place.share)} of the misfit beyond noise."
+        f"The mismatch sits in the {place.kind} {place.target} and varies with {place.driver} (largest at {spans}): a "
+        f"smooth change there removes {percent(place.share)} of the misfit beyond noise."
     )
 
 
@@ -106,7 +108,9 @@ def _proof(d: Any) -> str:
             f"{a.log_score:.3g}, 95 % intervals hold {percent(b.coverage)}, then {percent(a.coverage)})"
         )
     if d.before.model_error_sd is not None and d.after.model_error_sd is not None:
-        text += f". The embedded model-error sd shrinks from {d.before.model_error_sd:.3g} to {d.after.model_error_sd:.3g}"
+        text += (
+            f". The embedded model-error sd shrinks from {d.before.model_error_sd:.3g} to {d.after.model_error_sd:.3g}"
+        )
     return text + "."
 
 
@@ -116,11 +120,14 @@ def _named(d: Any) -> list[str]:
     rival = next((row for row in d.ranking if row is not top and row.terms and row.refitted), None)
     parts = [
         _where(d),
-        f"Adding {_and([_with_region(d, name) for name in d.terms])} and refitting everything removes {percent(top.misfit_removed)} of the misfit beyond "
-        f"noise (probability {top.probability:.3f}; {estimates}).",
+        f"Adding {_and([_with_region(d, name) for name in d.terms])} and refitting everything removes "
+        f"{percent(top.misfit_removed)} of the misfit beyond noise (probability {top.probability:.3f}; {estimates}).",
     ]
     if rival is not None:
-        parts.append(f"The next best, {_and(list(rival.terms))}, stands {top.log_evidence - rival.log_evidence:.1f} natural-log units of evidence behind.")
+        behind = top.log_evidence - rival.log_evidence
+        parts.append(
+            f"The next best, {_and(list(rival.terms))}, stands {behind:.1f} natural-log units of evidence behind."
+        )
     parts.append(_proof(d))
     if d.remaining > 0.005:
         parts.append(f"{percent(d.remaining)} of the misfit remains unexplained.")
@@ -131,7 +138,8 @@ def _ambiguous(d: Any) -> list[str]:
     parts = [_where(d), f"{len(d.tied)} hypotheses explain it equally well and these data cannot tell them apart."]
     if d.experiment is not None:
         parts.append(
-            f"What would tell them apart: {d.experiment.description} (predicted distance {d.experiment.separation:.1f} noise sd)."
+            f"What would tell them apart: {d.experiment.description} (predicted distance "
+            f"{d.experiment.separation:.1f} noise sd)."
         )
     return parts
 
@@ -141,7 +149,8 @@ def _unexplained(d: Any) -> list[str]:
     best = next((row for row in d.ranking if row.terms and row.refitted), None)
     if best is not None:
         parts.append(
-            f"The best of the library, {_and(list(best.terms))}, removes {percent(best.misfit_removed)} of the misfit beyond noise"
+            f"The best of the library, {_and(list(best.terms))}, removes {percent(best.misfit_removed)} of the misfit "
+            "beyond noise"
             + (f" ({best.note})" if best.note else "")
             + "."
         )
@@ -149,5 +158,6 @@ def _unexplained(d: Any) -> list[str]:
         parts.append(d.settings["withdrawn"])
     if d.missing is not None:
         size = float(d.missing.rate.abs().max())
-        parts.append(f"The missing change of {d.missing.target} against {d.missing.driver} reaches {size:.3g} {d.missing.unit or ''}.")
+        unit = f" {d.missing.unit}" if d.missing.unit else ""
+        parts.append(f"The missing change of {d.missing.target} against {d.missing.driver} reaches {size:.3g}{unit}.")
     return parts

@@ -13,7 +13,7 @@ from torchcal.data import Recording
 from torchcal.embeddings import Embedding, Gaussian
 from torchcal.errors import DomainError
 from torchcal.inference.draws import Draws
-from torchcal.inference.estimate import TOLERANCE_IN_TIME, check_starts, maximise
+from torchcal.inference.estimate import check_starts, maximise
 from torchcal.inference.fitting import allowed_solver_error, least_squares
 from torchcal.inference.sampling import Plan, draw
 from torchcal.inference.setup import PriorMaker, check_inputs, check_run, embedded_problem
@@ -31,6 +31,7 @@ from torchcal.prediction import embedded_prediction
 from torchcal.priors import Flat
 from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results import Calibration, MapEstimate
+from torchcal.results.in_time import NODE_TOLERANCE
 from torchcal.simulators import Scaling, Simulator, Trajectories
 
 __all__ = ["calibrate"]
@@ -206,5 +207,5 @@ def _check_propagation(propagate: NISP, alpha: Tensor, samples: Tensor | None) -
     points = alpha[None]
     if samples is not None:
         points = torch.cat([points, samples[:8, -1].to(points)])
-    tolerance = 10 * TOLERANCE_IN_TIME if isinstance(propagate.simulator, Trajectories) else 1e-6
+    tolerance = 10 * NODE_TOLERANCE if isinstance(propagate.simulator, Trajectories) else 1e-6
     return propagate.check(points, tolerance=tolerance)

@@ -12,9 +12,10 @@ from tqdm.auto import tqdm
 from torchcal.errors import ConvergenceError, ConvergenceWarning, IdentifiabilityWarning, ShapeError
 from torchcal.inference.newton import Minima, hessian, minimise
 from torchcal.inference.randomness import preserve_random_state
-from torchcal.inference.tangent import minimise_by_tangents
+from torchcal.inference.tangent import search
 from torchcal.models import Problem
 from torchcal.propagation import NISP
+from torchcal.results.in_time import NODE_TOLERANCE
 from torchcal.simulators import Trajectories
 
 __all__ = ["Estimate", "Laplace", "check_starts", "laplace", "maximise"]
@@ -25,10 +26,6 @@ behind the Hessian are good to about 1e-9 of its largest entry."""
 
 AGREEMENT = 1e-6
 """Relative difference of objectives up to which two starts count as the same maximum."""
-
-TOLERANCE_IN_TIME = 1e-5
-"""Change of the moments of trajectories, relative to the output's scale, with which enough nodes are found. Long
-oscillations take many nodes for less, and the default tolerance ε is a hundred times as large."""
 
 SAME_MEANS = 1e-3
 """Difference of scaled means up to which two starts ended at one maximum."""
@@ -107,12 +104,12 @@ def maximise(
         bar.update(1)
         bar.set_postfix(objective=f"{float(values.min()):.6g}")
 
-    def search(points: Tensor) -> Minima:
-        if in_time:
-            return minimise_by_tangents(_objective(problem), problem.propagate, points, progress=show)
-        return minimise(lambda u: -problem.log_prob(transform.bound(u)), points, progress=show)
-
-    found = search(transform.unbound(starts))
+    objective = _objective(problem)
+    begin = transform.unbound(starts)
+    if in_time and len(begin) > 2:
+        found = search(objective, problem.propagate, begin, leading, progress=show)
+    else:
+        found = minimise(lambda u: objective(problem.propagate, u), begin, progress=show)
     if not bool(torch.isfinite(found.values[0])):
         raise ConvergenceError(
             f"Expected a finite posterior at some starting point. Got none at {len(starts)}. Check the "
@@ -123,9 +120,10 @@ def maximise(
     if problem.propagate.pattern.num_germs:
         for _ in range(4):  # a maximum found with too few nodes may move with more of them
             best = transform.bound(found.points[:1])[..., : problem.propagate.num_alpha]
-            if not problem.propagate.refine(best, tolerance=TOLERANCE_IN_TIME if in_time else 1e-7):
+            if not problem.propagate.refine(best, tolerance=NODE_TOLERANCE if in_time else 1e-7):
                 break
-            found = search(found.points[: 2 if in_time else max(4, total // 4)])
+            points = found.points[: 1 if in_time else max(4, total // 4)]
+            found = minimise(lambda u: objective(problem.propagate, u), points, progress=show)
     bar.close()
     best, ties = _first_of_the_tied(problem, found)
     if agreeing < 2 <= total:

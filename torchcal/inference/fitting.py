@@ -22,6 +22,9 @@ __all__ = ["LeastSquares", "allowed_solver_error", "least_squares", "plain_propa
 
 _LEAST_SQUARES_STARTS = 64
 
+_FOLLOWED = 8
+"""Of the starts of trajectories, those that are followed to the end."""
+
 
 @dataclass(frozen=True)
 class LeastSquares:
@@ -118,8 +121,9 @@ def _least_squares(
         scaling = Scaling.from_parameters(free, center=natural, scale=scale)
         propagate, prior = build(scaling)
         near = scaling.scaled(physical)
+        count = 1 if isinstance(simulator, Trajectories) else 8
         starts = near + 0.1 * torch.randn(
-            8, len(near), dtype=torch.float64, generator=torch.Generator().manual_seed(seed)
+            count, len(near), dtype=torch.float64, generator=torch.Generator().manual_seed(seed)
         )
         starts[0] = near
         best = _fit(propagate, prior, residual, prior.transform.unbound(starts))
@@ -165,6 +169,8 @@ def _fit(
         return 0.5 * residual(model, prior.transform.bound(u)).square().mean(-1)
 
     if isinstance(propagate.simulator, Trajectories):
+        if len(starts) > _FOLLOWED:
+            starts = minimise_by_tangents(objective, propagate, starts, max_iterations=10).points[:_FOLLOWED]
         found = minimise_by_tangents(objective, propagate, starts, tolerance=1e-13)
     else:
         found = minimise(lambda u: objective(propagate, u), starts, tolerance=1e-13)

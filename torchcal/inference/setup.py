@@ -20,6 +20,9 @@ __all__ = ["PriorMaker", "check_inputs", "check_run", "embedded_problem"]
 
 PriorMaker = Callable[[NISP], CoefficientPrior]
 
+NODES_IN_TIME = 3
+"""Gauss nodes for each germ with which the search for trajectories begins; at the maximum they are refined."""
+
 
 def check_inputs(
     simulator: Simulator, recording: Recording, fixed: Mapping[str, float] | None
@@ -130,6 +133,11 @@ def embedded_problem(
     observed = recording.observed
     noise = recording.noise_sd
     y = torch.where(observed, recording.y, torch.zeros_like(recording.y))
+    if rule is None and isinstance(simulator, Trajectories):
+        free, _ = free_parameters(simulator.parameters, fixed)
+        uncertain = embedding.bind([parameter.name for parameter in free]).num_germs
+        if uncertain and NODES_IN_TIME**uncertain <= 4096:
+            rule = NODES_IN_TIME
     propagate = NISP(
         simulator,
         embedding,
@@ -139,8 +147,7 @@ def embedded_problem(
         scaling=scaling,
         order=order,
         rule=rule,
-        # Enough to start with: the rule is refined at the maximum.
-        trial_spread=0.02 if isinstance(simulator, Trajectories) else 0.2,
+        trial_spread=0.2,  # enough to start with: the rule is refined at the maximum
     )
     germs = propagate.pattern.num_germs
     if germs == 0 and likelihood.needs != "mean":

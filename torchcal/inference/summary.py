@@ -18,7 +18,7 @@ from torchcal.models import Problem
 from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results import Diagnostics, Quality
 from torchcal.results.diagnostics import ESS_THRESHOLD, r_hat_threshold
-from torchcal.simulators import Simulator
+from torchcal.simulators import Simulator, Trajectories
 
 __all__ = [
     "diagnose",
@@ -157,7 +157,10 @@ def settings_of(problem: Problem, fit: LeastSquares, embedding: str, seed: int, 
     """What a result stores of how it was made, as plain data."""
     propagate = problem.propagate
     choice = propagate.rule_choice
+    simulator = propagate.simulator
+    in_time = {"subdivide": simulator.subdivide} if isinstance(simulator, Trajectories) else {}
     return {
+        **in_time,
         "embedding": embedding,
         "prior": type(problem.prior).__name__,
         "seed": seed,

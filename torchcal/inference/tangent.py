@@ -6,11 +6,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchcal.inference.newton import Minima, directions, join
+from torchcal.inference.newton import Minima, directions, join, minimise
 from torchcal.propagation import NISP
 from torchcal.simulators import Conditions, Simulator
 
-__all__ = ["minimise_by_tangents"]
+__all__ = ["minimise_by_tangents", "search"]
 
 Objective = Callable[[NISP, Tensor], Tensor]
 
@@ -19,6 +19,18 @@ _INNER = 8
 
 _STEP = 1e-5
 """Central-difference step of the Hessian, as in `torchcal.inference.newton`."""
+
+_SAME = 1e-5
+"""Relative difference of objectives on the tangent plane from which on two starts are followed apart."""
+
+_DISTINCT = 4
+"""Points on the tangent plane that are followed with the model."""
+
+_ROUGH = 15
+"""Iterations of those points; then Newton's method on the model itself takes fewer."""
+
+_FINISHED = 2
+"""The best of those points, which are followed to the end."""
 
 _SHARES = (1.0, 0.5, 0.2, 0.05, 0.01)
 """Of the way to the tangents' minimum at which the model itself is tried."""
@@ -65,6 +77,69 @@ class _Tangents(Simulator):
         self.known.clear()
 
 
+class _Plane(Simulator):
+    """A simulator's tangent plane at one point, for any values."""
+
+    def __init__(self, simulator: Simulator, point: Tensor) -> None:
+        self.simulator = simulator
+        self.parameters = simulator.parameters
+        self.degree = 1
+        self.point = point
+
+    def at(self, x: Conditions, outputs: Sequence[str] | None = None) -> Callable[[Tensor], Tensor]:
+        """The plane at fixed conditions."""
+        found = self.simulator.linearise(x, self.point[None], outputs)
+        y, slope = found.y[0], found.jacobian[0]
+        return lambda values: y.to(values) + (values - self.point.to(values)) @ slope.T.to(values)
+
+
+def search(
+    objective: Objective,
+    propagate: NISP,
+    starts: Tensor,
+    leading: Tensor,
+    *,
+    progress: Callable[[int, Tensor], None] | None = None,
+) -> Minima:
+    """Minimise from every start on the tangent plane at one point, then with the model from where those ended.
+
+    Args:
+        objective: Of a propagation and points ``(*batch, P)``, ``(*batch,)``.
+        propagate: The propagation.
+        starts: ``(S, P)``.
+        leading: Scaled parameters at which the plane touches, ``(d,)``.
+        progress: Called with the iteration and the values so far.
+
+    Returns:
+        One row for each start: those that end in one point on the plane end in one point of the model. All but the
+        `_DISTINCT` best points on the plane are given up, with the value +inf.
+    """
+    point = propagate.with_held(propagate.scaling.physical(leading.detach())).to(device="cpu", dtype=torch.float64)
+    plane = propagate.copy(simulator=_Plane(propagate.simulator, point))
+    rough = minimise(lambda u: objective(plane, u), starts, max_iterations=30, tolerance=1e-6, progress=progress)
+    apart = rough.values.diff() > _SAME * (1 + rough.values[1:].abs())
+    group = torch.cat([torch.zeros_like(apart[:1], dtype=torch.long), apart.cumsum(0)])
+    first = torch.cat([torch.ones_like(apart[:1]), apart])
+    begin = torch.cat([rough.points[first][:_DISTINCT], starts[:1]])
+    points, values, iterations = _iterate(objective, propagate, begin, _ROUGH, 1e-7, progress)
+    best = values.argsort(stable=True)
+    best = best[torch.isfinite(values[best])]
+    apart = values[best].diff() > _SAME * (1 + values[best][1:].abs())
+    best = best[torch.cat([torch.ones_like(best[:1], dtype=torch.bool), apart])][:_FINISHED]
+    for row in best.tolist():
+        # What the tangents leave out, the model's curvature times its error, makes the end of the way slow.
+        end = minimise(lambda u: objective(propagate, u), points[row : row + 1], progress=progress)
+        points[row], values[row] = end.points[0], end.values[0]
+    kept = group < len(begin) - 1
+    ends = rough.points.clone()
+    results = torch.full_like(rough.values, torch.inf)
+    ends[kept], results[kept] = points[group[kept]], values[group[kept]]
+    if bool(values[-1] < results.min()):  # the plane led astray
+        ends[-1], results[-1] = points[-1], values[-1]
+    order = results.argsort(stable=True)
+    return Minima(ends[order], results[order], rough.iterations + iterations)
+
+
 def minimise_by_tangents(
     objective: Objective,
     propagate: NISP,
@@ -85,10 +160,24 @@ def minimise_by_tangents(
         propagate: The propagation.
         starts: ``(S, P)``.
         max_iterations: Most iterations.
-        tolerance: A start is done when three iterations in a row gain less than this, relative to the objective plus
-            one.
+        tolerance: A start is done when one whole step, or three iterations in a row, gain less than this, relative to
+            the objective plus one.
         progress: Called with the iteration and the values so far.
     """
+    points, values, iterations = _iterate(objective, propagate, starts, max_iterations, tolerance, progress)
+    order = values.argsort(stable=True)
+    return Minima(points[order], values[order], iterations)
+
+
+def _iterate(
+    objective: Objective,
+    propagate: NISP,
+    starts: Tensor,
+    max_iterations: int,
+    tolerance: float,
+    progress: Callable[[int, Tensor], None] | None,
+) -> tuple[Tensor, Tensor, int]:
+    """Points and values in the order of the starts, and the number of iterations."""
     simulator, free = propagate.simulator, propagate.pattern.names
     tangents = _Tangents(simulator, [i for i, name in enumerate(simulator.names) if name in free])
     tangent = propagate.copy(simulator=tangents, max_elements=2**62)
@@ -124,11 +213,11 @@ def minimise_by_tangents(
             points[group[better]] = tries[which, torch.arange(len(group))][better]
             small = gain <= tolerance * (1 + values[group].abs())
             values[group[better]] = best[better]
-            stalls[group] = torch.where(small, stalls[group] + 1, 0)
+            whole = better & (which == 0)
+            stalls[group] = torch.where(small, stalls[group] + 1 + 2 * whole, 0)
             active[group] = stalls[group] < 3
             length = step.norm(dim=-1)
             share = torch.where(better, shares[:, 0][which], 0.1 * _SHARES[-1])
-            whole = better & (which == 0)
             radius[group] = torch.where(whole, torch.maximum(radius[group], 2 * length), 1.5 * share * length)
         radius = radius.clamp(1e-12, 1e6)
         if iteration % 4 == 0:
@@ -137,9 +226,7 @@ def minimise_by_tangents(
             progress(iteration, values)
     for _ in range(len(points)):  # a leader may itself have joined another
         leader = leader[leader]
-    points, values = points[leader], values[leader]
-    order = values.argsort(stable=True)
-    return Minima(points[order], values[order], iteration)
+    return points[leader], values[leader], iteration
 
 
 def _descend(objective: Callable[[Tensor], Tensor], here: Tensor, radius: Tensor) -> Tensor:
@@ -162,7 +249,7 @@ def _descend(objective: Callable[[Tensor], Tensor], here: Tensor, radius: Tensor
         at = torch.where((best < value)[:, None], chosen, at)
         value = torch.minimum(value, best)
         total = total + gain
-        if bool((gain <= 1e-2 * total + 1e-13 * (1 + value.abs())).all()):
+        if bool((gain <= 0.1 * total + 1e-13 * (1 + value.abs())).all()):
             break
     return at
 

@@ -117,7 +117,7 @@ def select(
         x: The prediction's conditions.
         total: Number of predicted values, all outputs.
         recording: The data, or None.
-        x_name: The condition on the axis; may be left out where one alone is not held by ``where``.
+        x_name: The condition on the axis; may be left out where one alone is not held by ``where``, and for time.
         output: The output, by name or number; may be left out where there is one.
         where: ``{condition: value}`` to hold others; or a mask, slice or numbers of the conditions.
         units: Units beside the recording's.
@@ -136,6 +136,8 @@ def select(
         if key not in columns:
             raise DomainError(f"Expected a condition among {list(columns)}. Got {key!r} (check the spelling).")
     left = [key for key in columns if key not in held and key != by]
+    if x_name is None and "time" in left and recording is not None and recording.runs is not None:
+        x_name = "time"
     if x_name is None:
         if len(left) != 1:
             raise DomainError(

@@ -18,7 +18,8 @@ from torchcal.results import storage
 from torchcal.results.base import Result, conditions, indent, thin
 from torchcal.results.diagnostics import Diagnostics, table
 from torchcal.results.estimate import MapEstimate
-from torchcal.simulators import Simulator
+from torchcal.results.in_time import propagation_in_time
+from torchcal.simulators import Simulator, Trajectories
 
 __all__ = ["AdditiveCalibration", "sigma_unit"]
 
@@ -64,7 +65,7 @@ class AdditiveCalibration(Result):
         """Push-forward and posterior predictive, kept apart.
 
         Args:
-            x: Conditions, the data's by default.
+            x: Conditions, the data's by default; in time as for `Calibration.predict`.
             function: Another function of the parameters; its posterior predictive adds nothing to the
                 push-forward but σ², which has no meaning there: read ``push_forward``.
             max_draws: At most this many draws, evenly spaced, are averaged over.
@@ -72,7 +73,9 @@ class AdditiveCalibration(Result):
         if self.propagate is None and x is None and function is None and self.stored is not None:
             return self.stored
         propagate = self._propagation()
-        if x is not None or function is not None:
+        if x is not None and function is None and isinstance(propagate.simulator, Trajectories):
+            propagate = propagation_in_time(propagate, self.recording, x, self.map.alpha[:-1])
+        elif x is not None or function is not None:
             where = propagate.x if x is None else conditions(x, None if function else self.recording)
             other = None if function is None else Simulator(function, propagate.simulator.parameters)
             propagate = propagate.at(where, simulator=other)

@@ -22,7 +22,8 @@ from torchcal.results import storage
 from torchcal.results.base import Result, conditions, indent, thin
 from torchcal.results.diagnostics import Diagnostics, table
 from torchcal.results.estimate import MapEstimate
-from torchcal.simulators import Simulator
+from torchcal.results.in_time import NODE_TOLERANCE, propagation_in_time
+from torchcal.simulators import Simulator, Trajectories
 
 __all__ = ["Calibration"]
 
@@ -63,7 +64,9 @@ class Calibration(Result):
         """Predictive moments of the outputs, or of another function of the parameters.
 
         Args:
-            x: Conditions, ``(n,)`` or a dict of them, arrays of any kind; the data's by default.
+            x: Conditions, ``(n,)`` or a dict of them, arrays of any kind; the data's by default. In time: other times
+                ``{"time": (n,), "run": (n,)}`` of the recording's runs; or other runs, as a recording in time, a
+                `Run` or a list of them, with every initial state given and outputs that are not looked at.
             function: ``function(x, p)`` of the same parameters, for another quantity of interest; its conditions
                 may have other names than the data's.
             max_draws: At most this many draws, evenly spaced, are averaged over.
@@ -89,13 +92,17 @@ class Calibration(Result):
             )
         if x is None and function is None:
             return self.propagate
-        where = self.propagate.x if x is None else conditions(x, None if function else self.recording)
-        simulator = None if function is None else Simulator(function, self.propagate.simulator.parameters)
-        other = self.propagate.at(where, simulator=simulator)
+        in_time = function is None and isinstance(self.propagate.simulator, Trajectories)
+        if in_time:
+            other = propagation_in_time(self.propagate, self.recording, x, self.map.alpha)
+        else:
+            where = self.propagate.x if x is None else conditions(x, None if function else self.recording)
+            simulator = None if function is None else Simulator(function, self.propagate.simulator.parameters)
+            other = self.propagate.at(where, simulator=simulator)
         if other.pattern.num_germs:  # nodes that were enough at the data may not be elsewhere
             alpha = self.map.alpha.to(other.nodes)
-            other.refine(alpha)
-            other.check(alpha)
+            other.refine(alpha, tolerance=NODE_TOLERANCE if in_time else 1e-7)
+            other.check(alpha, tolerance=10 * NODE_TOLERANCE if in_time else 1e-6)
         return other
 
     def sample_outputs(self, num: int, x: Any = None, *, kind: str = "posterior", seed: int = 0) -> Tensor:

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from torchcal import embeddings, likelihoods, polychaos
-from torchcal.data import Recording
-from torchcal.errors import DomainError, EmbeddingError, MissingDependencyError, TorchcalError
+from torchcal.data import Recording, Run
+from torchcal.errors import DomainError, EmbeddingError, MissingDependencyError, RecordingError, TorchcalError
 from torchcal.prediction import AdditivePrediction, Moments, Prediction
 from torchcal.propagation import NISP, PropagationCheck, RuleChoice
 from torchcal.results.diagnostics import Diagnostics, Quality
 from torchcal.results.estimate import MapEstimate
-from torchcal.simulators import Scaling, Simulator
+from torchcal.simulators import ODESimulator, Scaling, Simulator, Trajectories
 
 if TYPE_CHECKING:
     from torchcal.results.additive import AdditiveCalibration
@@ -208,6 +208,9 @@ def _common_groups(result: Any) -> dict[str, Any]:
     groups["observed_data"] = _named_dataset("condition", outputs)
     x = recording.x if isinstance(recording.x, Mapping) else {"x": recording.x}
     groups["constant_data"] = _named_dataset("condition", x)
+    if recording.runs is not None and recording.runs[0].inputs:
+        inputs = {name: torch.cat([run.inputs[name] for run in recording.runs]) for name in recording.runs[0].inputs}
+        groups["inputs"] = _named_dataset("condition", inputs)
     if isinstance(recording.noise, Tensor):
         groups["noise"] = _dataset({"sd": ("datum", recording.noise)})
     if len(result.diagnostics.null_directions):
@@ -236,11 +239,24 @@ def _tree(groups: dict[str, Any], result: Any, extra: Mapping[str, Any]) -> Any:
             "outputs": list(recording.outputs),
             "noise": "none" if isinstance(recording.noise, str) else None,
             "units": dict(recording.units),
+            "runs": None if recording.runs is None else [_run_fields(run) for run in recording.runs],
         },
     }
     tree = _xarray().DataTree.from_dict({f"/{name}": group for name, group in groups.items()})
     tree.attrs["torchcal"] = json.dumps(meta)
     return tree
+
+
+def _run_fields(run: Run) -> dict[str, Any]:
+    """What of a run is not an array."""
+    return {
+        "samples": len(run.time),
+        "outputs": list(run.outputs),
+        "inputs": list(run.inputs),
+        "initial": dict(run.initial),
+        "hold": run.hold,
+        "units": dict(run.units),
+    }
 
 
 def _rule_fields(choice: RuleChoice) -> dict[str, Any]:
@@ -306,7 +322,34 @@ def _recording(groups: Mapping[str, Any], meta: Mapping[str, Any]) -> Recording:
     if "noise" in groups:
         noise = groups["noise"]["sd"]
     missing = any(bool(value.isnan().any()) for value in y.values())
+    if info.get("runs"):
+        return Recording(runs=_runs(groups, info["runs"]), noise=noise, missing=missing, units=_units(info))
     return Recording(x=x, y=y, noise=noise, missing=missing, units=info["units"])
+
+
+def _runs(groups: Mapping[str, Any], specs: list[dict[str, Any]]) -> list[Run]:
+    lengths = [spec["samples"] for spec in specs]
+    time = groups["constant_data"]["time"].split(lengths)
+    outputs = {name: values.split(lengths) for name, values in groups["observed_data"].items()}
+    inputs = {name: values.split(lengths) for name, values in groups.get("inputs", {}).items()}
+    return [
+        Run(
+            time=time[i],
+            outputs={name: outputs[name][i] for name in spec["outputs"]},
+            inputs={name: inputs[name][i] for name in spec["inputs"]},
+            initial=spec["initial"],
+            hold=spec["hold"],
+        )
+        for i, spec in enumerate(specs)
+    ]
+
+
+def _units(info: Mapping[str, Any]) -> dict[str, str]:
+    """Units of a recording in time; its runs know those of the inputs."""
+    units = dict(info["units"])
+    for spec in info["runs"]:
+        units |= spec["units"]
+    return units
 
 
 def _propagation(
@@ -320,6 +363,11 @@ def _propagation(
         torch.tensor(settings["scale"], dtype=torch.float64),
         torch.tensor(settings["log"]),
     )
+    if recording.runs is None and isinstance(simulator, ODESimulator | Trajectories):
+        raise RecordingError("Expected a static simulator for a static recording. Got one in time (give the other).")
+    simulator = simulator.bind(recording)
+    if isinstance(simulator, Trajectories) and settings.get("subdivide", 1) > simulator.subdivide:
+        simulator = Trajectories(simulator.ode, recording, subdivide=settings["subdivide"])
     propagate = NISP(
         simulator,
         embedding,

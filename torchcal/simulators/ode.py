@@ -69,6 +69,17 @@ class ODESimulator(Simulator):
         self.max_step = max_step
         if unknown := [name for name in self.initial if name not in self.states]:
             raise DomainError(f"Expected initial values of states {list(self.states)}. Got {unknown}.")
+        for name, value in self.initial.items():
+            if isinstance(value, str) and (value not in self.states or value == name):
+                raise DomainError(
+                    f"Expected the initial value of {name!r} as a number, another state's name or a function f(s, p). "
+                    f"Got {value!r} with states {list(self.states)}."
+                )
+            if not (callable(value) or isinstance(value, str | float | int)):
+                raise DomainError(
+                    f"Expected the initial value of {name!r} as a number, another state's name or a function f(s, p). "
+                    f"Got {type(value).__name__}."
+                )
         self.observe = self._observed(observe)
 
     def _observed(self, observe: Any) -> dict[str, Callable[..., Any]]:

@@ -139,6 +139,8 @@ class Simulator:
         outputs: Sequence[str] | None = None,
         columns: Sequence[int] | None = None,
         warm: Any = None,
+        *,
+        march: bool = True,
     ) -> Linearisation:
         """Outputs and their exact derivatives by the parameters, in forward mode.
 
@@ -148,6 +150,7 @@ class Simulator:
             outputs: Names of the outputs wanted.
             columns: Places of the parameters to derive by; all by default.
             warm: ``warm`` of an earlier result at nearby values.
+            march: For simulators in time: whether to solve step by step where the warm start does not help.
         """
         values = values.detach()
         columns = list(range(values.shape[-1])) if columns is None else list(columns)

@@ -29,6 +29,8 @@ MIN_STEPS = 48
 GAP = 1e-9
 #: Gaps whose square is below `GAP`: after one more correction nothing is left to check.
 QUADRATIC = 1e-5
+#: Gaps, relative to the state's size, from which Newton's method is not tried.
+WILD = 1e3
 #: Newton passes before the trajectory is solved step by step instead.
 MAX_PASSES = 8
 #: Points whose derivatives are computed at once: about what a processor's cache holds.
@@ -173,6 +175,12 @@ class Trajectories(Simulator):
             return self
         return Trajectories(self.ode, recording, subdivide=self.subdivide)
 
+    def elsewhere(self, recording: Recording) -> "Trajectories":
+        """The same simulator for other runs, with steps no longer than these."""
+        other = Trajectories(self.ode, recording)
+        share = float(other._h.max() / self._h.max())
+        return other.refined(math.ceil(share * (1 - 1e-9))) if share > 1 + 1e-9 else other
+
     def refined(self, factor: int = 2) -> "Trajectories":
         """The same with shorter steps."""
         return Trajectories(self.ode, self.recording, subdivide=self.subdivide * factor)
@@ -270,8 +278,8 @@ class Trajectories(Simulator):
         return result
 
     def _check_conditions(self, x: Conditions) -> None:
-        same = isinstance(x, Mapping) and "time" in x and "run" in x and len(x["time"]) == len(self._data_t)
-        if not (same and bool(torch.equal(x["time"].cpu().to(torch.float64), self._data_t))):
+        time = x["time"] if isinstance(x, Mapping) and "time" in x and "run" in x else None
+        if time is None or not torch.equal(time.cpu().to(torch.float64), self._data_t):
             raise DomainError(
                 "Expected the conditions of the recording that the simulator was bound to. Got others "
                 "(bind another recording: simulator.bind(recording))."
@@ -284,8 +292,14 @@ class Trajectories(Simulator):
         outputs: Sequence[str] | None = None,
         columns: Sequence[int] | None = None,
         warm: Any = None,
+        *,
+        march: bool = True,
     ) -> Linearisation:
-        """Outputs and their derivatives; ``warm`` is the trajectory of an earlier, nearby call."""
+        """Outputs and their derivatives; ``warm`` is the trajectory of an earlier, nearby call.
+
+        Where Newton's method does not settle from there, the trajectory is solved step by step; without ``march`` it is
+        infinite instead.
+        """
         wanted = tuple(outputs) if outputs is not None else self.recording.outputs
         values = values.detach()
         columns = list(range(values.shape[-1])) if columns is None else list(columns)
@@ -337,10 +351,16 @@ class Trajectories(Simulator):
                 elif isinstance(value, float | int):
                     entries[state] = values.new_full((*values.shape[:-1], 1), float(value))
             for state, value in known.items():
-                if isinstance(value, str):
-                    entries[state] = entries[value]
-                elif callable(value):
-                    entries[state] = value(entries, own) + torch.zeros_like(values[..., :1])
+                try:
+                    if isinstance(value, str):
+                        entries[state] = entries[value]
+                    elif callable(value):
+                        entries[state] = value(entries, own) + torch.zeros_like(values[..., :1])
+                except Exception as error:
+                    raise SimulatorError(
+                        f"Expected the initial value of {state!r} from those of {list(entries)}, which are known by "
+                        f"then, and parameters {list(own)}. It raised {type(error).__name__}: {error}."
+                    ) from error
             rows.append(torch.cat([entries[state] for state in self._states], dim=-1))
         return torch.stack(rows, dim=-2)
 
@@ -384,12 +404,17 @@ class Trajectories(Simulator):
         k4 = self._slope(t + h, s + full * k3, p, last)
         return s + (full / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
 
-    def _solve(self, values: Tensor, warm: Any = None) -> Tensor:
-        if warm is not None and warm.shape[0] == values.shape[0]:
-            states = self._newton(values, warm)
-            if states is not None:
-                return states
-        return self._march(values)
+    def _solve(self, values: Tensor, warm: Any = None, *, march: bool = True) -> Tensor:
+        if warm is None or warm.shape[0] != values.shape[0]:
+            # Trajectories that stand still are a poor guess, but cost little to try.
+            warm = self._start(values).unsqueeze(2).expand(-1, -1, self.num_steps + 1, -1)
+            march = True
+        states, settled = self._newton(values, warm)
+        if march and not bool(settled.all()):
+            states[~settled] = self._march(values[~settled])
+        elif not march:
+            states[~settled] = math.inf
+        return states
 
     def _march(self, values: Tensor) -> Tensor:
         """Step by step."""
@@ -403,28 +428,31 @@ class Trajectories(Simulator):
         states = torch.stack(found, dim=-2)
         return torch.where(torch.isfinite(states), states, torch.full_like(states, math.inf))
 
-    def _newton(self, values: Tensor, guess: Tensor) -> Tensor | None:
-        """Newton's method on whole trajectories; None where it does not settle at once."""
+    def _newton(self, values: Tensor, guess: Tensor) -> tuple[Tensor, Tensor]:
+        """Newton's method on whole trajectories, and which rows ``(H,)`` settled."""
         states = guess.clone()
         states[:, :, 0] = self._start(values)
-        size = states.abs().amax(dim=(0, 1, 2)).clamp_min(1e-300)
-        if not bool(torch.isfinite(size).all()):
-            return None
-        last = math.inf
+        size = states.abs().amax(dim=(1, 2), keepdim=True).clamp_min(1e-300)
+        settled = torch.zeros(len(values), dtype=torch.bool)
+        active = torch.isfinite(states).flatten(1).all(-1)
+        last = torch.full((len(values),), math.inf, dtype=torch.float64)
         for _ in range(MAX_PASSES):
-            ends, flow, _ = self._step_derivatives(values, states, ())
-            gap = ends - states[:, :, 1:]
-            worst = float((gap.abs().amax(dim=(0, 1, 2)) / size).max())
-            if worst < GAP:
-                return states
-            if not worst < 4.0 * last or not math.isfinite(worst):
-                return None
-            last = worst
-            change = _recur(flow, gap.unsqueeze(-1))[..., 0]
-            states = torch.cat([states[:, :, :1], states[:, :, 1:] + change], dim=2)
-            if worst < QUADRATIC:
-                return states
-        return None
+            rows = active.nonzero()[:, 0]
+            if len(rows) == 0:
+                break
+            now = states[rows]
+            ends, flow, _ = self._step_derivatives(values[rows], now, ())
+            gap = ends - now[:, :, 1:]
+            worst = (gap.abs() / size[rows]).flatten(1).amax(-1)
+            good = torch.isfinite(worst) & (worst < 4.0 * last[rows]) & (worst < WILD)
+            last[rows] = worst
+            change = _recur(flow, torch.nan_to_num(gap).unsqueeze(-1))[..., 0]
+            moved = torch.cat([now[:, :, :1], now[:, :, 1:] + change], dim=2)
+            good &= torch.isfinite(moved).flatten(1).all(-1)
+            states[rows] = torch.where((good & (worst >= GAP))[:, None, None, None], moved, now)
+            settled[rows] = good & (worst < QUADRATIC)
+            active[rows] = good & (worst >= QUADRATIC)
+        return states, settled
 
     def _step_derivatives(
         self, values: Tensor, states: Tensor, columns: Sequence[int]
@@ -453,7 +481,10 @@ class Trajectories(Simulator):
         for name, places in self._columns.items():
             block = values[..., places]
             spread = block.expand(-1, len(run_of)) if len(places) == 1 else block[..., run_of]
-            found[name] = spread.clone().requires_grad_(True) if wanted & set(places) else block if len(places) == 1 else spread
+            if wanted & set(places):
+                found[name] = spread.clone().requires_grad_(True)
+            else:
+                found[name] = block if len(places) == 1 else spread
         return found
 
     def _backward(
@@ -539,6 +570,11 @@ class Trajectories(Simulator):
             parts = torch.stack(y.split(seen.shape[1], dim=-1), dim=-1)
             by_state, _ = self._backward(parts, begin, {}, self._run_of, ())
         return by_state[0].transpose(0, 1).flatten(0, 1)
+
+    def slopes(self, values: Tensor, start: Tensor) -> Tensor:
+        """Rates of all states at the beginning of every run, ``(H, R, states)``, at states ``(H, R, states)``."""
+        u = {name: table[0, :, 0] for name, table in self._u.items()}
+        return self._slope(self._t[:, 0], start, self._p(values), u)
 
     def _measure(self, p: dict[str, Tensor], seen: Tensor, outputs: Sequence[str]) -> Tensor:
         s = {name: seen[..., i] for i, name in enumerate(self._states)}

@@ -1,0 +1,158 @@
+"""A calibration in time at other times, or for other runs."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchcal.data import Recording, Run
+from torchcal.errors import DomainError
+from torchcal.propagation import NISP
+from torchcal.results.base import conditions
+from torchcal.simulators import Conditions, Simulator, Trajectories
+
+__all__ = ["NODE_TOLERANCE", "propagation_in_time"]
+
+NODE_TOLERANCE = 1e-5
+"""Change of the moments of trajectories, relative to the output's scale, with which enough nodes are found. Long
+oscillations take many nodes for less, and the default tolerance ε is a hundred times as large."""
+
+
+class _Elsewhere(Simulator):
+    """Trajectories of other runs as a function of the calibrated parameters, at some of their samples."""
+
+    def __init__(self, bound: Trajectories, other: Trajectories, columns: list[int], picks: Tensor) -> None:
+        self.parameters = bound.parameters
+        self.degree = None
+        self.other, self.columns, self.picks = other, columns, picks
+
+    def at(self, x: Conditions, outputs: Sequence[str] | None = None) -> Callable[[Tensor], Tensor]:
+        """The outputs at the chosen samples."""
+        evaluate = self.other.at(self.other.x, outputs)
+        count = self.other.recording.n
+
+        def chosen(values: Tensor) -> Tensor:
+            y = evaluate(values[..., self.columns])
+            return y.unflatten(-1, (-1, count))[..., self.picks].flatten(-2)
+
+        return chosen
+
+
+def propagation_in_time(propagate: NISP, recording: Recording, x: Any, alpha: Tensor) -> NISP:
+    """The calibrated propagation at other times of the recording's runs, or for other runs.
+
+    Args:
+        propagate: Of the calibration.
+        recording: The data.
+        x: Times ``{"time": (n,), "run": (n,)}`` of the recording's runs (``run`` may be left out where there is one);
+            or a recording in time, a `Run`, or a list of them, whose outputs are not looked at.
+        alpha: Coefficients at which steps must be short enough, ``(P,)``.
+
+    Raises:
+        DomainError: If times lie outside a run, or runs leave something open that was calibrated run by run.
+    """
+    bound = propagate.simulator
+    if not isinstance(bound, Trajectories):
+        raise DomainError("Expected a calibration in time. Got a static one (predict at conditions x).")
+    if isinstance(x, Run):
+        x = [x]
+    listed = isinstance(x, Sequence) and len(x) > 0 and all(isinstance(run, Run) for run in x)
+    if isinstance(x, Recording) or listed:
+        runs = x.runs if isinstance(x, Recording) else tuple(x)
+        if runs is None:
+            raise DomainError(
+                "Expected a recording in time, a Run, or times. Got a static recording (make one with runs=[Run(...)])."
+            )
+        other = bound.elsewhere(_blank(runs, recording))
+        where, picks = other.x, torch.arange(other.recording.n)
+        columns = _columns(bound, other)
+    else:
+        where = _times(x, recording)
+        extended, picks = _with_times(recording, where)
+        other = bound.elsewhere(extended)
+        columns = list(range(len(bound.names)))
+    with torch.no_grad():
+        xi = propagate.nodes
+        values = propagate.with_held(propagate.parameters_at(alpha.to(xi), xi)).to(device="cpu", dtype=torch.float64)
+        spread = recording.spread[:: recording.n]
+        other = other.settled(values[:, columns], 1e-3 * spread.cpu().repeat_interleave(other.recording.n))
+    return propagate.copy(x=where, simulator=_Elsewhere(bound, other, columns, picks))
+
+
+def _blank(runs: Sequence[Run], recording: Recording) -> Recording:
+    """Runs without data: what is predicted are the recording's outputs."""
+    needed = set(recording.runs[0].inputs) if recording.runs else set()
+    for i, run in enumerate(runs):
+        if set(run.inputs) != needed:
+            raise DomainError(
+                f"Expected inputs {sorted(needed)} in every run, as in the recording. Got {sorted(run.inputs)} in run "
+                f"{i}."
+            )
+    empty = [
+        Run(
+            time=run.time,
+            outputs={name: torch.zeros_like(run.time) for name in recording.outputs},
+            inputs=run.inputs,
+            initial=run.initial,
+            hold=run.hold,
+        )
+        for run in runs
+    ]
+    return Recording(runs=empty)
+
+
+def _columns(bound: Trajectories, other: Trajectories) -> list[int]:
+    """The place of each of the other runs' parameters among the calibrated ones."""
+    pairs = zip(bound.runs, other.runs, strict=False)
+    same = len(bound.runs) == len(other.runs) and all(
+        a.time.shape == b.time.shape and bool((a.time == b.time).all()) and a.initial == b.initial for a, b in pairs
+    )
+    if same and bound.names == other.names:
+        return list(range(len(bound.names)))
+    own = {*bound.nuisance, *other.nuisance}
+    unknown = [name for name in other.names if name in own or name not in bound.names]
+    if unknown:
+        raise DomainError(
+            f"Expected runs of which everything is known but the calibrated parameters. Got {unknown} open (give a "
+            "Run its initial= for every state; a per-run parameter is known for the calibrated runs alone: predict at "
+            "{'time': ..., 'run': ...} of those)."
+        )
+    return [bound.names.index(name) for name in other.names]
+
+
+def _times(x: Any, recording: Recording) -> dict[str, Tensor]:
+    runs = recording.runs or ()
+    if len(runs) == 1 and not (isinstance(x, Mapping) and "run" in x):
+        time = x["time"] if isinstance(x, Mapping) and set(x) == {"time"} else x
+        if not isinstance(time, Mapping):
+            time = torch.as_tensor(time, dtype=torch.float64)
+            x = {"time": time, "run": torch.zeros_like(time)}
+    where = conditions(x, recording)
+    if not isinstance(where, Mapping):
+        raise DomainError("Expected times as a dict with 'time' and 'run'. Got one array.")
+    wrong = [float(r) for r in where["run"] if not (float(r).is_integer() and 0 <= r < len(runs))]
+    if wrong:
+        raise DomainError(f"Expected runs from 0 to {len(runs) - 1}. Got {wrong[0]:g}.")
+    return dict(where)
+
+
+def _with_times(recording: Recording, where: Mapping[str, Tensor]) -> tuple[Recording, Tensor]:
+    """The recording's runs with more samples, without data, and the places of the wanted ones."""
+    runs, offset = [], 0
+    picks = torch.zeros(len(where["time"]), dtype=torch.long)
+    for r, run in enumerate(recording.runs or ()):
+        chosen = (where["run"] == r).nonzero()[:, 0]
+        wanted = where["time"][chosen].to(run.time)
+        if bool((wanted < run.time[0]).any()):
+            raise DomainError(
+                f"Expected times from {float(run.time[0]):.6g} on in run {r}, where it begins. Got "
+                f"{float(wanted.min()):.6g}."
+            )
+        time = torch.unique(torch.cat([run.time, wanted]))
+        inputs = run.inputs_at(time) if run.inputs else {}
+        picks[chosen] = offset + torch.searchsorted(time, wanted)
+        offset += len(time)
+        outputs = {name: torch.zeros_like(time) for name in recording.outputs}
+        runs.append(Run(time=time, outputs=outputs, inputs=inputs, initial=run.initial, hold=run.hold))
+    return Recording(runs=runs), picks
