@@ -429,29 +429,58 @@ def embedded_vs_conventional(two: Study, epsilon: float = EPSILON) -> "Figure":
         ("Conventional calibration", two.conventional, style.PUSH_FORWARD_BAND, style.ADDITIVE),
         ("Embedded model error", two.embedded[epsilon], style.MODEL_ERROR_BAND, style.POSTERIOR),
     )
-    phi = recording.x["phi"]
-    value = float(phi.min())
+    value = float(recording.x["phi"].min())
     for (left, right), (name, result, band, line) in zip(axes, rows, strict=True):
-        x = studies.grid(two, phi=value)
-        moments = own_prediction(result.predict(x))
-        T0 = x["T0"].numpy()
-        mean, half = moments.mean.numpy(), 2 * moments.sd.numpy()
-        left.fill_between(T0, mean - half, mean + half, color=band, lw=0, label="one-step model ± 2 sd")
-        left.plot(T0, mean, color=line, lw=1.2)
-        keep = phi == value
-        left.plot(recording.x["T0"][keep], recording.y[keep], **_DATA_LOOK, label="GRI-Mech 3.0")
-        left.set_xlabel(style.label("T0", recording.units, LABELS))
-        left.set_ylabel(style.label("ln_tau", recording.units, LABELS))
+        _draw_lean(left, two, own_prediction(result.predict(studies.grid(two, phi=value))), value, band, line)
+        _draw_misses(right, two, own_prediction(result.predict()), band, line)
         left.set_title(name, fontsize="medium", fontweight="bold", loc="left")
-        style.legend(left, title=f"lean mixture, Φ = {value:g}")
-        at_data = own_prediction(result.predict())
-        _draw_misses(right, two, at_data, band, line)
-        share = studies.coverage(two, at_data, level=math.erf(math.sqrt(2)))
+        share = studies.coverage(two, own_prediction(result.predict()), level=math.erf(math.sqrt(2)))
         text = f"all {recording.n} data: {100 * share:.0f} % within ± 2 sd of the model's prediction"
         right.set_title(text, fontsize="medium", loc="left")
         for ax in (left, right):
             style.dress(ax)
     return figure
+
+
+def before_and_after(two: Study, base: Calibration, improved: Calibration, names: Sequence[str]) -> "Figure":
+    """Case 2: embedded error bars of the base and of the mechanism with what was missing, both at the MAP.
+
+    Args:
+        two: Its data.
+        base: Calibration of the base.
+        improved: The same of the improved mechanism.
+        names: What was added.
+    """
+    figure, axes = _subplots(2, 2, (9.8, 6.8), sharey="col", width_ratios=(1.0, 1.35))
+    rows = (
+        ("Before: embedded error of the base", base, style.PUSH_FORWARD_BAND, style.ADDITIVE),
+        (f"After: with the {' and '.join(names)}", improved, style.MODEL_ERROR_BAND, style.POSTERIOR),
+    )
+    value = float(two.recording.x["phi"].min())
+    for (left, right), (name, result, band, line) in zip(axes, rows, strict=True):
+        _draw_lean(left, two, result.predict(studies.grid(two, phi=value)).map, value, band, line)
+        moments = result.predict().map
+        _draw_misses(right, two, moments, band, line)
+        left.set_title(name, fontsize="medium", fontweight="bold", loc="left")
+        sd = float(moments.sd.square().mean().sqrt())
+        text = f"embedded sd {sd:.3f}, rms error {studies.rms_residual(two, moments.mean):.3f} (in ln τ)"
+        right.set_title(text, fontsize="medium", loc="left")
+        for ax in (left, right):
+            style.dress(ax)
+    return figure
+
+
+def _draw_lean(ax: "Axes", two: Study, moments: Moments, phi: float, band: str, line: str) -> None:
+    """Delays over T0 at one Φ, with a band of ±2 sd."""
+    T0, units = studies.grid(two, phi=phi)["T0"].numpy(), two.recording.units
+    mean, half = moments.mean.numpy(), 2 * moments.sd.numpy()
+    ax.fill_between(T0, mean - half, mean + half, color=band, lw=0, label="one-step model ± 2 sd")
+    ax.plot(T0, mean, color=line, lw=1.2)
+    keep = two.recording.x["phi"] == phi
+    ax.plot(two.recording.x["T0"][keep], two.recording.y[keep], **_DATA_LOOK, label="GRI-Mech 3.0")
+    ax.set_xlabel(style.label("T0", units, LABELS))
+    ax.set_ylabel(style.label("ln_tau", units, LABELS))
+    style.legend(ax, title=f"lean mixture, Φ = {phi:g}")
 
 
 _DATA_LOOK = {"marker": "o", "ls": "none", "ms": 4, "mfc": "white", "mec": style.DATA, "mew": 0.9, "zorder": 5}

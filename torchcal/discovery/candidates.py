@@ -217,7 +217,9 @@ def _in_pieces(linear: object, rows: Tensor, amplitudes: list[int]) -> Tensor:
     return torch.cat([linear(rows[k : k + 16], amplitudes)[1] for k in range(0, len(rows), 16)])  # type: ignore[operator]
 
 
-def _hidden_amplitudes(problem: Problem, own: list[int], certain: list[bool], begin: Tensor, linear: object) -> list[int]:
+def _hidden_amplitudes(
+    problem: Problem, own: list[int], certain: list[bool], begin: Tensor, linear: object
+) -> list[int]:
     for place, sure in zip(own, certain, strict=True):
         if not sure:
             continue

@@ -106,7 +106,9 @@ def responses(problem: Problem, found: Fitted, forcing: Tensor) -> tuple[Tensor,
     along = bound.along(values, states)
     flat = bins.reshape(-1)
     real = flat >= 0
-    weight = torch.zeros(count, dtype=torch.float64).index_add_(0, flat[real], torch.ones(int(real.sum()), dtype=torch.float64))
+    weight = torch.zeros(count, dtype=torch.float64).index_add_(
+        0, flat[real], torch.ones(int(real.sum()), dtype=torch.float64)
+    )
     drivers = {}
     for name, table in along.items():
         middle = (0.5 * (table[:, :-1] + table[:, 1:])).reshape(-1)[real]
@@ -135,12 +137,18 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
         labels += [("parameter", names[i], problem.parameters[i].unit) for i in own]
         for m, (kind, target, unit) in enumerate(labels):
             list_.append(Channel(kind, target, unit, drivers, time, response[:, :, m]))
-        at_data = {name: values[problem.condition_of] for name, values in problem.drivers(found.values[None], states).items()}
+        at_data = {
+            name: values[problem.condition_of] for name, values in problem.drivers(found.values[None], states).items()
+        }
     else:
-        at_data = {name: values[problem.condition_of] for name, values in problem.drivers(found.values[None], None).items()}
+        at_data = {
+            name: values[problem.condition_of] for name, values in problem.drivers(found.values[None], None).items()
+        }
         time = problem.order[problem.condition_of] if problem.order is not None else torch.arange(problem.n).double()
         for j, i in enumerate(found.free):
-            list_.append(Channel("parameter", names[i], problem.parameters[i].unit, at_data, time, found.jacobian[:, j]))
+            list_.append(
+                Channel("parameter", names[i], problem.parameters[i].unit, at_data, time, found.jacobian[:, j])
+            )
     time = problem.order[problem.condition_of] if problem.order is not None else torch.arange(problem.n).double()
     for number, name in enumerate(problem.recording.outputs):
         mine = (problem.output_of == number).double()

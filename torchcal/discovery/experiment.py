@@ -22,8 +22,8 @@ def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
     """The experiment, among a few that anyone can do, that separates the two nearest of the models most.
 
     Runs are repeated with other initial states, stronger or weaker inputs, or for longer; static conditions are moved
-    beyond their range. The predicted distance is what is left after every model's parameters have been fitted to old and
-    new data together (linearised).
+    beyond their range. The predicted distance is what is left after every model's parameters have been fitted to old
+    and new data together (linearised).
     """
     if len(models) < 2:
         return None
@@ -109,12 +109,26 @@ def _in_time(recording: Recording) -> list[tuple[str, Recording, dict[str, Any]]
     known = {**{k: v for k, v in start.items()}, **first.initial}
     options: list[tuple[str, dict[str, float], float, float]] = []
     for factor in (2.0, 0.5, 3.0, -1.0):
-        options.append((f"a run that starts from {factor:g} times the initial states of the first", {k: factor * v for k, v in known.items()}, 1.0, 1.0))
+        options.append(
+            (
+                f"a run that starts from {factor:g} times the initial states of the first",
+                {k: factor * v for k, v in known.items()},
+                1.0,
+                1.0,
+            )
+        )
     if first.inputs:
         for factor in (2.0, 0.5, 3.0):
             options.append((f"a run with {factor:g} times the inputs of the first", known, factor, 1.0))
     options.append(("a run three times as long as the first", known, 1.0, 3.0))
-    options.append(("a run that starts from 2 times the initial states and is twice as long", {k: 2 * v for k, v in known.items()}, 1.0, 2.0))
+    options.append(
+        (
+            "a run that starts from 2 times the initial states and is twice as long",
+            {k: 2 * v for k, v in known.items()},
+            1.0,
+            2.0,
+        )
+    )
     for text, initial, strength, longer in options:
         copies = int(longer)
         span = first.time[-1] - first.time[0]
@@ -139,7 +153,9 @@ def _static(recording: Recording) -> list[tuple[str, Recording, dict[str, Any]]]
             if low >= 0 > target:
                 continue
             moved = {k: v.clone() for k, v in x.items()}
-            moved[name] = torch.linspace(*((high, target) if end == "above" else (target, low)), recording.n, dtype=torch.float64)
+            moved[name] = torch.linspace(
+                *((high, target) if end == "above" else (target, low)), recording.n, dtype=torch.float64
+            )
             given: Any = moved if isinstance(recording.x, dict) else moved["x"]
             where = Recording(x=given, y=zeros)
             found.append((f"conditions with {name} {end} the recorded range, to {target:.4g}", where, {"x": moved}))

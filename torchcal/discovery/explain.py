@@ -8,11 +8,21 @@ from torch import Tensor
 
 from torchcal.discovery.channels import Channel
 from torchcal.discovery.fitting import Fitted
+from torchcal.discovery.local import region_text
 from torchcal.discovery.records import Estimate, Fit, Limit, Location, MissingRate, NeededShift, Table
 from torchcal.discovery.search import Model, Search
 from torchcal.discovery.structure import Place, Structure
 
-__all__ = ["estimates", "fit_record", "identifiability", "limits", "locate", "missing_rate", "needed_shifts", "symptoms"]
+__all__ = [
+    "estimates",
+    "fit_record",
+    "identifiability",
+    "limits",
+    "locate",
+    "missing_rate",
+    "needed_shifts",
+    "symptoms",
+]
 
 #: A span begins where the estimated change exceeds this share of its largest magnitude.
 SPAN_LEVEL = 0.3
@@ -176,11 +186,13 @@ def missing_rate(search: Search) -> MissingRate | None:
 def symptoms(search: Search, best: Model | None) -> list[str]:
     """Calibrated values that give the mismatch away."""
     rows = []
-    sd = search.base.sd()
+    sd = search.base.sd() * (misfit_size(search.base) if search.exact else 1.0)
     for i, at in zip(search.base.free, search.base.at_bound.tolist(), strict=True):
         q = search.base.problem.parameters[i]
         if at:
-            rows.append(f"{q.name} runs to its bound, {float(search.base.values[i]):.4g}{_unit(q.unit)}, in the calibrated base")
+            rows.append(
+                f"{q.name} runs to its bound, {float(search.base.values[i]):.4g}{_unit(q.unit)}, in the calibrated base"
+            )
     if best is not None:
         places = {q.name: k for k, q in enumerate(best.found.problem.parameters)}
         for i in search.base.free:
@@ -227,7 +239,9 @@ def identifiability(search: Search) -> list[str]:
         for j in range(i):
             c = abs(screening.correlation(i, j))
             if c > 0.99:
-                rows.append(f"{search.candidates[j].name} and {candidate.name} are nearly the same here (correlation {c:.3f})")
+                rows.append(
+                    f"{search.candidates[j].name} and {candidate.name} are nearly the same here (correlation {c:.3f})"
+                )
     return rows[:12]
 
 
@@ -239,7 +253,8 @@ def formulas(model: Model) -> list[str]:
                if model.found.problem.parameters[i].name in
                {*(term.full(q.name) for q in term.parameters), *term.frees}]  # fmt: skip
         text = term.formula or term.name
+        if model.window is not None:
+            w = model.window
+            text = f"{text.split(' where ')[0]} where {region_text(w.driver, w.low, w.high)}"
         rows.append(f"{text}, with " + "; ".join(str(e) for e in estimates(model.found, own)))
     return rows
-
-

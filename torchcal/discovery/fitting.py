@@ -186,6 +186,7 @@ def fit(
     size = torch.zeros(len(values), len(free), dtype=torch.float64)
     done = torch.zeros(len(values), dtype=torch.bool)
     lost = torch.zeros(len(values), dtype=torch.long)
+    eager = torch.full_like(chi2, 0.2)
     for _ in range(max_steps):
         if not free:
             break
@@ -193,21 +194,24 @@ def fit(
         if bool(log.any()):
             slope = torch.where(log, slope * values[:, None, free], slope)
         gradient = (slope.transpose(-1, -2) @ residual.unsqueeze(-1))[..., 0]
-        normal = slope.transpose(-1, -2) @ slope
-        size = torch.maximum(size * 0.9, normal.diagonal(dim1=-2, dim2=-1))
+        diagonal = slope.square().sum(-2)
+        size = torch.maximum(size * 0.9, diagonal)
         now = values[:, free]
         stuck = ((now <= low) & (gradient < 0)) | ((now >= high) & (gradient > 0)) | (size <= 0)
-        gradient = torch.where(stuck, torch.zeros_like(gradient), gradient)
-        unit = torch.where(stuck | (size <= 0), torch.ones_like(size), size).sqrt()
-        matrix = normal / (unit[:, :, None] * unit[:, None])
-        matrix = torch.where(stuck[:, :, None] | stuck[:, None], torch.zeros_like(matrix), matrix)
-        matrix = matrix + torch.diag_embed(damping[:, None] + 1e-12 + stuck.to(matrix))
-        change = torch.linalg.solve(matrix, (gradient / unit).unsqueeze(-1))[..., 0] / unit
+        unit = torch.where(stuck, torch.ones_like(size), size).sqrt()
+        # By singular values: the squares of nearly parallel tangents would lose what tells them apart.
+        u, s, v = torch.linalg.svd(
+            torch.where(stuck[:, None], torch.zeros_like(slope), slope / unit[:, None]), full_matrices=False
+        )
+        along = (u.transpose(-1, -2) @ residual.unsqueeze(-1))[..., 0]
+        shrink = s / (s.square() + damping[:, None] + 1e-14)
+        change = (v.transpose(-1, -2) @ (shrink * along).unsqueeze(-1))[..., 0] / unit
         moved = torch.where(log, now * change.clamp(-2, 2).exp(), now + change).clamp(low, high)
         trial = values.clone()
         trial[:, free] = torch.where(done[:, None], now, moved)
         step = torch.where(log, (trial[:, free] / now).log(), trial[:, free] - now)
-        predicted = 2 * (step * gradient).sum(-1) - (step.unsqueeze(1) @ normal @ step.unsqueeze(-1))[:, 0, 0]
+        reach = (slope @ step.unsqueeze(-1))[..., 0]
+        predicted = 2 * (step * gradient).sum(-1) - reach.square().sum(-1)
         # A step from which the trajectory cannot be mended at once is too long; only if that goes on is it marched.
         y_new, jacobian_new, residual_new, chi2_new, warm_new = evaluate(trial, warm, bool((lost >= 3).any()))
         lost = torch.where(torch.isfinite(chi2_new) | (lost >= 3), torch.zeros_like(lost), lost + 1)
@@ -215,14 +219,25 @@ def fit(
         better = (chi2_new < chi2) & ~done
         small = predicted <= TOLERANCE * (chi2 + 1e-3 * problem.n)
         done = done | (small & ~(chi2_new < chi2 * (1 - TOLERANCE))) | (~better & (damping > 1e10))
-        for old, new in ((values, trial), (y, y_new), (jacobian, jacobian_new), (residual, residual_new), (chi2, chi2_new)):
+        for old, new in (
+            (values, trial),
+            (y, y_new),
+            (jacobian, jacobian_new),
+            (residual, residual_new),
+            (chi2, chi2_new),
+        ):
             old[better] = new[better]
         if isinstance(warm, Tensor) and isinstance(warm_new, Tensor):
             warm = warm.clone()
             warm[better] = warm_new[better]
         else:
             warm = warm_new if bool(better.all()) else warm
-        damping = torch.where(better, damping * torch.where(gain > 0.75, 0.2, torch.where(gain > 0.25, 0.5, 2.0)), damping * 5)
+        # A step that had to be taken back teaches caution: along a bent valley the damping would swing otherwise.
+        eager = torch.where(better, (eager * 0.9).clamp_min(0.2), (eager * 2.0).clamp_max(0.8))
+        ease = torch.where(
+            gain > 0.75, eager, torch.where(gain > 0.25, torch.full_like(gain, 0.9), torch.full_like(gain, 2.0))
+        )
+        damping = torch.where(better, damping * ease, damping * 4.0)
         damping = damping.clamp(1e-9, 1e12)
         if bool(done.all()):
             break

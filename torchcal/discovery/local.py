@@ -44,7 +44,9 @@ def localised(term: Term, driver: str, low: float, high: float, span: tuple[floa
         return w
 
     def moving(function: Callable[..., Any]) -> Callable[..., Any]:
-        return lambda t, s, p, u: inside(t if driver == "t" else s[driver] if driver in s else u[driver], p) * function(t, s, p, u)
+        return lambda t, s, p, u: (
+            inside(t if driver == "t" else s[driver] if driver in s else u[driver], p) * function(t, s, p, u)
+        )
 
     def sensing(function: Callable[..., Any]) -> Callable[..., Any]:
         def observe(t: Any, s: Any, p: Any, u: Any, y: Any) -> Any:

@@ -174,9 +174,7 @@ class Problem:
         self, values: Tensor, columns: list[int], warm: Any = None, *, march: bool = True
     ) -> tuple[Tensor, Tensor, Any]:
         """Outputs at the used data ``(H, n)``, their derivatives ``(H, n, columns)``, and a warm start."""
-        found = self.simulator.linearise(
-            self.recording.x, values, self.recording.outputs, columns, warm, march=march
-        )
+        found = self.simulator.linearise(self.recording.x, values, self.recording.outputs, columns, warm, march=march)
         if found.y.shape[-1] != len(self.recording.y):
             raise SimulatorError(
                 f"Expected {len(self.recording.y)} output values, as in the recording. Got {found.y.shape[-1]}."

@@ -155,9 +155,7 @@ def contributions(
     return {i: torch.diag(tangent) for i, tangent in zip(chosen, parts, strict=True)}, drivers
 
 
-def windows(
-    residual: Residual, candidates: Sequence[Candidate], screening: Screening
-) -> tuple[list[Window], Tensor]:
+def windows(residual: Residual, candidates: Sequence[Candidate], screening: Screening) -> tuple[list[Window], Tensor]:
     """Score candidates that act only in a range of time, a state, an input or a condition.
 
     Returns the best window of every candidate and driver, and the largest score in each simulated residual.
@@ -176,7 +174,12 @@ def windows(
                 continue
             running = torch.cat([response.new_zeros(len(response), 1), response[:, order].cumsum(1)], dim=1)
             cuts = torch.linspace(0, len(order), 13).round().long().unique()
-            edges = [(int(a), int(b)) for x, a in enumerate(cuts) for b in cuts[x + 1 :] if (int(a), int(b)) != (0, len(order))]
+            edges = [
+                (int(a), int(b))
+                for x, a in enumerate(cuts)
+                for b in cuts[x + 1 :]
+                if (int(a), int(b)) != (0, len(order))
+            ]
             columns = torch.stack([running[:, b] - running[:, a] for a, b in edges], dim=-1)
             norm = columns.norm(dim=0)
             keep = norm > max(VANISHED * total, 1e-300)
@@ -188,10 +191,14 @@ def windows(
             if sign:
                 z, simulated = (sign * z).clamp_min(0), (sign * simulated).clamp_min(0)
             null = torch.maximum(null, simulated.abs().amax(0))
-            k = int(z.abs().argmax())
-            a, b = edges[k]
             ordered = driver[order]
-            low = -math.inf if a == 0 else float(0.5 * (ordered[a - 1] + ordered[a]))
-            high = math.inf if b == len(order) else float(0.5 * (ordered[b - 1] + ordered[min(b, len(order) - 1)]))
-            found.append(Window(i, name, low, high, float(z[k].abs()), float((unit[:, k] @ residual.e) / norm[k])))
+            chosen = int(z.abs().argmax())
+            open_ended = torch.tensor([a == 0 or b == len(order) for a, b in edges])
+            simple = int(torch.where(open_ended, z.abs(), torch.zeros_like(z)).argmax())
+            for k in dict.fromkeys((chosen, simple)):
+                a, b = edges[k]
+                low = -math.inf if a == 0 else float(0.5 * (ordered[a - 1] + ordered[a]))
+                high = math.inf if b == len(order) else float(0.5 * (ordered[b - 1] + ordered[b]))
+                size = float((unit[:, k] @ residual.e) / norm[k].clamp_min(1e-300))
+                found.append(Window(i, name, low, high, float(z[k].abs()), size))
     return found, null

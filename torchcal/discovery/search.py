@@ -26,7 +26,11 @@ PRIOR = {"base": 0.30, "single": 0.40, "local": 0.10, "several": 0.08, "none": 0
 #: Prior odds against an estimate on a physical bound that it wants to cross.
 UNPHYSICAL = math.log(1e-3)
 #: Refits at most: single terms, windows, pairs.
-MOST = {"single": 40, "local": 5, "pairs": 12}
+MOST = {"single": 40, "local": 8, "pairs": 12}
+#: Data below which no window is sought; nor is any without noise, where a window bends to whatever is left.
+LEAST_LOCAL = 30
+#: Shares of the linear estimate from which refits begin.
+STEPS = (0.05, 1.0)
 #: Correlation of projected tangents above which two candidates are one.
 SAME = 0.9999
 #: The solver's error against the noise.
@@ -140,7 +144,7 @@ class Search:
             self.problem = self.base.problem
 
     def _from_starts(self, begin: Tensor, free: list[int], rough: Tensor, outputs: Tensor) -> Fitted | None:
-        """The best fit from many starts: over the first part of the runs, then over all, as phases tell one from another."""
+        """The best fit from many starts: over the first part of the runs, then over all, so that no phase is lost."""
         problem = self.problem
         if not problem.in_time:
             return fit(problem, problem.whitening(rough, outputs), begin, free)
@@ -164,7 +168,9 @@ class Search:
         problem = dataclasses.replace(found.problem, keep=keep)
         rough = torch.zeros(len(keep), dtype=torch.float64)
         rough[found.problem.index] = found.whitening.sd
-        return refit(found, problem.whitening(rough, torch.zeros(len(problem.recording.outputs), dtype=torch.float64)), problem)
+        return refit(
+            found, problem.whitening(rough, torch.zeros(len(problem.recording.outputs), dtype=torch.float64)), problem
+        )
 
     def _sharpen(self, found: Fitted) -> Fitted:
         """Halve the time steps until the solver's error is small against the noise."""
@@ -228,7 +234,7 @@ class Search:
                     break
 
     def merge(self) -> None:
-        """Candidates with the same projected tangent whose refits cannot be told apart become one, under the first name."""
+        """Candidates whose tangents and refits cannot be told apart become one, under the first name."""
         plain = {m.numbers[0]: m for m in self.models if len(m.numbers) == 1 and m.window is None}
         self.aliases = {}
         gone: set[int] = set()
@@ -245,7 +251,9 @@ class Search:
         """Whether an alias is the same formula in the same place, under another name."""
         j = next(k for k, c in enumerate(self.candidates) if c.name == name)
         a, b = self.candidates[i], self.candidates[j]
-        places = [(*c.terms[0].rates, "|", *c.terms[0].outputs, "|", *c.terms[0].shifts, *c.terms[0].frees) for c in (a, b)]
+        places = [
+            (*c.terms[0].rates, "|", *c.terms[0].outputs, "|", *c.terms[0].shifts, *c.terms[0].frees) for c in (a, b)
+        ]
         u, v = a.tangents[0, :, 0], b.tangents[0, :, 0]
         return places[0] == places[1] and float((u @ v).abs()) >= (1 - 1e-12) * float(u.norm() * v.norm())
 
@@ -268,11 +276,14 @@ class Search:
 
     def _refit_local(self) -> None:
         """Windows that promise more than the same term everywhere."""
+        if self.exact or self.problem.n < LEAST_LOCAL:
+            return
         gains = {model.numbers[0]: 2 * model.log_evidence + math.log(self.problem.n) for model in self.models}
-        promising = [
-            w for w in self.local
-            if w.candidate not in self.gone and w.z**2 > max(gains.get(w.candidate, 0.0), self.screening.score(w.candidate) ** 2) + 6.0 and w.z > 3.5
-        ]  # fmt: skip
+        promising = []
+        for w in self.local:
+            plain = max(gains.get(w.candidate, 0.0), self.screening.score(w.candidate) ** 2)
+            if w.candidate not in self.gone and w.z > 3.5 and w.z**2 > plain + 6.0:
+                promising.append(w)
         promising.sort(key=lambda w: -w.z)
         prior = math.log(PRIOR["local"] / max(len(self.candidates), 1))
         for w in promising[: MOST["local"]]:
@@ -297,8 +308,8 @@ class Search:
         values = dict(zip([plain.problem.parameters[i].name for i in plain.own],
                           plain.shapes[int(self.screening.shape[column])].tolist(), strict=True))  # fmt: skip
         amplitude = plain.problem.parameters[plain.amplitudes[int(self.screening.amplitude[column])]].name
-        values[amplitude] = w.amplitude
         begin = candidate.begin.clone()
+        values[amplitude] += 0.02 * w.amplitude
         for i in candidate.own:
             name = candidate.problem.parameters[i].name
             if name in values:
@@ -306,7 +317,9 @@ class Search:
             else:
                 begin[i] = w.low if name.endswith("from") else w.high
         # Windows were searched on a grid of about 12 edges: the best of so many costs its logarithm.
-        model = self._refit((w.candidate,), candidate, begin[None], prior - math.log(3.0 * len(self._drivers())), window=w)
+        model = self._refit(
+            (w.candidate,), candidate, begin[None], prior - math.log(3.0 * len(self._drivers())), window=w
+        )
         if model is None:
             return None
         low, high = w.low, w.high
@@ -337,14 +350,25 @@ class Search:
             used.add(g)
             a = int(self.screening.amplitude[column])
             signed = float(self.screening.columns[:, column] @ self.residual.e) / float(self.screening.norm[column])
-            for factor in (1.0, 3.0) if len(used) == 1 else (1.0,):
-                row = candidate.begin.clone()
-                row[candidate.own] = candidate.shapes[g]
-                row[candidate.amplitudes[a]] += factor * signed
-                rows.append(row)
+            for factor in STEPS if len(used) == 1 else STEPS[:1]:
+                rows.append(self._step_along(candidate, g, a, factor * signed))
             if len(used) == 3:
                 break
         return torch.stack(rows)
+
+    def _step_along(self, candidate: Candidate, shape: int, amplitude: int, size: float) -> Tensor:
+        """The base's estimate with an amplitude of some size, and the rest moved to make up for it (linearised)."""
+        row = candidate.begin.clone()
+        row[candidate.own] = candidate.shapes[shape]
+        row[candidate.amplitudes[amplitude]] += size
+        w = self.base.whitening
+        slope, tangent = w(self.base.jacobian), w(candidate.tangents[shape, :, amplitude, None])
+        unit = slope.norm(dim=0).clamp_min(1e-300)
+        change = torch.linalg.lstsq(slope / unit, tangent, driver="gelsd").solution[:, 0] / unit
+        names = [q.name for q in candidate.problem.parameters]
+        for i, moved in zip(self.base.free, change.tolist(), strict=True):
+            row[names.index(self.base.problem.parameters[i].name)] -= size * moved
+        return row
 
     def _blind_begin(self, candidate: Candidate) -> Tensor:
         """Amplitudes of all magnitudes, where the tangent says nothing."""
@@ -369,8 +393,22 @@ class Search:
         if isinstance(self.base.warm, Tensor) and isinstance(candidate.problem.simulator, Trajectories):
             if len(candidate.problem.simulator.ode.states) == self.base.warm.shape[-1]:
                 warm = self.base.warm.expand(len(begin), *self.base.warm.shape[1:])
-        steps = 40 if window is None else 20
-        found = fit(candidate.problem, whitening, begin, candidate.free, warm=warm, max_steps=steps)
+        shape = [i for i in candidate.own if i not in candidate.amplitudes]
+        if shape:  # while the amplitude is small its shape means nothing
+            first = fit(
+                candidate.problem,
+                whitening,
+                begin,
+                [i for i in candidate.free if i not in shape],
+                warm=warm,
+                max_steps=12,
+            )
+            if first is None or first.ends is None or first.ends_chi2 is None:
+                return None
+            begin, warm = first.ends[first.ends_chi2.argsort()[:2]], None
+            if isinstance(first.warm, Tensor):
+                warm = first.warm.expand(len(begin), *first.warm.shape[1:])
+        found = fit(candidate.problem, whitening, begin, candidate.free, warm=warm, max_steps=60)
         if found is None:
             return None
         return self._judge(Model(numbers, candidate, found, 0.0, prior, True, window=window))
@@ -385,9 +423,12 @@ class Search:
         edges = [name for name in stuck if "window" in name]
         new = [name for name in stuck if name not in before and name not in edges]
         amplitude = {names[i] for i in candidate.amplitudes}
-        off = {names[i] for i, at in zip(found.free, found.at_bound.tolist(), strict=True)
-               if at and names[i] in amplitude and abs(float(found.values[i] - candidate.neutral[candidate.own.index(i)]))
-               <= 1e-9 * (1 + abs(float(found.values[i])))}  # fmt: skip
+        off = set()
+        for i, at in zip(found.free, found.at_bound.tolist(), strict=True):
+            if at and names[i] in amplitude:
+                value, neutral = float(found.values[i]), float(candidate.neutral[candidate.own.index(i)])
+                if abs(value - neutral) <= 1e-9 * (1 + abs(value)):
+                    off.add(names[i])
         model.physical = not new
         if off:
             model.note = f"wants the wrong sign: {', '.join(sorted(off))} stays at its neutral value"
@@ -451,7 +492,8 @@ class Search:
                 wanted[tuple(sorted((model.numbers[0], j)))] = None
         pairs = [pair for pair in wanted if len(set(pair)) == 2][: MOST["pairs"]]
         prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))
-        fitted = [m for pair in pairs if (m := self._refit_terms(pair, prior)) is not None]
+        tried = [self._refit_terms(pair, prior) for pair in pairs]
+        fitted = [m for m in tried if m is not None]
         self.models += fitted
         if self.max_terms < 3 or not fitted:
             return
@@ -461,9 +503,9 @@ class Search:
             for j in self._next_terms(best)[:4]:
                 if j in best.numbers:
                     continue
-                model = self._refit_terms(tuple(sorted((*best.numbers, j))), third)
-                if model is not None:
-                    self.models.append(model)
+                again = self._refit_terms(tuple(sorted((*best.numbers, j))), third)
+                if again is not None:
+                    self.models.append(again)
 
     def _linear_pairs(self) -> list[tuple[int, int]]:
         usable = [i for i in range(len(self.candidates)) if self.screening.best[i] >= 0 and i not in self.gone]
@@ -499,7 +541,9 @@ class Search:
         terms = [term for i in numbers for term in self.candidates[i].terms]
         self.tick("refit with " + ", ".join(term.name for term in terms))
         try:
-            candidate = prepare(self.base.problem, self.base, terms, self.fixed, drivers_scale(self.base.problem, self.base))
+            candidate = prepare(
+                self.base.problem, self.base, terms, self.fixed, drivers_scale(self.base.problem, self.base)
+            )
         except (SimulatorError, DomainError):
             return None
         names = [q.name for q in candidate.problem.parameters]
@@ -508,7 +552,11 @@ class Search:
             single = next((m for m in self.models if m.numbers == (lead,) and m.window is None), None)
             row = candidate.begin.clone()
             if single is not None:
-                known = dict(zip([q.name for q in single.candidate.problem.parameters], single.found.values.tolist(), strict=True))
+                known = dict(
+                    zip(
+                        [q.name for q in single.candidate.problem.parameters], single.found.values.tolist(), strict=True
+                    )
+                )
                 for k, name in enumerate(names):
                     if name in known:
                         row[k] = known[name]
@@ -522,7 +570,7 @@ class Search:
                     k = names.index(name)
                     neutral = float(source.neutral[source.own.index(place)])
                     value = float(fitted.found.values[place]) if fitted is not None else neutral
-                    row[k] = neutral + 0.2 * (value - neutral) if place in source.amplitudes else value
+                    row[k] = neutral + 0.02 * (value - neutral) if place in source.amplitudes else value
             rows.append(row)
         return self._refit(numbers, candidate, torch.stack(rows), prior)
 
@@ -547,5 +595,3 @@ def _joint(nulls: Sequence[Tensor], seen: Sequence[float]) -> float:
 def describe(model: Model) -> str | None:
     """Where a local model acts."""
     return None if model.window is None else region_text(model.window.driver, model.window.low, model.window.high)
-
-

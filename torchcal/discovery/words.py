@@ -150,9 +150,7 @@ def _unexplained(d: Any) -> list[str]:
     if best is not None:
         parts.append(
             f"The best of the library, {_and(list(best.terms))}, removes {percent(best.misfit_removed)} of the misfit "
-            "beyond noise"
-            + (f" ({best.note})" if best.note else "")
-            + "."
+            "beyond noise" + (f" ({best.note})" if best.note else "") + "."
         )
     if d.settings.get("withdrawn"):
         parts.append(d.settings["withdrawn"])

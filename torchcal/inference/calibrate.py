@@ -31,7 +31,7 @@ from torchcal.prediction import embedded_prediction
 from torchcal.priors import Flat
 from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results import Calibration, MapEstimate
-from torchcal.results.in_time import NODE_TOLERANCE
+from torchcal.results.in_time import check_nodes_in_time
 from torchcal.simulators import Scaling, Simulator, Trajectories
 
 __all__ = ["calibrate"]
@@ -207,5 +207,6 @@ def _check_propagation(propagate: NISP, alpha: Tensor, samples: Tensor | None) -
     points = alpha[None]
     if samples is not None:
         points = torch.cat([points, samples[:8, -1].to(points)])
-    tolerance = 10 * NODE_TOLERANCE if isinstance(propagate.simulator, Trajectories) else 1e-6
-    return propagate.check(points, tolerance=tolerance)
+    if isinstance(propagate.simulator, Trajectories):
+        return check_nodes_in_time(propagate, points)
+    return propagate.check(points)

@@ -15,7 +15,7 @@ from torchcal.inference.randomness import preserve_random_state
 from torchcal.inference.tangent import search
 from torchcal.models import Problem
 from torchcal.propagation import NISP
-from torchcal.results.in_time import NODE_TOLERANCE
+from torchcal.results.in_time import refine_in_time
 from torchcal.simulators import Trajectories
 
 __all__ = ["Estimate", "Laplace", "check_starts", "laplace", "maximise"]
@@ -120,7 +120,7 @@ def maximise(
     if problem.propagate.pattern.num_germs:
         for _ in range(4):  # a maximum found with too few nodes may move with more of them
             best = transform.bound(found.points[:1])[..., : problem.propagate.num_alpha]
-            if not problem.propagate.refine(best, tolerance=NODE_TOLERANCE if in_time else 1e-7):
+            if not (refine_in_time(problem.propagate, best) if in_time else problem.propagate.refine(best)):
                 break
             points = found.points[: 1 if in_time else max(4, total // 4)]
             found = minimise(lambda u: objective(problem.propagate, u), points, progress=show)

@@ -22,7 +22,7 @@ from torchcal.results import storage
 from torchcal.results.base import Result, conditions, indent, thin
 from torchcal.results.diagnostics import Diagnostics, table
 from torchcal.results.estimate import MapEstimate
-from torchcal.results.in_time import NODE_TOLERANCE, propagation_in_time
+from torchcal.results.in_time import check_nodes_in_time, propagation_in_time, refine_in_time
 from torchcal.simulators import Simulator, Trajectories
 
 __all__ = ["Calibration"]
@@ -101,8 +101,12 @@ class Calibration(Result):
             other = self.propagate.at(where, simulator=simulator)
         if other.pattern.num_germs:  # nodes that were enough at the data may not be elsewhere
             alpha = self.map.alpha.to(other.nodes)
-            other.refine(alpha, tolerance=NODE_TOLERANCE if in_time else 1e-7)
-            other.check(alpha, tolerance=10 * NODE_TOLERANCE if in_time else 1e-6)
+            if in_time:
+                refine_in_time(other, alpha)
+                check_nodes_in_time(other, alpha)
+            else:
+                other.refine(alpha)
+                other.check(alpha)
         return other
 
     def sample_outputs(self, num: int, x: Any = None, *, kind: str = "posterior", seed: int = 0) -> Tensor:

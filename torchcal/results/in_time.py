@@ -1,5 +1,7 @@
 """A calibration in time at other times, or for other runs."""
 
+import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -7,16 +9,55 @@ import torch
 from torch import Tensor
 
 from torchcal.data import Recording, Run
-from torchcal.errors import DomainError
-from torchcal.propagation import NISP
+from torchcal.errors import DomainError, PropagationWarning
+from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results.base import conditions
 from torchcal.simulators import Conditions, Simulator, Trajectories
 
-__all__ = ["NODE_TOLERANCE", "propagation_in_time"]
+__all__ = ["check_nodes_in_time", "propagation_in_time", "refine_in_time"]
 
 NODE_TOLERANCE = 1e-5
 """Change of the moments of trajectories, relative to the output's scale, with which enough nodes are found. Long
 oscillations take many nodes for less, and the default tolerance ε is a hundred times as large."""
+
+
+def refine_in_time(propagate: NISP, alpha: Tensor) -> bool:
+    """Take more nodes until the moments at α settle, or trajectories at more of them blow up.
+
+    Returns:
+        Whether the rule has changed.
+    """
+    changed = False
+    germs = propagate.pattern.num_germs
+    while germs and propagate.rule_choice.kind == "tensor":
+        result = propagate.check(alpha, warn=False)
+        change = max(result.mean_change, result.sd_change, key=lambda number: (math.isnan(number), number))
+        finer = propagate.rule_choice.finer(germs)
+        if change <= NODE_TOLERANCE or not math.isfinite(change) or finer.size**germs > propagate.max_nodes:
+            break
+        propagate.set_rule(finer)
+        changed = True
+    return changed
+
+
+def check_nodes_in_time(propagate: NISP, alpha: Tensor) -> PropagationCheck:
+    """Hold the moments at α against a finer rule, as `NISP.check` does, with a tolerance that trajectories can meet.
+
+    Warns:
+        PropagationWarning: If they have not converged, or if trajectories blow up at nodes of the finer rule.
+    """
+    result = propagate.check(alpha, warn=False)
+    if math.isfinite(result.mean_change) and math.isfinite(result.sd_change):
+        return propagate.check(alpha, tolerance=10 * NODE_TOLERANCE)
+    warnings.warn(
+        f"The solution blows up at the outermost of {result.finer_nodes} quadrature nodes: the density of the "
+        f"parameters reaches values with which the model has no solution. The moments are those of {result.nodes} "
+        "nodes, which do not reach as far. Embed such a parameter as embeddings.Uniform or with transform='log', or "
+        "name others: embedding=Gaussian(parameters=(...)).",
+        PropagationWarning,
+        stacklevel=3,
+    )
+    return result
 
 
 class _Elsewhere(Simulator):

@@ -60,9 +60,7 @@ class ODESimulator(Simulator):
         if max_step is not None and not max_step > 0:
             raise DomainError(f"Expected max_step > 0 or None. Got {max_step!r}.")
         self.rates = rates
-        self.states: dict[str, str | None] = (
-            dict(states) if isinstance(states, Mapping) else dict.fromkeys(states)
-        )
+        self.states: dict[str, str | None] = dict(states) if isinstance(states, Mapping) else dict.fromkeys(states)
         self.parameters = check_parameters(parameters)
         self.degree = None
         self.initial = dict(initial or {})

@@ -305,7 +305,7 @@ class Trajectories(Simulator):
         columns = list(range(values.shape[-1])) if columns is None else list(columns)
         found = []
         with torch.no_grad():
-            states = self._solve(values, warm)
+            states = self._solve(values, warm, march=march)
             size = max(1, POINTS // self.node_times.numel())
             for v, s in zip(values.split(size), states.split(size), strict=True):
                 tangents = self._sensitivities(v, s, columns) if columns else None
@@ -406,6 +406,8 @@ class Trajectories(Simulator):
 
     def _solve(self, values: Tensor, warm: Any = None, *, march: bool = True) -> Tensor:
         if warm is None or warm.shape[0] != values.shape[0]:
+            if len(values) * self._h.numel() > POINTS:  # of many trajectories, a step costs less than a pass over all
+                return self._march(values)
             # Trajectories that stand still are a poor guess, but cost little to try.
             warm = self._start(values).unsqueeze(2).expand(-1, -1, self.num_steps + 1, -1)
             march = True

@@ -147,9 +147,7 @@ def extend(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
         DomainError: If a term names an equation, output or parameter that the simulator does not have.
     """
     if isinstance(simulator, Trajectories):
-        return Trajectories(
-            _extend_ode(simulator.ode, terms), simulator.recording, subdivide=simulator.subdivide
-        )
+        return Trajectories(_extend_ode(simulator.ode, terms), simulator.recording, subdivide=simulator.subdivide)
     if not terms:
         return simulator
     if isinstance(simulator, ODESimulator):
@@ -190,9 +188,7 @@ def _extend_ode(simulator: ODESimulator, terms: Sequence[Term]) -> ODESimulator:
     for term in terms:
         for place in term.rates:
             if place not in states:
-                raise DomainError(
-                    f"Expected the term {term.name!r} in an equation of {list(states)}. Got {place!r}."
-                )
+                raise DomainError(f"Expected the term {term.name!r} in an equation of {list(states)}. Got {place!r}.")
         for place in term.outputs:
             if place not in simulator.observe:
                 raise DomainError(
@@ -276,9 +272,7 @@ def _extend_static(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
             for name, sensor in term.outputs.items():
                 place = name if name in found else "y" if not isinstance(result, Mapping) else name
                 if place not in found:
-                    raise DomainError(
-                        f"Expected the term {term.name!r} on an output of {list(found)}. Got {name!r}."
-                    )
+                    raise DomainError(f"Expected the term {term.name!r} on an output of {list(found)}. Got {name!r}.")
                 found[place] = sensor(x, term.own(p), found[place])
         return found if isinstance(result, Mapping) else found["y"]
 

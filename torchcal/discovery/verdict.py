@@ -1,0 +1,255 @@
+"""The verdict: consistent, named, ambiguous or unexplained."""
+
+import math
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from torchcal.discovery import explain, verify
+from torchcal.discovery.search import PRIOR, Model, Search
+from torchcal.discovery.structure import Structure
+
+__all__ = ["Decision", "decide"]
+
+#: A hypothesis is named when it has at least this probability among those the library offers.
+NAMED = 0.98
+#: Structure left after a hypothesis with less probability than this by noise alone speaks against it.
+WHITE = 0.005
+#: Of the tied hypotheses, those that together have this probability are listed.
+TIED = 0.98
+#: Of a recording without noise, the share of the held-out misfit that a named term must remove.
+REMOVED = 0.9
+#: The same of a recording whose noise is unknown, and how much more of the misfit every rival must leave.
+NEARLY, BEATEN = 0.97, 3.0
+
+
+class Decision:
+    """Verdict, accepted model and probabilities.
+
+    Attributes:
+        verdict: As in `Diagnosis`.
+        best: The accepted model.
+        tied: Sets of names that the data cannot tell apart.
+        tied_models: Their models.
+        probability: Of every model, by its ``id``.
+        none: Probability of something that is not in the library.
+        base: Probability of the base alone.
+        none_evidence: Log weight of the former.
+        withdrawn: Why a name was withdrawn, in words.
+    """
+
+    def __init__(self) -> None:
+        self.verdict = "consistent"
+        self.best: Model | None = None
+        self.tied: list[list[str]] = []
+        self.tied_models: list[Model] = []
+        self.probability: dict[int, float] = {}
+        self.none = 0.0
+        self.base = 1.0
+        self.none_evidence = 0.0
+        self.withdrawn = ""
+
+
+def _unknown(search: Search, structure: Structure, *, calibrated: bool) -> float:
+    """Log evidence of something smooth and unknown beside a model.
+
+    Calibrated, it is held against what noise alone gives: at most −1/(e p ln p) for a probability p (Sellke, Bayarri &
+    Berger 2001), and beyond the largest simulated value the surplus.
+    """
+    kinds = ("equation", "output") if search.problem.in_time else ("parameter", "output")
+    places = [p.evidence for p in structure.places if p.channel.kind in kinds]
+    if not places:
+        return -math.inf
+    seen = max(places)
+    if not calibrated:
+        return seen - math.log(len(places))
+    p = structure.p_value
+    bound = -math.log(-math.e * p * math.log(p)) if p < 1.0 / math.e else 0.0
+    return bound + max(seen - float(structure.null_best.max()), 0.0)
+
+
+def _none_evidence(search: Search, ranked: list[Model]) -> float:
+    """Log weight of "none of these": something unknown in the base, or beside the best models."""
+    prior = math.log(PRIOR["none"])
+    found = _unknown(search, search.structure, calibrated=False) + prior
+    for model in ranked[:4]:
+        found = max(found, model.weight + _unknown(search, search.examine(model), calibrated=True) + prior)
+    return found
+
+
+def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
+    """Weigh base, refitted models and something unknown; `mask` marks the held-out data."""
+    decision = Decision()
+    ranked = sorted((m for m in search.models if m.physical), key=lambda m: -m.weight)
+    if search.exact:
+        return _decide_exact(search, ranked, mask, decision)
+    decision.none_evidence = _none_evidence(search, ranked) if detected else math.log(PRIOR["none"])
+    _weigh(search, decision)
+    if not detected or decision.base >= max(decision.none, *decision.probability.values(), 0.0):
+        decision.verdict = "consistent"
+        return decision
+    groups = _groups(ranked)
+    white = [m for m in ranked[:6] if search.examine(m).p_value >= WHITE]
+    if not white or decision.none > 0.5:
+        decision.verdict = "unexplained"
+        _nearly(search, ranked, mask, decision)
+        return decision
+    best = white[0]
+    if groups[frozenset(best.names)] >= NAMED and not _other_names(search, best):
+        decision.verdict, decision.best = "named", best
+        _prove(search, decision, mask)
+        return decision
+    decision.verdict = "ambiguous"
+    covered = 0.0
+    seen: set[frozenset[str]] = set()
+    for model in ranked:
+        names = frozenset(model.names)
+        if names in seen or model.note:
+            continue
+        if covered >= TIED and seen:
+            break
+        if seen and model.weight < math.log(PRIOR["base"]):
+            break  # no better than the base is no explanation
+        seen.add(names)
+        covered += groups[names]
+        decision.tied.append(list(model.names))
+        decision.tied_models.append(model)
+        for other in _other_names(search, model):
+            decision.tied.append(
+                [other if name == search.candidates[model.numbers[0]].name else name for name in model.names]
+            )
+    if len(decision.tied) < 2:
+        decision.verdict, decision.best, decision.tied, decision.tied_models = "named", best, [], []
+        _prove(search, decision, mask)
+    return decision
+
+
+def _other_names(search: Search, model: Model) -> list[str]:
+    """Aliases of a single term that are different physics: these data cannot tell which it is."""
+    if len(model.numbers) != 1 or model.window is not None:
+        return []
+    i = model.numbers[0]
+    return [name for name in search.aliases.get(i, []) if not search.duplicate(i, name)]
+
+
+def _groups(models: Sequence[Model]) -> dict[frozenset[str], float]:
+    """Probability of each set of terms among all physical ones, wherever they act."""
+    if not models:
+        return {}
+    top = max(m.weight for m in models)
+    total = sum(math.exp(m.weight - top) for m in models)
+    found: dict[frozenset[str], float] = {}
+    for m in models:
+        names = frozenset(m.names)
+        found[names] = found.get(names, 0.0) + math.exp(m.weight - top) / total
+    return found
+
+
+def _gain(search: Search, model: Model, mask: Tensor | None, against: Model | None = None) -> float:
+    """Share of the squared misfit of the base, or of another model, that a model removes on held-out data."""
+    before = search.base if against is None else against.found
+    if mask is None:
+        return 1.0 - model.found.chi2 / before.chi2
+    seen = mask & search.problem.keep
+    old, new = (verify.held_out_fit(found, search.noise, mask) for found in (before, model.found))
+    if old is None or new is None:
+        return 0.0
+    y = search.problem.recording.y[seen]
+    floor = 0.0 if search.exact else float(search.noise.sd[seen].square().sum())
+    left = [max(float((y - part.prediction[seen]).square().sum()) - floor, 0.0) for part in (old, new)]
+    return 1.0 - left[1] / max(left[0], 1e-300)
+
+
+def _nearly(search: Search, ranked: list[Model], mask: Tensor | None, decision: Decision) -> None:
+    """Real recordings are never quite white: name what removes nearly all, on held-out data too, far before rivals."""
+    clean = [m for m in ranked if not m.note]
+    if search.problem.recording.noise is not None or not clean:
+        return
+    for size in sorted({len(m.numbers) for m in clean}):
+        mine = sorted((m for m in clean if len(m.numbers) == size), key=lambda m: m.found.chi2)
+        best = mine[0]
+        if explain.removed(search, best) < NEARLY or _gain(search, best, mask) < REMOVED:
+            continue
+        left = 1.0 - explain.removed(search, best)
+        rivals = [m for m in mine[1:] if frozenset(m.names) != frozenset(best.names)]
+        if not _other_names(search, best) and all(1.0 - explain.removed(search, m) > BEATEN * left for m in rivals):
+            decision.verdict, decision.best = "named", best
+            _prove(search, decision, mask)
+        return
+
+
+def _weigh(search: Search, decision: Decision, models: Sequence[Model] | None = None) -> None:
+    """Probabilities of all hypotheses (or of some of them alone), "none of these" among them."""
+    models = search.models if models is None else models
+    weights = [m.weight for m in models]
+    base = math.log(PRIOR["base"])
+    top = max([*weights, base, decision.none_evidence])
+    total = sum(math.exp(w - top) for w in [*weights, base, decision.none_evidence])
+    decision.probability = {id(m): math.exp(m.weight - top) / total for m in models}
+    decision.base = math.exp(base - top) / total
+    decision.none = math.exp(decision.none_evidence - top) / total
+
+
+def _decide_exact(search: Search, ranked: list[Model], mask: Tensor | None, decision: Decision) -> Decision:
+    """Without noise nothing is white: a term must remove nearly all of the held-out misfit that is left, far more than
+    any rival; then another may remove nearly all of what that leaves."""
+    decision.none_evidence = -math.inf
+    recording = search.problem.recording
+    if float(search.base.residual.abs().max()) <= 1e-6 * float(recording.spread.max()):
+        decision.verdict = "consistent"
+        return decision
+    clean = [m for m in ranked if not m.note]
+    accepted: Model | None = None
+    decision.verdict = "unexplained"
+    for size in range(1, search.max_terms + 1):
+        have = set() if accepted is None else set(accepted.numbers)
+        left = search.base.chi2 if accepted is None else accepted.found.chi2
+        group = sorted(
+            (m for m in clean if len(m.numbers) == size and have <= set(m.numbers)), key=lambda m: m.found.chi2
+        )
+        good = [m for m in group if m.found.chi2 <= (1 - REMOVED) * min(left, _least_part(clean, m))
+                and _gain(search, m, mask, accepted) >= REMOVED]  # fmt: skip
+        if not good:
+            continue
+        rivals = [
+            m
+            for m in group
+            if frozenset(m.names) != frozenset(good[0].names) and m.found.chi2 < BEATEN * good[0].found.chi2
+        ]
+        if rivals or _other_names(search, good[0]):
+            if accepted is None:
+                decision.verdict = "ambiguous"
+                decision.tied_models = [good[0], *rivals]
+                decision.tied = [list(m.names) for m in decision.tied_models] + [
+                    [n] for n in _other_names(search, good[0])
+                ]
+            break
+        accepted = good[0]
+    if accepted is not None:
+        decision.verdict, decision.best = "named", accepted
+    most = len(accepted.numbers) if accepted else len(decision.tied_models[0].numbers) if decision.tied_models else 1
+    _weigh(search, decision, [m for m in search.models if len(m.numbers) <= most])
+    return decision
+
+
+def _least_part(models: Sequence[Model], model: Model) -> float:
+    """Smallest χ² of a model with fewer of the same terms."""
+    return min((m.found.chi2 for m in models if set(m.numbers) < set(model.numbers)), default=math.inf)
+
+
+def _prove(search: Search, decision: Decision, mask: Tensor | None) -> None:
+    """Withdraw a name that predicts held-out data worse than the base does."""
+    if decision.best is None or mask is None:
+        return
+    before = verify.held_out_fit(search.base, search.noise, mask)
+    after = verify.held_out_fit(decision.best.found, search.noise, mask)
+    if before is None or after is None:
+        return
+    seen = mask & search.problem.keep
+    gain, error = verify.compare(search.problem.recording, before.prediction, after.prediction, search.noise, seen)
+    if gain < -error:
+        decision.withdrawn = (
+            f"{' and '.join(decision.best.names)} explained the fitted data but predicted held-out data worse than the "
+            f"base (by {-gain:.2g} ± {error:.1g} noise variances a datum), so the name is withdrawn."
+        )
+        decision.verdict, decision.best = "unexplained", None

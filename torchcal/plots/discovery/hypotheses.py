@@ -1,0 +1,102 @@
+"""The ranking of the hypotheses."""
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from torchcal.errors import DomainError
+from torchcal.plots import style
+from torchcal.plots.discovery.pieces import ACCEPTED, NONE, beside, draw_key, finite, join_terms, percent, signed
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+def ranking(
+    hypotheses: Iterable[Any],
+    *,
+    accepted: Sequence[str] = (),
+    tied: Iterable[Sequence[str]] = (),
+    value: str = "log_evidence",
+    most: int = 12,
+    ax: "Axes | None" = None,
+    legend: bool = True,
+) -> "Axes":
+    """The hypotheses, best first, with their log evidence and probability.
+
+    Args:
+        hypotheses: Each with ``terms`` (empty for the base), ``log_evidence`` (natural logarithm, relative to the
+            base), ``probability`` and ``physical``.
+        accepted: Terms of the accepted hypothesis.
+        tied: Each the terms of a hypothesis that the data cannot tell from the best.
+        value: What the bars show: ``"log_evidence"`` or ``"probability"``.
+        most: Largest number of bars; the base, "none of these" and the tied ones are among them.
+        ax: Where to draw; a new figure by default.
+        legend: Whether to draw one.
+
+    Returns:
+        The axes.
+
+    Raises:
+        DomainError: If there is no hypothesis, or ``value`` is another one.
+    """
+    if value not in ("log_evidence", "probability"):
+        raise DomainError(f"Expected value: 'log_evidence' or 'probability'. Got {value!r}.")
+    rows = sorted(hypotheses, key=lambda item: -finite(getattr(item, value), -math.inf))
+    if not rows:
+        raise DomainError("Expected at least one hypothesis. Got none.")
+    chosen, sets = frozenset(accepted), {frozenset(terms) for terms in tied}
+    kept = [h for h in rows if not h.terms or tuple(h.terms) == NONE or frozenset(h.terms) in {*sets, chosen}]
+    kept += [h for h in rows if all(h is not other for other in kept)][: max(0, most - len(kept))]
+    left_out = len(rows) - len(kept)
+    rows = [h for h in rows if any(h is other for other in kept)]
+    if ax is None:
+        ax = style.new_axes(None, (6.4, 1.2 + 0.3 * len(rows)))
+    else:
+        ax = style.new_axes(ax)
+
+    looks: dict[str, dict[str, Any]] = {
+        "accepted": {"facecolor": ACCEPTED, "edgecolor": ACCEPTED},
+        "tied": {"facecolor": style.MODEL_ERROR_BAND, "edgecolor": ACCEPTED, "hatch": "////"},
+        "considered": {"facecolor": style.POSTERIOR_BAND, "edgecolor": ACCEPTED},
+        "not physical": {"facecolor": "white", "edgecolor": "0.35", "hatch": "xxxx"},
+        "base, or none of these": {"facecolor": "0.6", "edgecolor": "0.25"},
+    }
+
+    def kind(item: Any) -> str:
+        if not item.terms or tuple(item.terms) == NONE:
+            return "base, or none of these"
+        if chosen and frozenset(item.terms) == chosen:
+            return "accepted"
+        if not item.physical:
+            return "not physical"
+        return "tied" if frozenset(item.terms) in sets else "considered"
+
+    kinds = [kind(item) for item in rows]
+    numbers = [finite(getattr(item, value), math.nan) for item in rows]
+    top = max([number for number in numbers if math.isfinite(number)], default=0.0)
+    # A hopeless hypothesis would squeeze all others: its bar is cut, its number is written beside it.
+    floor = 0.0 if value == "probability" else -max(0.3 * top, 5.0)
+    for name, options in looks.items():
+        places = [i for i, other in enumerate(kinds) if other == name]
+        if places:
+            widths = [max(numbers[i], floor) if math.isfinite(numbers[i]) else 0.0 for i in places]
+            ax.barh(places, widths, height=0.66, lw=0.7, label=name, zorder=3, **options)
+    ax.axvline(0.0, color="0.25", lw=0.7, zorder=4)
+    names = [join_terms(item.terms) if item.terms else "base model alone" for item in rows]
+    ax.set_yticks(range(len(rows)), names)
+    ax.set_ylim(len(rows) - 0.4, -0.6)
+    low = min([number for number in numbers if math.isfinite(number)], default=0.0)
+    ax.set_xlim(max(min(low, 0.0) * 1.05, floor), max(top, 0.01) * 1.05 if value == "log_evidence" else 1.0)
+    for i, item in enumerate(rows):
+        beside(ax, i, 46, signed(item.log_evidence))
+        beside(ax, i, 92, percent(item.probability))
+    beside(ax, None, 46, "ln K")
+    beside(ax, None, 92, "prob.")
+    shown = "log evidence against the base, ln K [1]" if value == "log_evidence" else "probability [1]"
+    ax.set_xlabel(shown + (f"\n({left_out} weaker ones not shown)" if left_out else ""))
+    style.dress(ax)
+    ax.tick_params(axis="y", length=0)
+    if legend and len(set(kinds)) > 1:
+        draw_key(ax, right=True)
+    return ax

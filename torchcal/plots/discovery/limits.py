@@ -1,0 +1,78 @@
+"""The smallest effects that a recording could have shown."""
+
+import math
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from torchcal.errors import DomainError
+from torchcal.plots import style
+from torchcal.plots.discovery.pieces import ACCEPTED, NOISE, beside, draw_key, finite, plain
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+def detection_limits(limits: Iterable[Any], *, most: int = 16, ax: "Axes | None" = None, legend: bool = True) -> "Axes":
+    """The smallest effect of each candidate that these data could have shown, and the estimate over it.
+
+    Args:
+        limits: Each with ``term``, ``parameter``, ``smallest``, ``unit`` and ``estimate`` (or None).
+        most: Largest number of rows: those with the largest estimates, then the others.
+        ax: Where to draw; a new figure by default.
+        legend: Whether to draw one.
+
+    Returns:
+        The axes, with \\|estimate\\| / smallest on a logarithmic abscissa.
+
+    Raises:
+        DomainError: If there is no candidate.
+    """
+    rows = list(limits)
+    if not rows:
+        raise DomainError("Expected at least one candidate. Got none.")
+
+    def ratio(item: Any) -> float:
+        if item.estimate is None or not math.isfinite(item.estimate) or not 0 < item.smallest < math.inf:
+            return math.nan
+        return abs(item.estimate) / float(item.smallest)
+
+    rows.sort(key=lambda item: (-finite(ratio(item), -1.0), not math.isfinite(item.smallest)))
+    left_out, rows = len(rows) - most, rows[:most]
+    ax = style.new_axes(None, (6.4, 1.2 + 0.28 * len(rows))) if ax is None else style.new_axes(ax)
+    ratios = np.array([ratio(item) for item in rows])
+    shown = ratios[np.isfinite(ratios) & (ratios > 0)]
+    low = max(min(0.3, 0.7 * shown.min(initial=1.0)), 0.01)
+    high = max(3.0, 1.6 * shown.max(initial=1.0))
+    ax.set_xscale("log")
+    ax.set_xlim(low, high)
+    ax.axvspan(low, 1.0, facecolor=NOISE, lw=0, zorder=0, label="too small to be seen in these data")
+    ax.axvline(1.0, color="0.25", lw=1.0, zorder=2)
+    terms = [item.term for item in rows]
+    names = [plain(item.term if terms.count(item.term) == 1 else f"{item.term}.{item.parameter}") for item in rows]
+    for i, (item, value) in enumerate(zip(rows, ratios, strict=True)):
+        if math.isfinite(value):
+            place = min(max(value, low), high)
+            ax.plot([1.0, place], [i, i], color="0.6", lw=1.0, zorder=3)
+            seen = value >= 1
+            ax.plot(
+                [place], [i], "o" if value > low else "<", ms=5.5, mfc=ACCEPTED if seen else "white", mec=ACCEPTED,
+                mew=1.1, zorder=4,
+            )  # fmt: skip
+        unit = f" {plain(item.unit)}" if item.unit else ""
+        smallest = f"{style.number(float(f'{item.smallest:.2g}'))}{unit}" if math.isfinite(item.smallest) else "∞"
+        note = str(getattr(item, "note", "") or "")
+        text = smallest if not note else plain(note, 30)
+        beside(ax, i, 6, text, "left")
+    beside(ax, None, 6, "smallest", "left")
+    ax.plot([], [], "o", ms=5.5, mfc=ACCEPTED, mec=ACCEPTED, label="estimate, where fitted")
+    ax.set_yticks(range(len(rows)), names)
+    ax.set_ylim(len(rows) - 0.4, -0.6)
+    more = f"\n({left_out} more not shown)" if left_out > 0 else ""
+    ax.set_xlabel("|estimate| / smallest detectable effect [1]" + more)
+    style.dress(ax)
+    ax.tick_params(axis="y", length=0)
+    if legend:
+        draw_key(ax, right=True)
+    return ax

@@ -1,0 +1,262 @@
+"""Every panel that a diagnosis has, in one figure or one by one."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from torchcal.data import Recording
+from torchcal.errors import DomainError
+from torchcal.plots.discovery.fits import both_fits
+from torchcal.plots.discovery.hypotheses import ranking
+from torchcal.plots.discovery.limits import detection_limits
+from torchcal.plots.discovery.panels import panels_of
+from torchcal.plots.discovery.pieces import Look, as_numbers, draw_figure_key, join_terms, plain
+from torchcal.plots.discovery.proof import held_out, held_out_scores
+from torchcal.plots.discovery.residuals import driver_values, residual_map
+from torchcal.plots.discovery.shifts import missing_rate, needed_shift
+from torchcal.plots.selection import conditions_of
+
+
+def discovery_overview(diagnosis: Any, fig: Any = None) -> Any:
+    """One figure with every panel that this diagnosis has.
+
+    Args:
+        diagnosis: The result of ``torchcal.diagnose``, or anything with its attributes.
+        fig: A figure or subfigure to draw in; a new one by default.
+
+    Returns:
+        The figure.
+
+    Raises:
+        DomainError: If ``fig`` is no figure.
+    """
+    parts = figure_parts(diagnosis)
+    wide = [part for part in parts if part.wide]
+    rest = [part for part in parts if not part.wide]
+    pairs = [rest[i : i + 2] for i in range(0, len(rest), 2)]
+    heights = [part.height for part in wide] + [max(part.height for part in pair) for pair in pairs]
+    if fig is None:
+        import matplotlib.pyplot as plt
+
+        fig = plt.figure(figsize=(11.0, sum(heights) + 0.4), layout="constrained")
+    elif not callable(getattr(fig, "add_subfigure", None)):
+        raise DomainError(f"Expected fig: a matplotlib figure or None. Got {type(fig).__name__}.")
+    elif fig.get_layout_engine() is None:
+        fig.set_layout_engine("constrained")
+    grid = fig.add_gridspec(len(heights), 2, height_ratios=heights)
+    for i, part in enumerate(wide):
+        part.place(fig.add_subfigure(grid[i, :]))
+    for i, pair in enumerate(pairs, start=len(wide)):
+        for j, part in enumerate(pair):
+            part.place(fig.add_subfigure(grid[i, j] if len(pair) == 2 else grid[i, :]))
+    return fig
+
+
+@dataclass(frozen=True)
+class FigurePart:
+    """One figure of a diagnosis.
+
+    Attributes:
+        key: ``"fits"``, ``"residuals"``, ``"ranking"``, ``"shift"``, ``"missing"``, ``"held out"``, ``"scores"`` or
+            ``"limits"``.
+        name: Its title.
+        caption: What it shows, in a sentence or two.
+        draw: Draws it on an empty figure or subfigure.
+        width: Inches, on its own.
+        height: Inches.
+        wide: Whether it takes a whole row of the overview.
+    """
+
+    key: str
+    name: str
+    caption: str
+    draw: Callable[[Any], None]
+    width: float
+    height: float
+    wide: bool = False
+
+    def place(self, fig: Any) -> None:
+        """Draw it with its title."""
+        self.draw(fig)
+        fig.suptitle(self.name, fontsize="medium", fontweight="bold", x=0.01, ha="left")
+
+
+def figure_parts(diagnosis: Any) -> list[FigurePart]:
+    """The figures that this diagnosis has something to show in.
+
+    Raises:
+        DomainError: If it is no diagnosis.
+    """
+    for name in ("recording", "base", "verdict"):
+        if not hasattr(diagnosis, name):
+            raise DomainError(
+                f"Expected diagnosis: a result of torchcal.diagnose. Got {type(diagnosis).__name__}, which has no "
+                f"{name!r}."
+            )
+    recording: Recording = diagnosis.recording
+    states = getattr(diagnosis.simulator, "states", {})
+    units = {name: unit for name, unit in states.items() if isinstance(unit, str)}
+    for run in recording.runs or ():
+        units |= run.units
+    units |= recording.units
+    base, final = diagnosis.base, diagnosis.final
+    after = final if tuple(final.terms) != tuple(base.terms) else None
+    mask = diagnosis.held_out
+    where = list(diagnosis.where)
+    shifts = list(diagnosis.shifts)
+    columns = conditions_of(recording.x, recording)
+    in_time = set(columns) == {"time", "run"}
+    drivers = [item.driver for item in [*where, *shifts] if item.driver in columns]
+    along = None if in_time or len(columns) == 1 else next(iter(drivers), None)
+    parts: list[FigurePart] = []
+
+    def called(driver: str) -> str:
+        return "time" if in_time and driver == "t" else driver
+
+    look = Look(units, {})
+    panels = panels_of(recording, as_numbers(base, "base", len(recording.y)), along, None, None, 6, look)
+    if along is not None and not panels[0].joined:  # nothing to join the fits along: fitted against measured tells more
+        along = None
+        panels = panels_of(recording, as_numbers(base, "base", len(recording.y)), along, None, None, 6, look)
+    count = len(panels)
+    across = 2 if count in (2, 4) else min(count, 3)
+
+    def fits(fig: Any) -> None:
+        axes = list(fig.subplots(math.ceil(count / across), across, squeeze=False).flat)
+        both_fits(recording, base, after, held_out=mask, along=along, ax=axes[:count], units=units, legend=False)
+        for spare in axes[count:]:
+            spare.remove()
+        draw_figure_key(fig, axes[:count])
+
+    said = "The data with the recalibrated base model" + ("" if after is None else " and with the accepted model")
+    said += (", " if after is None else ", both ") + "fitted to all data."
+    said += "" if mask is None else " Data that were held out for the proof lie in the grey region or are ringed."
+    parts.append(
+        FigurePart(
+            "fits",
+            "Data and fit" if after is None else "Data and both fits",
+            said,
+            fits,
+            {1: 6.4, 2: 8.4}.get(across, 9.6),
+            {1: 3.3, 2: 3.0}.get(across, 2.8) * (1 if count <= 3 else 1.75),
+            wide=True,
+        )
+    )
+
+    best = where[0] if where else None
+    driver = best.driver if best is not None else None
+    values = None if driver is None else _driver_of(diagnosis, driver, final if after is not None else base)
+    if values is None:
+        driver = None
+    spans = best.spans if best is not None and driver is not None else ()
+    output = best.target if best is not None and best.target in recording.outputs else None
+
+    def mismatch(fig: Any) -> None:
+        residual_map(
+            recording, base, after, driver=driver, values=values, spans=spans, output=output, units=units,
+            share=best.share if best is not None and spans else None, noise=diagnosis.noise,
+            ax=fig.subplots(),
+        )  # fmt: skip
+
+    said = "What the models leave of the data"
+    said += f", against {called(driver)}." if driver is not None else "."
+    said += " Shaded: where the mismatch sits." if spans else ""
+    parts.append(FigurePart("residuals", "Where the mismatch sits" if spans else "Residuals", said, mismatch, 6.0, 3.5))
+
+    hypotheses = list(diagnosis.ranking)
+    if hypotheses:
+        bars = min(len(hypotheses), 12)
+        parts.append(
+            FigurePart(
+                "ranking",
+                "Ranking of the hypotheses",
+                "Log evidence against the base model, ln K, and probability among all hypotheses considered.",
+                lambda fig: _ignore(
+                    ranking(hypotheses, accepted=diagnosis.terms, tied=diagnosis.tied, ax=fig.subplots())
+                ),
+                7.0,
+                max(3.2, 1.4 + 0.26 * bars),
+            )
+        )
+    if shifts:
+        parts.append(
+            FigurePart(
+                "shift",
+                f"Shift that {plain(shifts[0].parameter)} would need",
+                f"The shift of {shifts[0].parameter} that each stretch of data needs by itself, ±1 sd, against "
+                f"{called(shifts[0].driver)}. Were the base model complete, it would scatter around zero.",
+                lambda fig: _ignore(needed_shift(shifts[0], ax=fig.subplots(), units=units)),
+                6.0,
+                3.3,
+            )
+        )
+    missing = diagnosis.missing
+    if missing is not None:
+        parts.append(
+            FigurePart(
+                "missing",
+                "What is missing, without a formula",
+                f"A smooth estimate of what is missing, ±2 sd, as a function of {called(missing.driver)}.",
+                lambda fig: _ignore(missing_rate(missing, ax=fig.subplots(), units=units)),
+                6.0,
+                3.3,
+            )
+        )
+    scores = (diagnosis.before, diagnosis.after)
+    pair = (scores[0], scores[1] if after is not None else None)
+    predicted = getattr(scores[0], "prediction", None)
+    if mask is not None and predicted is not None:
+        second = pair[1] if getattr(pair[1], "prediction", None) is not None else None
+        names = ("base model", "accepted model" if after is None else "with " + join_terms(after.terms))
+        parts.append(
+            FigurePart(
+                "held out",
+                "Prediction of held-out data",
+                "What the models, fitted without the held-out data, predict for them.",
+                lambda fig: _ignore(
+                    held_out(
+                        recording, scores[0], second, mask, ax=fig.subplots(), along=along, names=names, units=units
+                    )
+                ),
+                6.0,
+                3.5,
+            )
+        )
+    if scores[0] is not None:
+        unit = units.get(recording.outputs[0]) if len(recording.outputs) == 1 else None
+        parts.append(
+            FigurePart(
+                "scores",
+                "Scores before and after" if pair[1] is not None else "Scores",
+                "RMSE, mean log predictive density a datum, and share of the data in the 95 % interval, whose wanted "
+                "value is dotted.",
+                lambda fig: _ignore(held_out_scores(*pair, ax=fig.subplots(1, 3), unit=unit)),
+                7.2,
+                2.2,
+            )
+        )
+    limits = list(diagnosis.detection_limit)
+    if limits:
+        parts.append(
+            FigurePart(
+                "limits",
+                "Detection limits",
+                "The smallest effect of each candidate that these data could have shown, and the estimate as a "
+                "multiple of it.",
+                lambda fig: _ignore(detection_limits(limits, ax=fig.subplots())),
+                7.0,
+                max(3.2, 1.4 + 0.26 * min(len(limits), 16)),
+            )
+        )
+    return parts
+
+
+def _driver_of(diagnosis: Any, driver: str, fit: Any) -> Any:
+    """A driver's values ``(n,)``: those that the diagnosis keeps, or the recording's."""
+    kept = getattr(diagnosis, "drivers", None) or {}
+    return kept[driver] if driver in kept else driver_values(diagnosis.recording, driver, fit)
+
+
+def _ignore(_: Any) -> None:
+    """The axes are of no use to the caller."""

@@ -1,0 +1,170 @@
+"""Where the mismatch sits: residuals against what they vary with."""
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchcal.data import Recording
+from torchcal.errors import DomainError
+from torchcal.plots import style
+from torchcal.plots.discovery.panels import curves_of
+from torchcal.plots.discovery.pieces import (
+    EDGE,
+    LOCATED,
+    NOISE,
+    Look,
+    as_numbers,
+    draw_key,
+    finish,
+    places_of,
+    rms,
+    thinned,
+)
+from torchcal.plots.selection import conditions_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+
+def driver_values(recording: Recording, driver: str, fitted: Any = None) -> Tensor | None:
+    """Values of a driver at the recording's conditions.
+
+    Args:
+        recording: The data.
+        driver: A condition, ``"t"`` for time, an input of the runs, or an output.
+        fitted: Fitted outputs ``(n_total,)``, taken where the driver is an output; the data by default.
+
+    Returns:
+        Shape ``(n,)``, in the driver's unit; None where the recording does not hold it (a hidden state, say).
+    """
+    columns = recording.x if isinstance(recording.x, dict) else {"x": recording.x}
+    name = "time" if driver == "t" and "t" not in columns else driver
+    if name in columns:
+        return columns[name]
+    if driver in recording.outputs:
+        return recording.split(recording.y if fitted is None else getattr(fitted, "prediction", fitted))[driver]
+    runs = getattr(recording, "runs", None)
+    if runs and all(driver in run.inputs for run in runs):
+        return torch.cat([run.inputs[driver] for run in runs])
+    return None
+
+
+def residual_map(
+    recording: Recording,
+    before: Any,
+    after: Any = None,
+    *,
+    driver: str | None = None,
+    values: Any = None,
+    spans: Iterable[tuple[float, float]] = (),
+    share: float | None = None,
+    noise: Any = None,
+    output: str | None = None,
+    ax: "Axes | None" = None,
+    names: tuple[str, str] | None = None,
+    units: Mapping[str, str] | None = None,
+    labels: Mapping[str, str] | None = None,
+    legend: bool = True,
+) -> "Axes":
+    """Residuals, data minus model, of both models against what the mismatch varies with.
+
+    With more than 40 data their means over neighbouring data are drawn as lines.
+
+    Args:
+        recording: The data.
+        before: Fitted outputs of the base, ``(n_total,)``, or anything that has them as ``prediction``.
+        after: The accepted model's, or None.
+        driver: What is on the abscissa: see `driver_values`; the first condition (time) by default.
+        values: The driver's values ``(n,)``, where the recording does not hold them.
+        spans: Ranges of the driver in which the mismatch sits, shaded.
+        share: Share of the misfit that sits there.
+        noise: Noise sd of the output, in its unit, or anything with a dict ``sd`` by output; by default the
+            recording's. Drawn as a band of ±2 sd.
+        output: By default the output that the base fits worst.
+        ax: Where to draw; a new figure by default.
+        names: What to call the two models.
+        units: Units by name, beside the recording's.
+        labels: How to write names on the axes, by name.
+        legend: Whether to draw one.
+
+    Returns:
+        The axes.
+
+    Raises:
+        DomainError: If the output does not exist, or the recording does not hold the driver.
+        ShapeError: If fits or driver and recording do not fit.
+    """
+    fits = curves_of(recording, before, after, names)
+    look = Look(units={**recording.units, **(units or {})}, labels=labels or {})
+    y = recording.y.cpu().numpy()
+    if output is None:
+        scaled = (y - fits[0].values) / recording.spread.cpu().numpy()
+        output = max(recording.outputs, key=lambda name: rms(scaled[places_of(recording, name)]))
+    elif output not in recording.outputs:
+        raise DomainError(f"Expected output among {list(recording.outputs)}. Got {output!r} (check the spelling).")
+    columns = conditions_of(recording.x, recording)
+    if driver is None:
+        driver = "time" if "time" in columns else next(iter(columns))
+    if values is None:
+        values = driver_values(recording, driver, fits[-1].values if driver not in columns else None)
+    if values is None:
+        raise DomainError(
+            f"Expected driver: a condition, input or output of the recording. Got {driver!r} (give its values=)."
+        )
+    x = as_numbers(values, "values", recording.n)
+    part = places_of(recording, output)
+    ax = style.new_axes(ax)
+    located = f"mismatch located here ({100 * share:.0f} % of it)" if share is not None else "mismatch located here"
+    shown = np.isfinite(y[part]) & np.isfinite(x)
+    low, high = float(x[shown].min()), float(x[shown].max())
+    inside = [(start, end) for start, end in spans if end >= low and start <= high]
+    for i, (start, end) in enumerate(inside):
+        ax.axvspan(
+            max(start, low), min(end, high), facecolor=LOCATED, edgecolor=EDGE, ls=":", lw=0.8, zorder=0,
+            label=located if i == 0 else "_located",
+        )  # fmt: skip
+    sd = _noise_of(noise, recording, output)
+    if sd:
+        ax.axhspan(-2 * sd, 2 * sd, facecolor=NOISE, lw=0, zorder=1, label="±2 noise sd", alpha=0.75)
+    ax.axhline(0.0, color="0.35", lw=0.7, zorder=2)
+    keep = np.flatnonzero(shown)
+    keep = keep[np.argsort(x[keep], kind="stable")]
+    many = len(keep) > 40
+    dots = keep[thinned(len(keep))]
+    for fit in fits:
+        residual = y[part] - fit.values[part]
+        ax.plot(
+            x[dots], residual[dots], fit.marker, ms=2.2 if many else 4.5, mfc=fit.face if not many else fit.color,
+            mec="none" if many else fit.color, mew=0.9, alpha=0.3 if many else 1.0, zorder=fit.zorder - 3,
+            label="_points" if many else fit.name,
+        )  # fmt: skip
+        if many:
+            levels = np.unique(x[keep])
+            if len(levels) <= 30:
+                bins = [keep[x[keep] == level] for level in levels]
+            else:
+                bins = np.array_split(keep, min(30, len(keep) // 8))
+            centers = [x[rows].mean() for rows in bins]
+            means = [np.nanmean(residual[rows]) for rows in bins]
+            ax.plot(
+                centers, means, color=fit.color, ls=fit.line, lw=1.7, label=fit.name + ", local mean",
+                zorder=fit.zorder,
+            )  # fmt: skip
+    finish(ax, look.axis(driver), f"data − model, {look.axis(output)}", "")
+    if legend:
+        draw_key(ax)
+    return ax
+
+
+def _noise_of(noise: Any, recording: Recording, output: str) -> float | None:
+    if noise is None:
+        given = recording.noise_sd
+        return None if given is None else float(given[places_of(recording, output)].median())
+    sd = getattr(noise, "sd", noise)
+    if isinstance(sd, Mapping):
+        sd = sd.get(output)
+    return float(sd) if sd is not None and math.isfinite(float(sd)) else None
