@@ -128,7 +128,6 @@ def draw(two: Study, story: Story, out: Path, *, readme: bool) -> list[Path]:
         "case_2_corner": lambda: figures.figure_corner(two),
         "conventional_prediction": lambda: figures.figure_21([two]),
         "conventional_posterior": lambda: figures.figure_20([two]),
-        "log_rate": lambda: figures.figure_22([two]),
         "case_1_diagnosis": story.alone.plot,
     }
     import matplotlib.pyplot as plt

@@ -350,7 +350,7 @@ def test_a_forecast_beyond_the_data_where_no_input_is_needed() -> None:
 def test_a_density_that_reaches_where_the_model_has_no_solution_is_told() -> None:
     model = tc.ODESimulator(lambda t, s, p, u: {"c": p["a"] * s["c"] ** 3}, ["c"], [tc.Parameter("a", initial=-0.5)])
     t = np.linspace(0, 2, 15)
-    y = 1 / np.sqrt(1 + 0.2 * t) + 0.02 * np.sin(4 * t)
+    y = 1 / np.sqrt(1 + 0.2 * t) + 0.04 * np.sin(4 * t)
     data = tc.Recording(runs=[tc.Run(t, {"c": y}, initial={"c": 1.0})])
     found = tc.calibrate(model, data, num_samples=0, num_starts=6, seed=0)
     mean, sd = float(found.map.mean[0]), float(found.map.sd[0])
@@ -476,7 +476,7 @@ def test_draws_from_the_posterior_of_a_model_in_time() -> None:
     model = tc.ODESimulator(lambda t, s, p, u: {"c": -p["k"] * s["c"]}, ["c"], [tc.Parameter("k", initial=0.5)])
     noise = 0.02 * np.random.default_rng(1).standard_normal(12)
     data = tc.Recording(runs=[tc.Run(t, {"c": np.exp(-0.8 * t) + noise}, initial={"c": 1.0})], noise=0.02)
-    found = tc.calibrate_additive(model, data, num_samples=60, num_chains=2, num_warmup=30, seed=0)
+    found = tc.calibrate_additive(model, data, num_samples=40, num_chains=2, num_warmup=20, seed=0)
     draws: Tensor = found.parameters[:, 0]
     jacobian = t * np.exp(-0.8 * t)
     sd = 0.02 / np.sqrt((jacobian**2).sum())

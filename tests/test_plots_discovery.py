@@ -329,6 +329,14 @@ def test_residuals_are_data_minus_model_against_the_driver():
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [min]", "data − model, y [°C]")
 
 
+def test_a_detailed_simulation_has_no_noise_band():
+    d = cooling()
+    told = plots.residual_map(d.recording, d.base, noise=NoiseModel({"y": 0.1}, {"y": 0.0}, "estimated"))
+    assert "±2 noise sd" in labels(told)
+    none = plots.residual_map(d.recording, d.base, noise=NoiseModel({"y": 0.1}, {"y": 0.0}, "none"))
+    assert "±2 noise sd" not in labels(none)
+
+
 def test_a_dense_map_draws_local_means():
     d = ignition()
     ax = plots.residual_map(d.recording, d.base, driver="phi")
@@ -397,6 +405,17 @@ def test_the_base_and_none_of_these_stay_in_a_short_ranking():
         plots.ranking([])
     with pytest.raises(DomainError, match="Expected value"):
         plots.ranking(many, value="evidence")
+
+
+def test_the_same_terms_in_another_region_are_told_apart():
+    rows = [
+        Hypothesis(("leak",), 9.0, 0.9, region="h < 0.2"),
+        Hypothesis(("leak",), 5.0, 0.1),
+        Hypothesis(("leak", "lag"), 11.0, 0.0),
+        Hypothesis((), 0.0, 0.0),
+    ]
+    names = [text.get_text() for text in plots.ranking(rows).get_yticklabels()]
+    assert names == ["leak, h < 0.2", "leak", "leak + lag", "base model alone"]
 
 
 # --- shift, rate -----------------------------------------------------------------------------------------

@@ -1,17 +1,40 @@
-"""The Python in README.md runs as written."""
+"""The Python in README.md runs as written, and prints what README.md says."""
 
+import contextlib
+import io
 import re
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import pytest
 
 README = Path(__file__).parents[1] / "README.md"
+NUMBER = re.compile(r"(?<![\w.])-?\d+\.?\d*(?:e-?\d+)?")
 
 
-def test_readme_code_runs(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def text() -> str:
+    return README.read_text(encoding="utf-8")
+
+
+def test_readme_code_runs_and_prints_what_is_said(text, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(plt, "show", lambda *args, **kwargs: None)
-    text = README.read_text(encoding="utf-8")
-    blocks = re.findall(r"^```python\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
-    assert blocks, "README.md shows no Python"
-    exec(compile("\n".join(blocks), str(README), "exec"), {"__name__": "readme"})
+    blocks = re.findall(r"^```(python|text)\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
+    assert [kind for kind, _ in blocks] == ["python", "text"] * (len(blocks) // 2)
+    names = {"__name__": "readme"}
+    for (_, code), (_, said) in zip(blocks[::2], blocks[1::2], strict=True):
+        printed = io.StringIO()
+        with contextlib.redirect_stdout(printed):
+            exec(compile(code, str(README), "exec"), names)
+        shown = printed.getvalue()
+        assert NUMBER.sub("#", shown).split() == NUMBER.sub("#", said).split()
+        # The last digits belong to the machine.
+        numbers = [[float(n) for n in NUMBER.findall(part)] for part in (shown, said)]
+        assert numbers[0] == pytest.approx(numbers[1], rel=0.05)
+
+
+def test_readme_pictures_exist(text):
+    pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", text)
+    assert len(pictures) == 2
+    assert all((README.parent / picture).is_file() for picture in pictures)

@@ -104,7 +104,7 @@ def diagnose(
         search.screen_all()
         detected = search.exact or search.p_detect < 1.0 - confidence
         if terms:
-            search.refit_singles()
+            search.refit_singles(detected=detected)
             if detected and _wants_more(search):
                 search.refit_several()
         decision = decide(search, detected, mask)

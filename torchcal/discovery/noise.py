@@ -41,7 +41,7 @@ class Noise:
         freedom: Degrees of freedom that the size was estimated with; infinite where it is known.
         posterior: Probability of each coefficient in `GRID`, by output, ``(outputs, grid)``.
         source: As in `NoiseModel`.
-        doubted: By how much the noise found exceeds the noise given, where that is a contradiction; else 1.
+        doubted: By how much the residual's fastest part exceeds the noise given, where that is a contradiction; else 1.
     """
 
     sd: Tensor
@@ -160,7 +160,8 @@ def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor |
                 log_det += float(upper.diagonal().abs().log().sum())
                 count += len(places) - b.shape[1]
             sizes.append(square / count)
-            logs.append(-0.5 * count * math.log(max(square, 1e-300)) - log_det - SHRINK * float(rho))
+            size = 0.5 * count * math.log(max(square, 1e-300)) if given is None else 0.5 * square
+            logs.append(-size - log_det - SHRINK * float(rho))
         likelihood = torch.tensor(logs, dtype=torch.float64)
         weight = (likelihood - likelihood.max()).exp()
         posterior[output, : len(weight)] = weight / weight.sum()
@@ -178,7 +179,6 @@ def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor |
                 sd[mask], freedom = scale, min(freedom, usable)
         elif scale > EXCESS * (1 + 2 / math.sqrt(2 * usable)):
             doubted = max(doubted, scale)
-            sd[mask] = sd[mask] * scale
     step = _quantisation(problem)
     for name, size in step.items():
         mask = torch.arange(len(recording.y)) // recording.n == recording.outputs.index(name)

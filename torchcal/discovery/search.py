@@ -26,7 +26,9 @@ PRIOR = {"base": 0.30, "single": 0.40, "local": 0.10, "several": 0.08, "none": 0
 #: Prior odds against an estimate on a physical bound that it wants to cross.
 UNPHYSICAL = math.log(1e-3)
 #: Refits at most: single terms, windows, pairs.
-MOST = {"single": 40, "local": 8, "pairs": 12}
+MOST = {"single": 40, "local": 6, "pairs": 12}
+#: Refitted in any case: this many, and those with at least this share of the largest score.
+FEW, CHANCE = 6, 0.2
 #: Data below which no window is sought; nor is any without noise, where a window bends to whatever is left.
 LEAST_LOCAL = 30
 #: Shares of the linear estimate from which refits begin.
@@ -259,30 +261,38 @@ class Search:
 
     # --- refits -----------------------------------------------------------------------------------------
 
-    def refit_singles(self) -> None:
-        """Every candidate, then the best local ones."""
+    def refit_singles(self, *, detected: bool = True) -> None:
+        """Every candidate that the screening leaves a chance, then the best local ones.
+
+        Where nothing was detected only the leading few, for the record.
+        """
         count = len(self.candidates)
         prior = math.log(PRIOR["single"] / max(count, 1))
         blind = [i for i in range(count) if self.screening.best[i] < 0 and self.candidates[i].blind]
         order = sorted((i for i in range(count) if self.screening.best[i] >= 0), key=lambda i: -self.screening.score(i))
-        for i in [*order, *blind][: MOST["single"]]:
+        top = self.screening.score(order[0]) if order else 0.0
+        promising = [i for k, i in enumerate(order) if k < FEW or self.screening.score(i) >= CHANCE * top]
+        chosen = promising[: MOST["single"]] if detected else order[:FEW]
+        for i in [*chosen, *blind]:
             self.tick(f"refit with {self.candidates[i].name}")
             model = self._refit((i,), self.candidates[i], self._begin(i), prior)
             if model is not None:
                 self.models.append(model)
         self._reweigh()
         self.merge()
-        self._refit_local()
+        if detected:
+            self._refit_local()
 
     def _refit_local(self) -> None:
         """Windows that promise more than the same term everywhere."""
         if self.exact or self.problem.n < LEAST_LOCAL:
             return
         gains = {model.numbers[0]: 2 * model.log_evidence + math.log(self.problem.n) for model in self.models}
+        leading = 2 * max((model.log_evidence for model in self.models if model.physical), default=0.0)
         promising = []
         for w in self.local:
             plain = max(gains.get(w.candidate, 0.0), self.screening.score(w.candidate) ** 2)
-            if w.candidate not in self.gone and w.z > 3.5 and w.z**2 > plain + 6.0:
+            if w.candidate not in self.gone and w.z > 3.5 and w.z**2 > max(plain + 6.0, leading - 10.0):
                 promising.append(w)
         promising.sort(key=lambda w: -w.z)
         prior = math.log(PRIOR["local"] / max(len(self.candidates), 1))

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
 from torchcal.data import Recording
 from torchcal.errors import DomainError, RecordingError, SimulatorError
@@ -522,18 +521,21 @@ class Trajectories(Simulator):
     def _sensitivities(self, values: Tensor, states: Tensor, columns: Sequence[int]) -> Tensor:
         """∂ states / ∂ parameters at the ends of all steps, ``(H, R, K + 1, S, len(columns))``."""
         _, flow, forcing = self._step_derivatives(values, states, columns)
-        tangent = values.new_zeros(len(columns), *values.shape)
-        for j, column in enumerate(columns):
-            tangent[j, :, column] = 1.0
-        with forward_ad.dual_level():
-            v = forward_ad.make_dual(values.expand(len(columns), -1, -1).contiguous(), tangent)
-            begin = forward_ad.unpack_dual(self._start(v)).tangent
-        if begin is None:
-            begin = values.new_zeros(len(columns), values.shape[0], len(self.runs), len(self._states))
-        begin = begin.permute(1, 2, 3, 0)
+        begin = self._start_slopes(values)[..., list(columns)]
         forcing = forcing.clone()
         forcing[:, :, 0] += flow[:, :, 0] @ begin
         return torch.cat([begin.unsqueeze(2), _recur(flow, forcing)], dim=2)
+
+    def _start_slopes(self, values: Tensor) -> Tensor:
+        """∂ initial states / ∂ parameters, ``(H, R, S, P)``."""
+        with torch.enable_grad():
+            leaf = values.detach().requires_grad_(True)
+            start = self._start(leaf)
+            rows = []
+            for part in start.flatten(1).unbind(-1):
+                grad = torch.autograd.grad(part.sum(), leaf, retain_graph=True)[0] if part.requires_grad else None
+                rows.append(torch.zeros_like(leaf) if grad is None else grad)
+        return torch.stack(rows, dim=1).unflatten(1, start.shape[1:])
 
     def flow(self, values: Tensor, states: Tensor) -> Tensor:
         """Derivative of the end of every step by its beginning, ``(H, R, K, S, S)``."""

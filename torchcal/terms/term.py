@@ -163,7 +163,9 @@ def _parameters(simulator: Simulator, terms: Sequence[Term]) -> tuple[Parameter,
             if name not in names:
                 raise DomainError(f"Expected the term {term.name!r} to name a parameter of {names}. Got {name!r}.")
     found = [
-        dataclasses.replace(parameter, neutral=None, initial=parameter.initial or parameter.neutral)
+        dataclasses.replace(
+            parameter, neutral=None, initial=parameter.neutral if parameter.initial is None else parameter.initial
+        )
         if parameter.name in freed
         else parameter
         for parameter in simulator.parameters

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from torchcal.errors import DomainError
 from torchcal.plots import style
-from torchcal.plots.discovery.pieces import ACCEPTED, NONE, beside, draw_key, finite, join_terms, percent, signed
+from torchcal.plots.discovery.pieces import ACCEPTED, NONE, beside, draw_key, finite, join_terms, percent, plain, signed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,7 +26,7 @@ def ranking(
 
     Args:
         hypotheses: Each with ``terms`` (empty for the base), ``log_evidence`` (natural logarithm, relative to the
-            base), ``probability`` and ``physical``.
+            base), ``probability`` and ``physical``; ``region`` in words where it acts there alone.
         accepted: Terms of the accepted hypothesis.
         tied: Each the terms of a hypothesis that the data cannot tell from the best.
         value: What the bars show: ``"log_evidence"`` or ``"probability"``.
@@ -42,7 +42,7 @@ def ranking(
     """
     if value not in ("log_evidence", "probability"):
         raise DomainError(f"Expected value: 'log_evidence' or 'probability'. Got {value!r}.")
-    rows = sorted(hypotheses, key=lambda item: -finite(getattr(item, value), -math.inf))
+    rows = sorted(hypotheses, key=lambda item: (-finite(item.probability, -1.0), -finite(item.log_evidence, -math.inf)))
     if not rows:
         raise DomainError("Expected at least one hypothesis. Got none.")
     chosen, sets = frozenset(accepted), {frozenset(terms) for terms in tied}
@@ -83,7 +83,7 @@ def ranking(
             widths = [max(numbers[i], floor) if math.isfinite(numbers[i]) else 0.0 for i in places]
             ax.barh(places, widths, height=0.66, lw=0.7, label=name, zorder=3, **options)
     ax.axvline(0.0, color="0.25", lw=0.7, zorder=4)
-    names = [join_terms(item.terms) if item.terms else "base model alone" for item in rows]
+    names = [_name(item) for item in rows]
     ax.set_yticks(range(len(rows)), names)
     ax.set_ylim(len(rows) - 0.4, -0.6)
     low = min([number for number in numbers if math.isfinite(number)], default=0.0)
@@ -100,3 +100,11 @@ def ranking(
     if legend and len(set(kinds)) > 1:
         draw_key(ax, right=True)
     return ax
+
+
+def _name(item: Any) -> str:
+    """A hypothesis's terms, and where they act."""
+    region = getattr(item, "region", None)
+    if not item.terms:
+        return "base model alone"
+    return plain(f"{' + '.join(item.terms)}, {region}") if region else join_terms(item.terms)

@@ -164,6 +164,8 @@ def _noise_of(noise: Any, recording: Recording, output: str) -> float | None:
     if noise is None:
         given = recording.noise_sd
         return None if given is None else float(given[places_of(recording, output)].median())
+    if getattr(noise, "source", None) == "none":
+        return None  # a detailed simulation: what it counts as noise is no one's
     sd = getattr(noise, "sd", noise)
     if isinstance(sd, Mapping):
         sd = sd.get(output)
