@@ -80,6 +80,8 @@ def diagnose(
     """
     begun = time.perf_counter()
     terms = _check(simulator, recording, candidates, confidence, max_terms, num_starts)
+    given = terms
+    terms = [term for term in given if not _contains(simulator, term)]
     problem = Problem.of(simulator, recording)
     free, _ = base_columns(problem, fixed or {})
     if not free:
@@ -108,7 +110,7 @@ def diagnose(
             if detected and _wants_more(search):
                 search.refit_several()
         decision = decide(search, detected, mask)
-        return _result(search, decision, simulator, recording, mask, confidence, begun, terms, seed)
+        return _result(search, decision, simulator, recording, mask, confidence, begun, given, seed)
     finally:
         bar.close()
 
@@ -133,6 +135,14 @@ def _check(
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
             raise DomainError(f"Expected {name} as a positive integer. Got {value!r}.")
     return list(by_name.values())
+
+
+def _contains(simulator: Simulator, term: Term) -> bool:
+    """Whether the simulator holds a term already, as an improved one does."""
+    freed = {q.name for q in simulator.parameters if q.neutral is None}
+    if term.parameters:
+        return all(term.full(q.name) in simulator.names for q in term.parameters)
+    return set(term.frees) <= freed
 
 
 def _wants_more(search: Search) -> bool:
@@ -198,7 +208,9 @@ def _result(
         tied=decision.tied,
         where=explain.locate(search, shown) if decision.verdict != "consistent" else Table([], ("kind", "target")),
         ranking=_ranking(search, decision, mask),
-        detection_limit=explain.limits(search, 1.0 - confidence, POWER),
+        detection_limit=explain.limits(
+            search, 1.0 - confidence, POWER, [term for term in terms if _contains(simulator, term)]
+        ),
         remaining=remaining,
         before=before,
         after=after,

@@ -12,6 +12,7 @@ from torchcal.discovery.local import region_text
 from torchcal.discovery.records import Estimate, Fit, Limit, Location, MissingRate, NeededShift, Table
 from torchcal.discovery.search import Model, Search
 from torchcal.discovery.structure import Place, Structure
+from torchcal.terms import Term
 
 __all__ = [
     "estimates",
@@ -127,8 +128,8 @@ def removed(search: Search, model: Model) -> float:
     return min(max(1.0 - max(left, 0.0) / excess, 0.0), 1.0)
 
 
-def limits(search: Search, alpha: float, power: float) -> Table[Limit]:
-    """Smallest detectable effects."""
+def limits(search: Search, alpha: float, power: float, contained: Sequence[Term] = ()) -> Table[Limit]:
+    """Smallest detectable effects; ``contained`` terms are part of the simulator already."""
     screening = search.screening
     from_power = math.sqrt(2) * float(torch.special.erfinv(torch.tensor(2 * power - 1, dtype=torch.float64)))
     # Three families of statistics share the level.
@@ -148,6 +149,9 @@ def limits(search: Search, alpha: float, power: float) -> Table[Limit]:
         norm = float(screening.norm[column])
         note = f"also: {', '.join(search.aliases[i])}" if search.aliases.get(i) else ""
         rows.append(Limit(candidate.name, q.name, (critical + from_power) / norm, q.unit, power, estimate, note))
+    for term in contained:
+        name = term.full(term.parameters[0].name) if term.parameters else term.frees[0]
+        rows.append(Limit(term.name, name, math.inf, None, power, None, "already in the base model"))
     return Table(rows, ("term", "parameter", "smallest", "unit", "power", "estimate", "note"))
 
 

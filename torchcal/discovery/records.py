@@ -247,7 +247,7 @@ class Scores:
 
     fitted: Score
     held_out: Score | None
-    prediction: Tensor | None
+    prediction: Tensor | None = dataclasses.field(repr=False)
     model_error_sd: float | None = None
 
 
@@ -314,4 +314,4 @@ class Experiment:
 
     description: str
     separation: float
-    conditions: dict[str, Any] = dataclasses.field(default_factory=dict)
+    conditions: dict[str, Any] = dataclasses.field(default_factory=dict, repr=False)

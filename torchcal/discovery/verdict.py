@@ -12,7 +12,7 @@ from torchcal.discovery.structure import Structure
 __all__ = ["Decision", "decide"]
 
 #: A hypothesis is named when it has at least this probability among those the library offers.
-NAMED = 0.98
+NAMED = 0.97
 #: Structure left after a hypothesis with less probability than this by noise alone speaks against it.
 WHITE = 0.005
 #: Of the tied hypotheses, those that together have this probability are listed.
@@ -94,11 +94,16 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         decision.verdict = "unexplained"
         _nearly(search, ranked, mask, decision)
         return decision
+    for best in white:
+        if (
+            set(best.names) <= set(white[0].names)
+            and _certainty(groups, best) >= NAMED
+            and not _other_names(search, best)
+        ):
+            decision.verdict, decision.best = "named", best
+            _prove(search, decision, mask)
+            return decision
     best = white[0]
-    if groups[frozenset(best.names)] >= NAMED and not _other_names(search, best):
-        decision.verdict, decision.best = "named", best
-        _prove(search, decision, mask)
-        return decision
     decision.verdict = "ambiguous"
     covered = 0.0
     seen: set[frozenset[str]] = set()
@@ -143,6 +148,11 @@ def _groups(models: Sequence[Model]) -> dict[frozenset[str], float]:
         names = frozenset(m.names)
         found[names] = found.get(names, 0.0) + math.exp(m.weight - top) / total
     return found
+
+
+def _certainty(groups: dict[frozenset[str], float], model: Model) -> float:
+    """Probability that all of a model's terms are there, whatever else is."""
+    return sum(share for names, share in groups.items() if names >= frozenset(model.names))
 
 
 def _gain(search: Search, model: Model, mask: Tensor | None, against: Model | None = None) -> float:
