@@ -24,7 +24,7 @@ figures: $(STAMPS)/arviz,ignition ## make every figure of the studies (no time l
 
 PHYSICS := cooling_water photovoltaic copper puromycin cars mercury
 
-physics: $(STAMPS)/physics ## find the missing physics in real recordings (Mercury takes minutes)
+physics: $(STAMPS)/physics ## find the missing physics in real recordings
 	@set -e; for name in $(PHYSICS); do $(PY) -m examples.physics.$$name; done
 
 test: $(STAMPS)/test ## run the tests and doctests, but the slow ones

@@ -20,13 +20,13 @@ __all__ = ["Noise", "estimate", "smooth_columns", "spikes"]
 #: AR(1) coefficients that are tried.
 GRID = torch.linspace(0.0, 0.95, 39, dtype=torch.float64)
 #: Share of a sequence's degrees of freedom that smooth curves may take.
-SMOOTH_SHARE = 1.0 / 3.0
+SMOOTH_SHARE = 1.0 / 6.0
 #: A sample that differs from its neighbours' mean by more than this many robust sd, alone, is an outlier.
 SPIKE = 4.5
 #: Weight against correlation: log prior density of φ is −SHRINK·φ.
-SHRINK = 2.0
+SHRINK = 1.0
 #: Quantile of its posterior at which a clear correlation is taken.
-CAUTION = 0.8
+CAUTION = 0.6
 #: How much larger the noise found may be than the noise given before the given one is doubted.
 EXCESS = 1.5
 
@@ -71,7 +71,7 @@ class Noise:
 
 
 def smooth_columns(problem: Problem, places: Tensor) -> Tensor:
-    """Smooth curves over one sequence, ``(len(places), m)``, m about a third of its length."""
+    """Smooth curves over one sequence, ``(len(places), m)``, m about a sixth of its length."""
     n = len(places)
     count = int(n * SMOOTH_SHARE)
     if problem.order is not None:

@@ -466,7 +466,7 @@ class Search:
         fresh = estimate(best.found.problem, best.found.residual, best.found.jacobian, given)
         old = self.noise
         change = float((fresh.sd / old.sd).log().abs().max()) + float((fresh.correlation - old.correlation).abs().max())
-        if change < 0.05 or float((fresh.sd / old.sd).max()) > 1.05:
+        if change < 0.05:
             return
         self.noise = fresh
         self.base = refit(self.base, fresh.whitening(self.base.problem))

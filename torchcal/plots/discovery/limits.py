@@ -60,7 +60,7 @@ def detection_limits(limits: Iterable[Any], *, most: int = 16, ax: "Axes | None"
                 [place], [i], "o" if value > low else "<", ms=5.5, mfc=ACCEPTED if seen else "white", mec=ACCEPTED,
                 mew=1.1, zorder=4,
             )  # fmt: skip
-        unit = f" {plain(item.unit)}" if item.unit else ""
+        unit = f" {plain(item.unit)}" if item.unit not in (None, "", "1") else ""
         smallest = f"{style.number(float(f'{item.smallest:.2g}'))}{unit}" if math.isfinite(item.smallest) else "∞"
         note = str(getattr(item, "note", "") or "")
         text = smallest if not note else plain(note, 30)

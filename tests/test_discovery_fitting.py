@@ -1,0 +1,391 @@
+"""Least squares, whitening and simulated noise of a diagnosis, against scipy, Cholesky and what follows by hand."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import torchcal as tc
+from torchcal.discovery.fitting import fit, refit, starts
+from torchcal.discovery.noise import GRID, Noise
+from torchcal.discovery.problem import Problem
+from torchcal.discovery.structure import Residual, _noise_draws
+
+F64 = torch.float64
+
+
+def draws(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=F64)
+
+
+def white(problem, sd):
+    """Whitening of white noise of one sd."""
+    recording = problem.recording
+    return problem.whitening(torch.full_like(recording.y, sd), torch.zeros(len(recording.outputs), dtype=F64))
+
+
+def solve(simulator, recording, sd=1.0, *, count=8, free=None, begin=None):
+    problem = Problem.of(simulator, recording)
+    free = list(range(len(problem.parameters))) if free is None else free
+    begin = starts(problem, count, 0) if begin is None else torch.as_tensor(begin, dtype=F64)
+    return fit(problem, white(problem, sd), begin, free)
+
+
+def exponential(x, p):
+    return p["a"] * torch.exp(-p["k"] * x) + p["b"]
+
+
+def rational(x, p):
+    return p["a"] * x / (p["K"] + x)
+
+
+def wave(x, p):
+    return p["a"] * torch.sin(p["w"] * x) * torch.exp(-p["c"] * x)
+
+
+X = torch.linspace(0.1, 5, 40, dtype=F64)
+#: Function, the same for numpy, parameters, truth, and where scipy starts.
+PROBLEMS = {
+    "exponential": (
+        exponential,
+        lambda x, a, k, b: a * np.exp(-k * x) + b,
+        [tc.Parameter("a"), tc.Parameter("k", low=0.0, initial=1.0), tc.Parameter("b")],
+        (2.0, 0.8, 0.5),
+    ),
+    "rational": (
+        rational,
+        lambda x, a, K: a * x / (K + x),
+        [tc.Parameter("a", low=0.0), tc.Parameter("K", low=1e-6, transform="log", initial=1.0)],
+        (3.0, 1.4),
+    ),
+    "wave": (
+        wave,
+        lambda x, a, w, c: a * np.sin(w * x) * np.exp(-c * x),
+        [tc.Parameter("a"), tc.Parameter("w", low=0.5, high=4.0), tc.Parameter("c", low=0.0, initial=0.1)],
+        (1.5, 2.2, 0.3),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_the_minimum_is_scipys(name):
+    optimize = pytest.importorskip("scipy.optimize")
+    function, plain, parameters, truth = PROBLEMS[name]
+    y = torch.from_numpy(plain(X.numpy(), *truth)) + 0.05 * draws(40, seed=3)
+    found = solve(tc.Simulator(function, parameters), tc.Recording(x=X, y=y), 0.05, count=12)
+    wanted = optimize.least_squares(
+        lambda v: (plain(X.numpy(), *v) - y.numpy()) / 0.05, truth, xtol=1e-14, ftol=1e-14, gtol=1e-14
+    )
+    # χ² converges to a relative change of 1e-7; the estimates to the root of that in units of their sd.
+    assert found.chi2 == pytest.approx(2 * wanted.cost, rel=1e-6)
+    covariance = np.linalg.inv(wanted.jac.T @ wanted.jac)
+    sd = np.sqrt(np.diag(covariance))
+    np.testing.assert_array_less(np.abs(found.values.numpy() - wanted.x) / sd, 0.02)
+    np.testing.assert_allclose(found.sd().numpy(), sd, rtol=0.02)
+    np.testing.assert_allclose(found.covariance().numpy(), covariance, rtol=0.05, atol=0.02 * sd.min() ** 2)
+    assert not bool(found.at_bound.any())
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_many_starts_agree(name):
+    function, plain, parameters, truth = PROBLEMS[name]
+    y = torch.from_numpy(plain(X.numpy(), *truth)) + 0.05 * draws(40, seed=4)
+    found = solve(tc.Simulator(function, parameters), tc.Recording(x=X, y=y), 0.05, count=12)
+    assert found.ends.shape[1] == len(parameters)
+    assert found.agreeing >= 0.25
+    assert float(found.ends_chi2.min()) == pytest.approx(found.chi2)
+
+
+@pytest.mark.parametrize(("low", "high", "wanted"), [(None, 1.0, 1.0), (3.0, None, 3.0), (2.5, 4.0, 2.5)])
+def test_a_bound_that_the_data_want_to_cross(low, high, wanted):
+    # y = a x + b with a = 2: the other parameter is then the mean of what is left.
+    x = torch.linspace(-1, 2, 20, dtype=F64)
+    y = 2.0 * x + 1.0 + 0.01 * draws(20)
+    simulator = tc.Simulator(
+        lambda x, p: p["a"] * x + p["b"], [tc.Parameter("a", low=low, high=high), tc.Parameter("b")]
+    )
+    found = solve(simulator, tc.Recording(x=x, y=y), 0.01)
+    assert float(found.values[0]) == wanted
+    assert found.at_bound.tolist() == [True, False]
+    assert float(found.values[1]) == pytest.approx(float((y - wanted * x).mean()), abs=1e-6)
+
+
+def test_a_bound_that_the_minimum_only_touches_is_no_symptom():
+    x = torch.linspace(0, 1, 30, dtype=F64)
+    simulator = tc.Simulator(lambda x, p: p["a"] * x, [tc.Parameter("a", low=0.0)])
+    found = solve(simulator, tc.Recording(x=x, y=1e-9 * x), 1.0)
+    assert not bool(found.at_bound.any())
+    # An estimate one sd beyond the bound is what noise alone gives.
+    size = 1.0 / float(x.square().sum().sqrt())
+    found = solve(simulator, tc.Recording(x=x, y=-1.0 * size * x), 1.0)
+    assert float(found.values[0]) == 0.0
+    assert not bool(found.at_bound.any())
+
+
+def test_bounds_hold_at_every_start_and_end():
+    simulator = tc.Simulator(wave, [tc.Parameter("a", low=-1.0, high=1.0), tc.Parameter("w", low=1.0, high=2.0),
+                                    tc.Parameter("c", low=0.0, high=0.1)])  # fmt: skip
+    y = 1.5 * torch.sin(2.2 * X) * torch.exp(-0.3 * X)
+    found = solve(simulator, tc.Recording(x=X, y=y), 0.05, begin=20 * draws(10, 3))
+    low, high = torch.tensor([-1.0, 1.0, 0.0], dtype=F64), torch.tensor([1.0, 2.0, 0.1], dtype=F64)
+    assert bool(((found.ends >= low) & (found.ends <= high)).all())
+
+
+def test_the_logarithm_does_not_change_the_minimum():
+    x = torch.linspace(0, 3, 30, dtype=F64)
+    y = 1.3 * torch.exp(-0.4 * x) + 0.01 * draws(30)
+    fits = []
+    for transform in (None, "log"):
+        simulator = tc.Simulator(
+            lambda x, p: p["a"] * torch.exp(-p["k"] * x),
+            [tc.Parameter("a", low=1e-6, initial=1.0), tc.Parameter("k", low=1e-9, transform=transform, initial=0.5)],
+        )
+        fits.append(solve(simulator, tc.Recording(x=x, y=y), 0.01))
+    assert fits[0].chi2 == pytest.approx(fits[1].chi2, rel=1e-6)
+    torch.testing.assert_close(fits[0].values, fits[1].values, rtol=1e-4, atol=0)
+    torch.testing.assert_close(fits[0].sd(), fits[1].sd(), rtol=1e-3, atol=0)
+
+
+def test_the_logarithm_crosses_decades():
+    # From 1 down to 1e-5 for a rate whose tangent is nearly flat at the start.
+    x = torch.linspace(0, 1e5, 50, dtype=F64)
+    y = torch.exp(-1e-5 * x) + 1e-3 * draws(50)
+    simulator = tc.Simulator(
+        lambda x, p: torch.exp(-p["k"] * x), [tc.Parameter("k", low=1e-12, transform="log", initial=1e-3)]
+    )
+    found = solve(simulator, tc.Recording(x=x, y=y), 1e-3)
+    assert float(found.values[0]) == pytest.approx(1e-5, rel=5e-3)
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
+def test_units_do_not_matter(scale):
+    x = torch.linspace(0, 3, 30, dtype=F64)
+    y = scale * (torch.exp(-0.4 * x) + 0.01 * draws(30))
+    simulator = tc.Simulator(
+        lambda x, p: p["a"] * torch.exp(-p["k"] * x / scale),
+        [tc.Parameter("a", low=0.0, initial=0.7 * scale), tc.Parameter("k", low=0.0, initial=1.0 * scale)],
+    )
+    found = solve(simulator, tc.Recording(x=x, y=y), 0.01 * scale)
+    assert float(found.values[1]) / scale == pytest.approx(0.4, abs=0.03)
+    assert found.chi2 == pytest.approx(28.0, abs=5 * math.sqrt(56))
+
+
+def test_a_direction_that_the_data_do_not_tell():
+    # Only a + b enters: its variance is that of a mean, the other direction's is huge, and nothing is NaN.
+    x = torch.linspace(0, 1, 25, dtype=F64)
+    simulator = tc.Simulator(
+        lambda x, p: p["a"] + p["b"] + p["c"] * (x - 0.5), [tc.Parameter(name) for name in ("a", "b", "c")]
+    )
+    found = solve(simulator, tc.Recording(x=x, y=1.0 + 0.1 * draws(25)), 0.1)
+    assert bool(torch.isfinite(found.values).all())
+    assert float(found.values[0] + found.values[1]) == pytest.approx(float((0.1 * draws(25)).mean()) + 1.0, abs=1e-5)
+    covariance = found.covariance()
+    ones = torch.tensor([1.0, 1.0, 0.0], dtype=F64)
+    assert float(ones @ covariance @ ones) == pytest.approx(0.1**2 / 25, rel=1e-2)
+    assert float(found.sd()[0]) > 1e3
+    assert float(found.sd()[2]) == pytest.approx(0.1 / float((x - 0.5).norm()), rel=1e-6)
+
+
+def test_a_parameter_without_effect_stays_where_it_was():
+    simulator = tc.Simulator(lambda x, p: p["a"] * x + 0.0 * p["b"], [tc.Parameter("a"), tc.Parameter("b")])
+    found = solve(simulator, tc.Recording(x=X, y=2 * X), 0.1, begin=[[1.0, 7.0]])
+    assert found.values.tolist() == pytest.approx([2.0, 7.0])
+
+
+def test_held_parameters_stay():
+    simulator = tc.Simulator(lambda x, p: p["a"] * x + p["b"], [tc.Parameter("a"), tc.Parameter("b")])
+    found = solve(simulator, tc.Recording(x=X, y=2 * X + 1), 0.1, free=[0], begin=[[0.0, 0.5]])
+    assert float(found.values[1]) == 0.5
+    assert float(found.sd()[1]) == 0.0
+    assert float(found.values[0]) == pytest.approx(float(((2 * X + 0.5) * X).sum() / X.square().sum()))
+
+
+def test_starts_without_a_finite_output_are_left_out():
+    def root(x, p):
+        return torch.sqrt(p["a"] - x)
+
+    x = torch.linspace(0, 1, 20, dtype=F64)
+    recording = tc.Recording(x=x, y=torch.sqrt(2.0 - x))
+    simulator = tc.Simulator(root, [tc.Parameter("a")])
+    found = solve(simulator, recording, 0.01, begin=[[-1.0], [3.0], [0.5]])
+    assert float(found.values[0]) == pytest.approx(2.0, abs=1e-4)
+    assert solve(simulator, recording, 0.01, begin=[[-1.0], [0.5]]) is None
+
+
+def test_starting_values_are_reproducible_and_within_bounds():
+    simulator = tc.Simulator(
+        lambda x, p: x, [tc.Parameter("a", low=1.0, high=2.0), tc.Parameter("b", low=0.0, initial=3.0),
+                         tc.Parameter("c"), tc.Parameter("d", low=1e-3, high=1e3, transform="log")]
+    )  # fmt: skip
+    problem = Problem.of(simulator, tc.Recording(x=X, y=X))
+    first, again, other = (starts(problem, 16, seed) for seed in (1, 1, 2))
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    assert float(first[0, 1]) == 3.0
+    assert bool(((first[:, 0] >= 1) & (first[:, 0] <= 2) & (first[:, 1] >= 0) & (first[:, 3] >= 1e-3)).all())
+    assert float(starts(problem, 4, 0, {2: 5.0})[3, 2]) == 5.0
+
+
+def oscillator(n=60):
+    time = torch.linspace(0, 12, n, dtype=F64)
+    simulator = tc.ODESimulator(
+        lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"] - p["c"] * s["v"]},
+        {"x": "m", "v": "m/s"},
+        [tc.Parameter("k", low=0.0, initial=1.0), tc.Parameter("c", low=0.0, initial=0.2)],
+        observe=("x",),
+    )
+    return simulator, time
+
+
+def test_a_trajectory_fit_is_the_closed_form():
+    optimize = pytest.importorskip("scipy.optimize")
+    simulator, time = oscillator()
+
+    def closed(p):
+        k, c, x0, v0 = p
+        w = np.sqrt(k - c * c / 4)
+        t = time.numpy()
+        return np.exp(-c * t / 2) * (x0 * np.cos(w * t) + (v0 + c * x0 / 2) / w * np.sin(w * t))
+
+    y = closed((1.3, 0.15, 1.0, 0.2)) + 0.02 * draws(60, seed=1).numpy()
+    recording = tc.Recording(runs=[tc.Run(time, outputs={"x": y})])
+    found = solve(simulator, recording, 0.02, begin=[[1.2, 0.1, 1.0, 0.0]])
+    wanted = optimize.least_squares(lambda p: (closed(p) - y) / 0.02, (1.3, 0.15, 1.0, 0.2), xtol=1e-12, ftol=1e-12)
+    # The solver's steps leave an error of a few 1e-5 in x at the default length.
+    assert found.chi2 == pytest.approx(2 * wanted.cost, rel=1e-2)
+    np.testing.assert_allclose(found.values.numpy(), wanted.x, atol=3e-3)
+
+
+def test_refit_to_part_of_the_data():
+    simulator = tc.Simulator(lambda x, p: p["a"] * x + p["b"], [tc.Parameter("a"), tc.Parameter("b")])
+    y = torch.where(X < 2.5, X, 3 * X - 5)
+    recording = tc.Recording(x=X, y=y)
+    found = solve(simulator, recording, 0.1)
+    part = found.problem.keeping(X < 2.5)
+    again = refit(found, white(part, 0.1), part)
+    assert again.values.tolist() == pytest.approx([1.0, 0.0], abs=1e-5)
+
+
+# --- whitening ------------------------------------------------------------------------------------------------
+
+
+def dense(time, sd, phi, usual):
+    """Covariance of AR(1) noise sampled at given times."""
+    gap = (time[:, None] - time[None, :]).abs() / usual
+    return sd[:, None] * phi**gap * sd[None, :]
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.3, 0.9])
+@pytest.mark.parametrize("even", [True, False])
+def test_whitening_is_choleskys(phi, even):
+    n = 25
+    time = torch.arange(n, dtype=F64) if even else torch.rand(n, generator=torch.Generator().manual_seed(2)).double()
+    time = time if even else (0.2 + time).cumsum(0)
+    simulator, _ = oscillator()
+    recording = tc.Recording(runs=[tc.Run(time, outputs={"x": draws(n)})])
+    problem = Problem.of(simulator, recording)
+    sd = 0.5 + torch.rand(n, generator=torch.Generator().manual_seed(1)).double()
+    w = problem.whitening(sd, torch.tensor([phi], dtype=F64))
+    usual = float(time.diff().median())
+    covariance = dense(time, sd, phi, usual) if phi else torch.diag(sd.square())
+    r = draws(n, 3, seed=5)
+    factor = torch.linalg.cholesky(covariance)
+    wanted = torch.linalg.solve_triangular(factor, r, upper=False)
+    torch.testing.assert_close(w(r), wanted, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(w.vector(r[:, 0]), wanted[:, 0], rtol=1e-9, atol=1e-9)
+    assert w.log_det == pytest.approx(-float(factor.diagonal().log().sum()), rel=1e-9)
+    torch.testing.assert_close(w.scaled(2.0)(r), wanted / 2, rtol=1e-9, atol=1e-9)
+
+
+def test_runs_and_outputs_are_whitened_apart():
+    time = torch.arange(10, dtype=F64)
+    simulator, _ = oscillator()
+    simulator = tc.ODESimulator(simulator.rates, simulator.states, simulator.parameters)
+    y = draws(4, 10)
+    y[1, 3] = math.nan
+    recording = tc.Recording(
+        runs=[tc.Run(time, outputs={"x": y[0], "v": y[1]}), tc.Run(time, outputs={"x": y[2], "v": y[3]})], missing=True
+    )
+    problem = Problem.of(simulator, recording)
+    assert problem.n == 39
+    phi = torch.tensor([0.5, 0.8], dtype=F64)
+    sd = torch.full((40,), 2.0, dtype=F64)
+    r = draws(39, 1, seed=6)
+    found = problem.whitening(sd, phi)(r)[:, 0]
+    blocks = []
+    for name, rho in (("x", 0.5), ("v", 0.8)):
+        for run in (0, 1):
+            kept = [k for k in range(10) if not (name == "v" and run == 0 and k == 3)]
+            blocks.append(dense(time[kept], torch.full((len(kept),), 2.0, dtype=F64), rho, 1.0))
+    covariance = torch.block_diag(*blocks)
+    wanted = torch.linalg.solve_triangular(torch.linalg.cholesky(covariance), r, upper=False)[:, 0]
+    torch.testing.assert_close(found, wanted, rtol=1e-9, atol=1e-9)
+
+
+def test_static_noise_is_correlated_in_the_order_of_recording():
+    x = torch.tensor([0.0, 3.0, 1.0, 2.0], dtype=F64)
+    simulator = tc.Simulator(lambda x, p: p["a"] * x, [tc.Parameter("a")])
+    problem = Problem.of(simulator, tc.Recording(x=x, y=x))
+    w = problem.whitening(torch.ones(4, dtype=F64), torch.tensor([0.6], dtype=F64))
+    r = draws(4, seed=1)
+    torch.testing.assert_close(w.vector(r)[1:], (r[1:] - 0.6 * r[:-1]) / 0.8, rtol=1e-12, atol=0)
+
+
+# --- simulated residuals ------------------------------------------------------------------------------------
+
+
+def line(n, noise=1.0):
+    x = torch.linspace(0, 1, n, dtype=F64)
+    simulator = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    return solve(simulator, tc.Recording(x=x, y=x + noise * draws(n)), 1.0)
+
+
+def noise_model(n, phi=0.0, freedom=math.inf):
+    posterior = torch.zeros(1, len(GRID), dtype=F64)
+    posterior[0, int((GRID - phi).abs().argmin())] = 1.0
+    return Noise(torch.ones(n, dtype=F64), torch.tensor([phi], dtype=F64), freedom, posterior, "estimated")
+
+
+def test_simulated_noise_is_white_where_noise_is():
+    e = _noise_draws(line(30), noise_model(30), 4000, 0)
+    assert e.shape == (30, 4000)
+    # sd of a variance of 120 000 draws: √(2/120000) = 0.004; of a mean 0.003; five of each.
+    assert float(e.mean()) == pytest.approx(0.0, abs=0.015)
+    assert float(e.var()) == pytest.approx(1.0, abs=0.02)
+    torch.testing.assert_close(e @ e.T / 4000, torch.eye(30, dtype=F64), rtol=0, atol=5 * math.sqrt(2 / 4000))
+
+
+def test_simulated_correlated_noise_is_white_once_whitened():
+    found = line(30)
+    noise = noise_model(30, 0.6)
+    found = refit(found, noise.whitening(found.problem))
+    e = _noise_draws(found, noise, 4000, 0)
+    torch.testing.assert_close(e @ e.T / 4000, torch.eye(30, dtype=F64), rtol=0, atol=5 * math.sqrt(2 / 4000))
+
+
+def test_a_size_from_few_data_widens_the_tails():
+    # Student's t with 5 degrees of freedom has the variance 5/3.
+    e = _noise_draws(line(30), noise_model(30, freedom=5.0), 20000, 0)[0]
+    assert float(e.var()) == pytest.approx(5 / 3, abs=0.15)
+    assert float((e.abs() > 3).double().mean()) == pytest.approx(0.0301, abs=5 * math.sqrt(0.03 / 20000))
+
+
+def test_simulated_noise_is_reproducible_and_leaves_the_global_state_alone():
+    found, noise = line(20), noise_model(20, freedom=8.0)
+    before = torch.random.get_rng_state()
+    one, two, three = (_noise_draws(found, noise, 50, seed) for seed in (1, 1, 2))
+    assert torch.equal(before, torch.random.get_rng_state())
+    assert torch.equal(one, two)
+    assert not torch.equal(one, three)
+
+
+def test_projection_takes_the_tangents_away():
+    found = line(25, noise=0.3)
+    residual = Residual(found, noise_model(25))
+    tangents = torch.stack([torch.ones(25, dtype=F64), found.problem.recording.x], dim=-1)
+    torch.testing.assert_close(residual.project(tangents), torch.zeros(25, 2, dtype=F64), rtol=0, atol=1e-12)
+    assert residual.freedom == 23
+    # The fit is a least-squares fit: its residual is orthogonal to the tangents already.
+    torch.testing.assert_close(residual.e, found.residual, rtol=0, atol=1e-6)
+    assert float((tangents.T @ residual.null).abs().max()) < 1e-10
