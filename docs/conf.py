@@ -39,6 +39,7 @@ nb_execution_raise_on_error = True
 nb_execution_timeout = 600
 nb_merge_streams = True
 nb_render_text_lexer = "none"
+nb_render_markdown_format = "myst"  # the tables of terms; CommonMark has none
 nb_output_stderr = "remove"  # warnings name files of the machine that built the page; results print them too
 
 # --- reference -------------------------------------------------------------------------------------------

@@ -343,3 +343,19 @@ def test_results_survive_a_file(found: dict[str, Study], tmp_path: Path) -> None
     assert len(list(tmp_path.glob("*.nc"))) == 6
     loaded = tc.results.Calibration.load(tmp_path / "case_2_embedded.nc", simulator=found["2"].surrogate)
     torch.testing.assert_close(loaded.predict().sd, found["2"].embedded[EPSILON].predict().sd)
+
+
+def test_demo_names_what_is_missing_and_the_error_bars_collapse(found: dict[str, Study], tmp_path: Path) -> None:
+    two = found["2"]
+    story = demo.explain(two, tmp_path, seed=0, progress=False)
+    assert (story.diagnosis.verdict, story.diagnosis.terms) == ("named", ["fuel reaction order"])
+    (location, *_) = story.diagnosis.where
+    assert location.driver == "phi"
+    before, after = (result.predict().map.sd for result in (story.base, story.improved))
+    assert _rms(after) < 0.1 * _rms(before)
+    # At Φ = 1 the order of the fuel is an alias of A.
+    assert demo.FUEL[0] not in [*story.alone.terms, *(name for names in story.alone.tied for name in names)]
+    text = demo.physics(two, story)
+    assert "it is not named" in text
+    paths = demo.draw(two, story, tmp_path, readme=False)
+    assert all(path.stat().st_size > 10_000 for path in [*paths, tmp_path / "report.html"])

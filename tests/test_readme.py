@@ -29,9 +29,10 @@ def test_readme_code_runs_and_prints_what_is_said(text, tmp_path, monkeypatch):
             exec(compile(code, str(README), "exec"), names)
         shown = printed.getvalue()
         assert NUMBER.sub("#", shown).split() == NUMBER.sub("#", said).split()
-        # The last digits belong to the machine.
-        numbers = [[float(n) for n in NUMBER.findall(part)] for part in (shown, said)]
-        assert numbers[0] == pytest.approx(numbers[1], rel=0.05)
+        for number, stated in zip(NUMBER.findall(shown), NUMBER.findall(said), strict=True):
+            # An sd in one or two digits is rough; estimates are not.
+            digits = len(stated.partition("e")[0].replace(".", "").lstrip("-0"))
+            assert float(number) == pytest.approx(float(stated), rel=0.3 if digits <= 2 else 0.01)
 
 
 def test_readme_pictures_exist(text):

@@ -20,7 +20,9 @@ from torchcal.discovery.problem import Problem
 from torchcal.discovery.records import Estimate, Hypothesis, Scores, Table
 from torchcal.discovery.result import Diagnosis
 from torchcal.discovery.search import PRIOR, Model, Search, describe
+from torchcal.discovery.several import refit_several
 from torchcal.discovery.verdict import Decision, decide
+from torchcal.discovery.windows import refit_local
 from torchcal.errors import ConvergenceWarning, DomainError, RecordingError
 from torchcal.simulators import Parameter, Simulator, Trajectories
 from torchcal.terms import Term, extend
@@ -107,8 +109,10 @@ def diagnose(
         detected = search.exact or search.p_detect < 1.0 - confidence
         if terms:
             search.refit_singles(detected=detected)
-            if detected and _wants_more(search):
-                search.refit_several()
+            if detected:
+                refit_local(search)
+                if _wants_more(search):
+                    refit_several(search)
         decision = decide(search, detected, mask)
         return _result(search, decision, simulator, recording, mask, confidence, begun, given, seed)
     finally:
@@ -230,7 +234,12 @@ def _result(
         p_detect=search.p_detect,
         confidence=confidence,
         library=[term.name for term in terms],
-        settings={"seed": seed, "withdrawn": decision.withdrawn, "solver": _solver(search.problem.simulator)},
+        settings={
+            "seed": seed,
+            "withdrawn": decision.withdrawn,
+            "nearly": decision.nearly,
+            "solver": _solver(search.problem.simulator),
+        },
         seconds=time.perf_counter() - begun,
         drivers=search._drivers(),
     )

@@ -30,7 +30,7 @@ class Embedded:
     Attributes:
         parameter: Its name.
         sd: σ_j in the parameter's unit.
-        output_sd: Root mean square of the outputs' model-error sd, in their unit.
+        output_sd: Root mean square of the outputs' model-error sd, in their unit; of several outputs in their spreads.
         log_likelihood: Against no model error.
     """
 
@@ -51,6 +51,9 @@ def embed_each(found: Fitted, noise: Noise, parameters: list[str] | None = None)
     names = [found.problem.parameters[i].name for i in found.free]
     s2 = noise.sd[found.problem.index].square()
     r2 = found.residual.square()
+    recording = found.problem.recording
+    several = len(recording.outputs) > 1
+    unit2 = recording.spread[found.problem.index].square() if several else torch.ones_like(r2)
     rows = []
     for k, name in enumerate(names):
         if parameters is not None and name not in parameters:
@@ -67,7 +70,7 @@ def embed_each(found: Fitted, noise: Noise, parameters: list[str] | None = None)
             Embedded(
                 name,
                 float(variance[best].sqrt()),
-                float((variance[best] * slope2).mean().sqrt()),
+                float((variance[best] * slope2 / unit2).mean().sqrt()),
                 float(logs[best] - logs[0]),
             )
         )

@@ -1,6 +1,7 @@
 """Frozen records that a diagnosis is made of, and the list that prints them as a table."""
 
 import dataclasses
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -92,7 +93,8 @@ class Estimate:
     at_bound: bool = False
 
     def __str__(self) -> str:
-        text = f"{self.name} = {self.value:.4g} ± {self.sd:.2g}"
+        spread = f" ± {self.sd:.2g}" if math.isfinite(self.sd) else " (not determined)"
+        text = f"{self.name} = {self.value:.4g}{spread}"
         text += f" {self.unit}" if self.unit else ""
         return text + (" (at its bound)" if self.at_bound else "")
 
@@ -242,7 +244,8 @@ class Scores:
         fitted: All data, final fit.
         held_out: Data that the fit never saw; None where none could be held out.
         prediction: What the fit without the held-out data predicts, ``(n_total,)``.
-        model_error_sd: Embedded model-error sd, root mean square over the data, outputs' unit.
+        model_error_sd: Embedded model-error sd, root mean square over the data, in the outputs' unit (of several
+            outputs in their spreads).
     """
 
     fitted: Score

@@ -1,6 +1,5 @@
 """Every surviving candidate is added and refitted with everything else; evidence and what is left decide."""
 
-import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -8,14 +7,14 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from torchcal.discovery.candidates import Candidate, base_columns, drivers_scale, prepare
-from torchcal.discovery.fitting import Fitted, fit, follow_slopes, refit, starts
-from torchcal.discovery.local import localised, region_text
-from torchcal.discovery.noise import Noise, estimate, spikes
+from torchcal.discovery.base import calibrate_base
+from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
+from torchcal.discovery.fitting import Fitted, fit, refit
+from torchcal.discovery.local import region_text
+from torchcal.discovery.noise import Noise, estimate
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.screen import Screening, Window, screen, windows
 from torchcal.discovery.structure import Residual, Structure, analyse
-from torchcal.errors import ConvergenceError, DomainError, SimulatorError
 from torchcal.simulators import Trajectories
 from torchcal.terms import Term
 
@@ -25,18 +24,14 @@ __all__ = ["Model", "Search"]
 PRIOR = {"base": 0.30, "single": 0.40, "local": 0.10, "several": 0.08, "none": 0.12}
 #: Prior odds against an estimate on a physical bound that it wants to cross.
 UNPHYSICAL = math.log(1e-3)
-#: Refits at most: single terms, windows, pairs.
-MOST = {"single": 40, "local": 6, "pairs": 12}
+#: Single terms that are refitted at most.
+MOST = 40
 #: Refitted in any case: this many, and those with at least this share of the largest score.
 FEW, CHANCE = 6, 0.2
-#: Data below which no window is sought; nor is any without noise, where a window bends to whatever is left.
-LEAST_LOCAL = 30
 #: Shares of the linear estimate from which refits begin.
 STEPS = (0.05, 1.0)
 #: Correlation of projected tangents above which two candidates are one.
 SAME = 0.9999
-#: The solver's error against the noise.
-SOLVER_SHARE = 0.05
 
 
 @dataclass(eq=False)
@@ -107,99 +102,10 @@ class Search:
         """Whether the recording is declared noise-free."""
         return self.problem.recording.noise == "none"
 
-    # --- base -------------------------------------------------------------------------------------------
-
     def calibrate_base(self) -> None:
-        """Fit the base, set outliers aside, estimate the noise, shorten the solver's steps where they matter."""
-        recording = self.problem.recording
-        free, held = base_columns(self.problem, self.fixed)
-        self.free = free
-        rough = recording.noise if isinstance(recording.noise, Tensor) else 0.1 * recording.spread
-        outputs = torch.zeros(len(recording.outputs), dtype=torch.float64)
-        begin = starts(self.problem, self.num_starts, self.seed, held)
-        for i, value in held.items():
-            begin[:, i] = value
-        found = self._from_starts(begin, free, rough, outputs)
-        if found is None:
-            raise ConvergenceError(
-                "Expected finite outputs of the base at one of the starting values at least. Got none in "
-                f"{self.num_starts} (give initial= or bounds to the parameters)."
-            )
-        found = self._sharpen(found)
-        if not self.exact:
-            for _ in range(3):
-                given = recording.noise if isinstance(recording.noise, Tensor) else None
-                sd = given
-                bad = spikes(found.problem, found.residual, sd)
-                if not bool(bad.any()) or float(bad.double().mean()) > 0.2:
-                    break
-                keep = found.problem.keep.clone()
-                keep[found.problem.index[bad]] = False
-                found = self._again(found, keep)
-        self.problem = found.problem
-        self.noise = estimate(found.problem, found.residual, found.jacobian, recording.noise)
-        self.base = refit(found, self.noise.whitening(found.problem))
-        if not self.exact:
-            self.noise = estimate(self.base.problem, self.base.residual, self.base.jacobian, recording.noise)
-            self.base = refit(self.base, self.noise.whitening(self.base.problem))
-            self.base = self._sharpen(self.base)
-            self.problem = self.base.problem
-
-    def _from_starts(self, begin: Tensor, free: list[int], rough: Tensor, outputs: Tensor) -> Fitted | None:
-        """The best fit from many starts: over the first part of the runs, then over all, so that no phase is lost."""
-        problem = self.problem
-        if not problem.in_time:
-            return fit(problem, problem.whitening(rough, outputs), begin, free)
-        guided = follow_slopes(problem, begin)
-        begin = torch.cat([guided, begin[: max(2, len(begin) // 4)]])
-        keep = torch.zeros(problem.recording.n, dtype=torch.bool)
-        run = problem.recording.x["run"]  # type: ignore[index]
-        for r in run.unique():
-            mine = (run == r).nonzero()[:, 0]
-            keep[mine[: max(8, len(mine) // 4)]] = True
-        early = problem.keeping(keep.repeat(len(problem.recording.outputs)))
-        ends = begin
-        if early.n >= 3 * len(free):
-            first = fit(early, early.whitening(rough, outputs), begin, free, max_steps=15)
-            if first is not None and first.ends is not None and first.ends_chi2 is not None:
-                order = first.ends_chi2.argsort()
-                ends = torch.cat([first.ends[order[: max(4, len(order) // 2)]], guided[:4]])
-        return fit(problem, problem.whitening(rough, outputs), ends, free)
-
-    def _again(self, found: Fitted, keep: Tensor) -> Fitted:
-        problem = dataclasses.replace(found.problem, keep=keep)
-        rough = torch.zeros(len(keep), dtype=torch.float64)
-        rough[found.problem.index] = found.whitening.sd
-        return refit(
-            found, problem.whitening(rough, torch.zeros(len(problem.recording.outputs), dtype=torch.float64)), problem
-        )
-
-    def _sharpen(self, found: Fitted) -> Fitted:
-        """Halve the time steps until the solver's error is small against the noise."""
-        recording = self.problem.recording
-        for _ in range(7):
-            simulator = found.problem.simulator
-            if not isinstance(simulator, Trajectories) or simulator.ode.max_step is not None:
-                return found
-            if isinstance(recording.noise, Tensor):
-                allowed = SOLVER_SHARE * recording.noise[found.problem.index]
-            else:
-                size = found.residual.square().mean().sqrt()
-                allowed = SOLVER_SHARE * torch.maximum(size, 1e-6 * recording.spread[found.problem.index])
-            finer = simulator.refined(2)
-            y = finer.outputs_of(found.values[None], finer.solve(found.values[None]))[0, found.problem.index]
-            error = (y - found.y).abs()
-            if bool((error <= allowed).all()):
-                return found
-            problem = dataclasses.replace(found.problem, simulator=finer)
-            whitening = found.whitening
-            again = fit(problem, whitening, found.values[None], found.free)
-            found = found if again is None else again
-        raise SimulatorError(
-            "Expected the solution to settle when time steps are halved. Got a change of "
-            f"{float(error.max()):.3g} after 7 times (a stiff or discontinuous model: smooth it, give max_step=, or "
-            "rescale it)."
-        )
+        """Calibrate the base and estimate the noise."""
+        self.base, self.noise = calibrate_base(self.problem, self.fixed, self.num_starts, self.seed)
+        self.problem = self.base.problem
 
     # --- screening --------------------------------------------------------------------------------------
 
@@ -259,17 +165,14 @@ class Search:
     # --- refits -----------------------------------------------------------------------------------------
 
     def refit_singles(self, *, detected: bool = True) -> None:
-        """Every candidate that the screening leaves a chance, then the best local ones.
-
-        Where nothing was detected only the leading few, for the record.
-        """
+        """Every candidate that the screening leaves a chance; where nothing was detected only the leading few."""
         count = len(self.candidates)
         prior = math.log(PRIOR["single"] / max(count, 1))
         blind = [i for i in range(count) if self.screening.best[i] < 0 and self.candidates[i].blind]
         order = sorted((i for i in range(count) if self.screening.best[i] >= 0), key=lambda i: -self.screening.score(i))
         top = self.screening.score(order[0]) if order else 0.0
         promising = [i for k, i in enumerate(order) if k < FEW or self.screening.score(i) >= CHANCE * top]
-        chosen = promising[: MOST["single"]] if detected else order[:FEW]
+        chosen = promising[:MOST] if detected else order[:FEW]
         for i in [*chosen, *blind]:
             self.tick(f"refit with {self.candidates[i].name}")
             model = self._refit((i,), self.candidates[i], self._begin(i), prior)
@@ -277,67 +180,6 @@ class Search:
                 self.models.append(model)
         self._reweigh()
         self.merge()
-        if detected:
-            self._refit_local()
-
-    def _refit_local(self) -> None:
-        """Windows that promise more than the same term everywhere."""
-        if self.exact or self.problem.n < LEAST_LOCAL:
-            return
-        gains = {model.numbers[0]: 2 * model.log_evidence + math.log(self.problem.n) for model in self.models}
-        leading = 2 * max((model.log_evidence for model in self.models if model.physical), default=0.0)
-        promising = []
-        for w in self.local:
-            plain = max(gains.get(w.candidate, 0.0), self.screening.score(w.candidate) ** 2)
-            if w.candidate not in self.gone and w.z > 3.5 and w.z**2 > max(plain + 6.0, leading - 10.0):
-                promising.append(w)
-        promising.sort(key=lambda w: -w.z)
-        prior = math.log(PRIOR["local"] / max(len(self.candidates), 1))
-        for w in promising[: MOST["local"]]:
-            self.tick(f"refit with local {self.candidates[w.candidate].name}")
-            model = self._refit_window(w, prior)
-            if model is not None:
-                self.models.append(model)
-
-    def _refit_window(self, w: Window, prior: float) -> Model | None:
-        plain = self.candidates[w.candidate]
-        driver = self._drivers()[w.driver]
-        span = (float(driver.min()), float(driver.max()))
-        term = plain.terms[0]
-        if term.frees:
-            return None
-        local = localised(term, w.driver, w.low, w.high, span, static=not self.problem.in_time)
-        try:
-            candidate = prepare(self.base.problem, self.base, [local], self.fixed, {})
-        except (SimulatorError, DomainError):
-            return None
-        column = self.screening.best[w.candidate]
-        values = dict(zip([plain.problem.parameters[i].name for i in plain.own],
-                          plain.shapes[int(self.screening.shape[column])].tolist(), strict=True))  # fmt: skip
-        amplitude = plain.problem.parameters[plain.amplitudes[int(self.screening.amplitude[column])]].name
-        begin = candidate.begin.clone()
-        values[amplitude] += 0.02 * w.amplitude
-        for i in candidate.own:
-            name = candidate.problem.parameters[i].name
-            if name in values:
-                begin[i] = values[name]
-            else:
-                begin[i] = w.low if name.endswith("from") else w.high
-        # Windows were searched on a grid of about 12 edges: the best of so many costs its logarithm.
-        model = self._refit(
-            (w.candidate,), candidate, begin[None], prior - math.log(3.0 * len(self._drivers())), window=w
-        )
-        if model is None:
-            return None
-        low, high = w.low, w.high
-        for i in candidate.own:
-            name = candidate.problem.parameters[i].name
-            if name.endswith("window from"):
-                low = float(model.found.values[i])
-            elif name.endswith("window to"):
-                high = float(model.found.values[i])
-        model.window = dataclasses.replace(w, low=low, high=high)
-        return model
 
     def _drivers(self) -> dict[str, Tensor]:
         return self.base.problem.drivers(self.base.values[None], self.base.warm)
@@ -484,102 +326,6 @@ class Search:
             model.residual = Residual(model.found, self.noise, seed=self.seed, draws=500)
             model.structure = analyse(model.residual)
         return model.structure
-
-    def refit_several(self) -> None:
-        """Pairs from the linear search at the base, and second terms after the best single ones; then thirds."""
-        single = sorted((m for m in self.models if len(m.numbers) == 1), key=lambda m: -m.weight)
-        count = len(self.candidates)
-        if count < 2 or self.max_terms < 2:
-            return
-        wanted: dict[tuple[int, ...], None] = {}
-        for pair in self._linear_pairs():
-            wanted[pair] = None
-        for model in single[:3]:
-            for j in self._next_terms(model)[:5]:
-                wanted[tuple(sorted((model.numbers[0], j)))] = None
-        pairs = [pair for pair in wanted if len(set(pair)) == 2][: MOST["pairs"]]
-        prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))
-        tried = [self._refit_terms(pair, prior) for pair in pairs]
-        fitted = [m for m in tried if m is not None]
-        self.models += fitted
-        if self.max_terms < 3 or not fitted:
-            return
-        best = max(fitted, key=lambda m: m.weight)
-        if self.examine(best).p_value < 0.01 or self.exact:
-            third = math.log(0.2 * PRIOR["several"] / (count * (count - 1) * max(count - 2, 1) / 6))
-            for j in self._next_terms(best)[:4]:
-                if j in best.numbers:
-                    continue
-                again = self._refit_terms(tuple(sorted((*best.numbers, j))), third)
-                if again is not None:
-                    self.models.append(again)
-
-    def _linear_pairs(self) -> list[tuple[int, int]]:
-        usable = [i for i in range(len(self.candidates)) if self.screening.best[i] >= 0 and i not in self.gone]
-        if len(usable) < 2:
-            return []
-        columns = self.screening.columns[:, [self.screening.best[i] for i in usable]]
-        z = columns.T @ self.residual.e
-        c = columns.T @ columns
-        gain = (z[:, None].square() + z.square() - 2 * c * z[:, None] * z) / (1 - c.square()).clamp_min(1e-6)
-        gain = torch.where(c.abs() > 0.9995, torch.zeros_like(gain), gain).triu(1)
-        order = gain.flatten().argsort(descending=True)[:8]
-        return [(usable[int(k) // len(usable)], usable[int(k) % len(usable)]) for k in order]
-
-    def _next_terms(self, model: Model) -> list[int]:
-        """Other candidates by their score at a model's fit."""
-        residual = model.residual or Residual(model.found, self.noise, seed=self.seed, draws=10)
-        scale = drivers_scale(model.found.problem, model.found)
-        scores = []
-        for j, other in enumerate(self.candidates):
-            if j in model.numbers or j in self.gone:
-                continue
-            self.tick(f"screen {other.name} after {', '.join(model.names)}")
-            try:
-                prepared = prepare(model.found.problem, model.found, other.terms, self.fixed, scale)
-            except (SimulatorError, DomainError):
-                continue
-            found = screen(residual, [prepared])
-            if found.best[0] >= 0:
-                scores.append((-found.score(0), j))
-        return [j for _, j in sorted(scores)]
-
-    def _refit_terms(self, numbers: tuple[int, ...], prior: float) -> Model | None:
-        terms = [term for i in numbers for term in self.candidates[i].terms]
-        self.tick("refit with " + ", ".join(term.name for term in terms))
-        try:
-            candidate = prepare(
-                self.base.problem, self.base, terms, self.fixed, drivers_scale(self.base.problem, self.base)
-            )
-        except (SimulatorError, DomainError):
-            return None
-        names = [q.name for q in candidate.problem.parameters]
-        rows = []
-        for lead in numbers:
-            single = next((m for m in self.models if m.numbers == (lead,) and m.window is None), None)
-            row = candidate.begin.clone()
-            if single is not None:
-                known = dict(
-                    zip(
-                        [q.name for q in single.candidate.problem.parameters], single.found.values.tolist(), strict=True
-                    )
-                )
-                for k, name in enumerate(names):
-                    if name in known:
-                        row[k] = known[name]
-            for other in numbers:
-                if other == lead:
-                    continue
-                fitted = next((m for m in self.models if m.numbers == (other,) and m.window is None), None)
-                source = self.candidates[other]
-                for place in source.own:
-                    name = source.problem.parameters[place].name
-                    k = names.index(name)
-                    neutral = float(source.neutral[source.own.index(place)])
-                    value = float(fitted.found.values[place]) if fitted is not None else neutral
-                    row[k] = neutral + 0.02 * (value - neutral) if place in source.amplitudes else value
-            rows.append(row)
-        return self._refit(numbers, candidate, torch.stack(rows), prior)
 
 
 def _joint(nulls: Sequence[Tensor], seen: Sequence[float]) -> float:

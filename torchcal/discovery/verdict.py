@@ -36,6 +36,7 @@ class Decision:
         base: Probability of the base alone.
         none_evidence: Log weight of the former.
         withdrawn: Why a name was withdrawn, in words.
+        nearly: Whether what is left is not white, and the name rests on the share of the misfit that it removes.
     """
 
     def __init__(self) -> None:
@@ -48,6 +49,7 @@ class Decision:
         self.base = 1.0
         self.none_evidence = 0.0
         self.withdrawn = ""
+        self.nearly = False
 
 
 def _unknown(search: Search, structure: Structure, *, calibrated: bool) -> float:
@@ -183,7 +185,7 @@ def _nearly(search: Search, ranked: list[Model], mask: Tensor | None, decision: 
         left = 1.0 - explain.removed(search, best)
         rivals = [m for m in mine[1:] if frozenset(m.names) != frozenset(best.names)]
         if not _other_names(search, best) and all(1.0 - explain.removed(search, m) > BEATEN * left for m in rivals):
-            decision.verdict, decision.best = "named", best
+            decision.verdict, decision.best, decision.nearly = "named", best, True
             _prove(search, decision, mask)
         return
 

@@ -118,12 +118,18 @@ def _named(d: Any) -> list[str]:
     top = next((row for row in d.ranking if list(row.terms) == list(d.terms)), d.ranking[0])
     estimates = "; ".join(str(estimate) for estimate in top.estimates)
     rival = next((row for row in d.ranking if row is not top and row.terms and row.refitted), None)
+    likely = "" if d.settings.get("nearly") else f"probability {top.probability:.3f}; "
     parts = [
         _where(d),
         f"Adding {_and([_with_region(d, name) for name in d.terms])} and refitting everything removes "
-        f"{percent(top.misfit_removed)} of the misfit beyond noise (probability {top.probability:.3f}; {estimates}).",
+        f"{percent(top.misfit_removed)} of the misfit beyond noise ({likely}{estimates}).",
     ]
-    if rival is not None:
+    if d.settings.get("nearly"):
+        parts.append(
+            "What is left is more than noise, as on most real recordings; the name rests on the share that is removed, "
+            "on held-out data too, and on every rival leaving at least three times as much."
+        )
+    elif rival is not None:
         behind = top.log_evidence - rival.log_evidence
         parts.append(
             f"The next best, {_and(list(rival.terms))}, stands {behind:.1f} natural-log units of evidence behind."

@@ -1,0 +1,932 @@
+"""`diagnose`: the code of the design, the four verdicts on small cases, and what is refused."""
+
+import dataclasses
+import math
+import warnings
+
+import matplotlib.figure
+import pytest
+import torch
+
+import torchcal as tc
+from torchcal.discovery.records import (
+    Estimate,
+    Experiment,
+    Fit,
+    Hypothesis,
+    Limit,
+    Location,
+    MissingRate,
+    NeededShift,
+    NoiseModel,
+    Score,
+    Scores,
+    Table,
+)
+from torchcal.simulators import Trajectories
+
+F64 = torch.float64
+
+
+def draw(n, sd, seed, phi=0.0):
+    e = torch.randn(n, generator=torch.Generator().manual_seed(seed), dtype=F64)
+    for k in range(1, n):
+        e[k] = phi * e[k - 1] + math.sqrt(1 - phi**2) * e[k]
+    return sd * e
+
+
+def simulate(simulator, runs, **values):
+    """Outputs by name, with steps eight times shorter than the tool begins with. A dot in a name is written __."""
+    values = {name.replace("__", "."): value for name, value in values.items()}
+    recording = tc.Recording(runs=runs)
+    bound = Trajectories(simulator, recording, subdivide=8)
+    row = torch.tensor([[values[q.name] for q in bound.parameters]], dtype=F64)
+    return recording.split(bound.linearise(recording.x, row, recording.outputs, []).y[0])
+
+
+def quiet(*args, **options):
+    return tc.diagnose(*args, **{"seed": 0, "progress": False, **options})
+
+
+def named(terms, *names):
+    return [next(term for term in terms if term.name == name) for name in names]
+
+
+def estimate_of(d, name):
+    return next(e for e in d.final.estimates if e.name == name)
+
+
+# --- the code of the design, as written ---------------------------------------------------------------------
+
+
+def oscillator():
+    return tc.ODESimulator(
+        rates=lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"] - p["c"] * s["v"] + u["f"]},
+        states={"x": "m", "v": "m/s"},
+        parameters=[tc.Parameter("k", unit="1/s^2", low=0.0, initial=4.0),
+                    tc.Parameter("c", unit="1/s", low=0.0, initial=0.1)],
+        observe=("x",),
+    )  # fmt: skip
+
+
+GUST = tc.Term("wind gust", equation="v", rate=lambda t, s, p, u: p["g"] * torch.exp(-(((t - p["t0"]) / 0.5) ** 2)),
+               parameters=[tc.Parameter("g", unit="m/s^2"), tc.Parameter("t0", unit="s", low=0.0, high=10.0)])  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def windy():
+    """An oscillator hit by a gust at t = 5, and all candidates of the design."""
+    body = oscillator()
+    t = torch.linspace(0, 10, 81, dtype=F64)
+    f = 0.5 * torch.sin(1.3 * t)
+
+    def run(x):
+        return tc.Run(time=t, outputs={"x": x}, inputs={"f": f}, initial={"x": 0.0})
+
+    x = simulate(tc.terms.extend(body, [GUST]), [run(torch.zeros(81))],
+                 **{"k": 4.2, "c": 0.15, "wind gust.g": 1.0, "wind gust.t0": 5.0, "v(0)": 1.0})["x"]  # fmt: skip
+    motion = tc.Recording(runs=[run(x + draw(81, 0.01, 2))])
+    candidates = [GUST, *tc.terms.mechanics(position="x", velocity="v"), *tc.terms.sensor(outputs=("x",))]
+    return body, motion, candidates, tc.diagnose(body, motion, candidates, seed=0)
+
+
+def all_of(values, kind):
+    return isinstance(values, list) and all(isinstance(value, kind) for value in values)
+
+
+def check_types(d):
+    """Every attribute that the design and the documentation name."""
+    assert d.verdict in ("consistent", "named", "ambiguous", "unexplained")
+    assert all_of(d.terms, str)
+    assert all_of(d.tied, list)
+    assert all(all_of(tied, str) for tied in d.tied)
+    for table, kind in ((d.where, Location), (d.ranking, Hypothesis), (d.detection_limit, Limit)):
+        assert isinstance(table, Table)
+        assert all_of(table, kind)
+        assert isinstance(str(table), str)
+        assert set(table.columns) <= {f.name for f in dataclasses.fields(kind)}
+    assert isinstance(d.remaining, float)
+    assert 0.0 <= d.remaining <= 1.0
+    for scores in (d.before, d.after):
+        assert scores is None or isinstance(scores, Scores)
+        if scores is not None:
+            assert isinstance(scores.fitted, Score)
+            assert scores.held_out is None or isinstance(scores.held_out, Score)
+            assert scores.fitted.n > 0
+            assert 0.0 <= scores.fitted.coverage <= 1.0
+    assert isinstance(d.before, Scores)
+    assert isinstance(d.improved, tc.Simulator)
+    assert all_of(d.symptoms, str)
+    assert isinstance(d.noise, NoiseModel)
+    assert set(d.noise.sd) == set(d.recording.outputs)
+    for fitted in (d.base, d.final):
+        assert isinstance(fitted, Fit)
+        assert all(isinstance(e, Estimate) for e in fitted.estimates)
+        for values in (fitted.prediction, fitted.residual):
+            assert values.dtype == F64
+            assert values.shape == d.recording.y.shape
+            assert not values.requires_grad
+        both = d.recording.observed
+        torch.testing.assert_close((fitted.prediction + fitted.residual)[both], d.recording.y[both])
+    assert all_of(d.shifts, NeededShift)
+    assert d.missing is None or isinstance(d.missing, MissingRate)
+    assert d.experiment is None or isinstance(d.experiment, Experiment)
+    assert all_of(d.equations, str)
+    assert all_of(d.identifiability, str)
+    assert d.held_out is None or (d.held_out.dtype == torch.bool and d.held_out.shape == d.recording.y.shape)
+    assert 0.0 < d.p_detect <= 1.0
+    assert d.confidence == 0.99
+    assert all_of(d.library, str)
+    assert isinstance(d.settings["seed"], int)
+    assert d.seconds > 0
+    assert math.isclose(sum(row.probability for row in d.ranking), 1.0, abs_tol=1e-6)
+    assert [row.probability for row in d.ranking] == sorted((row.probability for row in d.ranking), reverse=True)
+
+
+def test_the_design_in_time(windy, tmp_path):
+    body, motion, candidates, d = windy
+    check_types(d)
+    assert d.verdict == "named"
+    assert d.terms == ["wind gust"]
+    assert d.library == [term.name for term in candidates]
+    assert d.simulator is body
+    assert d.recording is motion
+    assert d.remaining < 0.05
+    assert estimate_of(d, "wind gust.g").value == pytest.approx(1.0, abs=0.1)
+    assert estimate_of(d, "wind gust.t0").value == pytest.approx(5.0, abs=0.1)
+    assert d.after.held_out.rmse < 0.7 * d.before.held_out.rmse
+    assert d.after.held_out.n == d.before.held_out.n == int(d.held_out.sum())
+    assert d.after.model_error_sd < 0.1 * d.before.model_error_sd
+    text = str(d)
+    assert "wind gust" in text.splitlines()[0]
+    assert "wind gust.g = " in text
+    assert "wind gust" in d.equations[0]
+    assert d.improved.names == ("k", "c", "wind gust.g", "wind gust.t0")
+    assert [q.initial is not None for q in d.improved.parameters] == [True] * 4
+    assert isinstance(d.plot(), matplotlib.figure.Figure)
+    path = tmp_path / "report.html"
+    d.report(path)
+    page = path.read_text(encoding="utf-8")
+    assert "wind gust" in page
+    assert "<img" in page or "<svg" in page
+    assert "src=\"http" not in page
+
+
+def test_improved_is_a_simulator_like_any_other(windy):
+    _, motion, candidates, d = windy
+    fit = tc.calibrate(
+        d.improved, motion, embedding=tc.embeddings.PolynomialChaos(parameters=("k",)),
+        likelihood=tc.likelihoods.ABC(epsilon=0.1), num_samples=0, num_starts=4, seed=0,
+    )  # fmt: skip
+    assert fit.predict(motion.x).mean.shape == motion.y.shape
+    again = quiet(d.improved, motion, candidates)
+    assert again.verdict == "consistent"
+    assert again.terms == []
+    row = next(row for row in again.detection_limit if row.term == "wind gust")
+    assert row.note == "already in the base model"
+    assert math.isinf(row.smallest)
+
+
+def test_the_same_seed_gives_the_same_diagnosis():
+    body, motion, candidates = pushed(0.05)
+    first, second = (quiet(body, motion, candidates, seed=3) for _ in range(2))
+    assert str(first.ranking) == str(second.ranking)
+    assert torch.equal(first.final.prediction, second.final.prediction)
+    state = torch.random.get_rng_state()
+    quiet(body, motion, candidates)
+    assert torch.equal(state, torch.random.get_rng_state())
+
+
+def ignition(shift=None):
+    """ln τ of a one-step mechanism: dormant reaction orders and temperature exponent."""
+
+    def f(x, p):
+        heat = p["E"] / (1.987 * x["T0"]) - p["n"] * torch.log(x["T0"] / 1150.0)
+        return heat - p["lnA"] - (p["fuel_order"] - 1.0) * torch.log(x["phi"]) - 0.2 * (p["air_order"] - 1.0)
+
+    simulator = tc.Simulator(f, parameters=[
+        tc.Parameter("lnA", low=10.0, high=36.0), tc.Parameter("E", unit="cal/mol", low=26315.5, high=56954.0),
+        tc.Parameter("fuel_order", neutral=1.0, low=-2.0, high=3.0),
+        tc.Parameter("air_order", neutral=1.0, low=-2.0, high=3.0),
+        tc.Parameter("n", neutral=0.0, low=-12.0, high=12.0),
+    ])  # fmt: skip
+    T0, phi = torch.meshgrid(
+        torch.linspace(1000, 1300, 8, dtype=F64), torch.linspace(0.5, 2, 6, dtype=F64), indexing="ij"
+    )
+    x = {"T0": T0.flatten(), "phi": phi.flatten()}
+    p = {"lnA": 20.0, "E": 43000.0, "fuel_order": -0.3, "air_order": 1.0, "n": 0.0}
+    y = f(x, {name: torch.tensor(value, dtype=F64) for name, value in p.items()})
+    return simulator, x, y if shift is None else y + shift(x)
+
+
+ORDERS = [tc.Term("fuel reaction order", frees=("fuel_order",)), tc.Term("air reaction order", frees=("air_order",)),
+          tc.Term("temperature exponent", frees=("n",))]  # fmt: skip
+
+
+def test_the_design_without_time(tmp_path):
+    simulator, x, y = ignition(lambda x: 0.003 * torch.sin(x["T0"] / 20))
+    delays = tc.Recording(x=x, y=y, noise="none")
+    d = quiet(simulator, delays, ORDERS)
+    check_types(d)
+    assert d.verdict == "named"
+    assert d.terms == ["fuel reaction order"]
+    assert d.noise.source == "none"
+    assert estimate_of(d, "fuel_order").value == pytest.approx(-0.3, abs=0.02)
+    assert d.where[0].driver == "phi"
+    assert d.remaining < 0.01
+    assert next(r for r in d.detection_limit if r.term == "air reaction order").note == "already in the base model"
+    d.report(tmp_path / "ignition.html")
+    assert isinstance(d.plot(), matplotlib.figure.Figure)
+    fit = tc.calibrate(
+        d.improved, delays, embedding=tc.embeddings.IndependentGaussian(),
+        likelihood=tc.likelihoods.ABC(epsilon=0.1), num_samples=0, num_starts=4, seed=0,
+    )  # fmt: skip
+    assert set(fit.names) == {"lnA", "E", "fuel_order"} if hasattr(fit, "names") else True
+
+
+def test_a_parameter_that_depends_on_a_condition():
+    simulator, x, y = ignition()
+    simulator = tc.Simulator(simulator.function, simulator.parameters[:2] + (  # no order to free
+        tc.Parameter("fuel_order", neutral=1.0), tc.Parameter("air_order", neutral=1.0), tc.Parameter("n", neutral=0.0)))
+    term = tc.Term("composition-dependent rate", shifts={"lnA": lambda x, p: p["m"] * torch.log(x["phi"])},
+                   parameters=[tc.Parameter("m")])  # fmt: skip
+    rival = tc.Term("temperature-dependent rate", shifts={"lnA": lambda x, p: p["m"] * (x["T0"] / 1150.0) ** 2},
+                    parameters=[tc.Parameter("m")])  # fmt: skip
+    d = quiet(simulator, tc.Recording(x=x, y=y + draw(48, 0.02, 1), noise=0.02), [rival, term])
+    assert d.verdict == "named"
+    assert d.terms == ["composition-dependent rate"]
+    assert estimate_of(d, "composition-dependent rate.m").value == pytest.approx(-1.3, abs=0.05)
+
+
+# --- verdicts: mechanics ------------------------------------------------------------------------------------
+
+NAMES = ("linear drag", "quadratic drag", "quadratic stiffness", "cubic stiffness", "position-dependent damping",
+         "bias force")  # fmt: skip
+T = torch.linspace(0, 15, 101, dtype=F64)
+FORCE = 0.8 * torch.sin(0.9 * T)
+
+
+def run_of(x, t=T, f=FORCE, **more):
+    return tc.Run(time=t, outputs={"x": x}, inputs={"f": f}, initial=more.pop("initial", {"x": 1.0, "v": 0.0}), **more)
+
+
+def spring(terms, *, noise=0.02, seed=11, phi=0.0, **values):
+    """A driven spring with some terms, recorded with noise; base, clean outputs and noisy ones."""
+    body = oscillator()
+    whole = tc.terms.extend(body, terms)
+    clean = simulate(whole, [run_of(torch.zeros_like(T))], k=2.0, c=0.2, **values)["x"]
+    return body, clean, clean + draw(len(T), noise, seed, phi)
+
+
+def pushed(b, **options):
+    """With a bias force."""
+    library = named(tc.terms.mechanics(), *NAMES)
+    body, _, x = spring(named(library, "bias force"), **{"bias force__b": b}, **options)
+    return body, tc.Recording(runs=[run_of(x)], noise=0.02), library
+
+
+def test_a_large_effect_is_named():
+    d = quiet(*pushed(0.08))
+    check_types(d)
+    assert d.verdict == "named"
+    assert d.terms == ["bias force"]
+    b = estimate_of(d, "bias force.b")
+    assert abs(b.value - 0.08) < 5 * b.sd
+    assert b.sd < 0.01
+    assert b.unit == "m/s^2"
+    assert d.remaining < 0.05
+    assert d.p_detect < 0.01
+    assert d.after.fitted.rmse == pytest.approx(0.02, rel=0.25)
+    assert d.before.fitted.rmse > 1.5 * d.after.fitted.rmse
+    # Coverage of a 95 % interval: within five binomial standard errors.
+    assert d.after.fitted.coverage == pytest.approx(0.95, abs=5 * math.sqrt(0.95 * 0.05 / 101))
+    assert "dv/dt ∋ b" in d.equations[0]
+    top = d.ranking[0]
+    assert top.terms == ("bias force",)
+    assert top.refitted
+    assert top.physical
+    assert top.misfit_removed > 0.95
+    assert top.held_out_rmse == pytest.approx(d.after.held_out.rmse)
+    assert {row.terms for row in d.ranking} >= {(), ("none of these",)}
+
+
+def test_nothing_is_named_where_nothing_is_missing():
+    d = quiet(*pushed(0.0))
+    check_types(d)
+    assert d.verdict == "consistent"
+    assert d.terms == d.tied == d.equations == d.shifts == []
+    assert d.missing is None
+    assert d.experiment is None
+    assert d.improved is d.simulator
+    assert d.final.terms == ()
+    limits = {row.term: row for row in d.detection_limit}
+    assert set(limits) == set(NAMES)
+    assert math.isinf(limits["linear drag"].smallest)
+    assert limits["linear drag"].note == "already in the base model"
+    for name in set(NAMES) - {"linear drag"}:
+        assert 0 < limits[name].smallest < math.inf
+        assert limits[name].power == 0.95
+    assert "smallest effects" in " ".join(str(d).split())
+    assert "linear drag cannot be told from the parameters of the base" in d.identifiability
+
+
+def test_a_planted_effect_above_its_limit_is_found():
+    limit = next(r for r in quiet(*pushed(0.0)).detection_limit if r.term == "bias force").smallest
+    d = quiet(*pushed(2.0 * limit, seed=12))
+    assert d.verdict == "named"
+    assert d.terms == ["bias force"]
+
+
+@pytest.mark.parametrize("noise", [None, "none"])
+def test_named_whatever_is_known_of_the_noise(noise):
+    body, motion, library = pushed(0.08, noise=0.0001 if noise == "none" else 0.02)
+    d = quiet(body, tc.Recording(runs=motion.runs, noise=noise), library)
+    assert d.verdict == "named"
+    assert d.terms == ["bias force"]
+    assert d.noise.source == ("estimated" if noise is None else "none")
+
+
+def test_a_recording_without_noise_of_the_base_is_consistent():
+    body, clean, _ = spring([])
+    d = quiet(body, tc.Recording(runs=[run_of(clean)], noise="none"), named(tc.terms.mechanics(), *NAMES))
+    assert d.verdict == "consistent"
+
+
+def test_two_that_cannot_be_told_apart_are_both_listed():
+    # At |x| < 1 the large-angle sine is a softening spring: x - sin x ≈ x³/6.
+    library = named(tc.terms.mechanics(), "quadratic drag", "cubic stiffness", "large-angle sine", "bias force")
+    body, _, x = spring(named(library, "large-angle sine"), noise=0.01, **{"large-angle sine__k": 1.0})
+    d = quiet(body, tc.Recording(runs=[run_of(x)], noise=0.01), library)
+    check_types(d)
+    assert d.verdict == "ambiguous"
+    assert d.terms == []
+    assert ["large-angle sine"] in d.tied
+    assert ["cubic stiffness"] in d.tied
+    assert d.improved is body
+    assert isinstance(d.experiment, Experiment)
+    assert d.experiment.separation > 0
+    assert d.experiment.description
+    assert set(d.experiment.conditions) == {"time", "initial", "inputs"}
+    assert " or " in str(d).splitlines()[0]
+    assert d.experiment.description in " ".join(str(d).split())
+
+
+def test_an_effect_outside_the_library_is_unexplained():
+    library = named(tc.terms.mechanics(), "quadratic drag", "cubic stiffness", "bias force")
+    outside = tc.Term("pulses", equation="v", parameters=[tc.Parameter("a")],
+                      rate=lambda t, s, p, u: p["a"] * torch.sin(2.3 * t) * torch.exp(-(((t - 7.0) / 2.5) ** 2)))  # fmt: skip
+    body, clean, x = spring([outside], pulses__a=0.8)
+    d = quiet(body, tc.Recording(runs=[run_of(x)], noise=0.02), library)
+    check_types(d)
+    assert d.verdict == "unexplained"
+    assert d.terms == []
+    assert d.improved is body
+    assert d.remaining > 0.2
+    assert isinstance(d.missing, MissingRate)
+    assert bool((d.missing.values.diff() >= 0).all())
+    assert d.missing.rate.shape == d.missing.sd.shape == d.missing.values.shape
+    assert d.where[0].share > 0.3
+    assert "not in this library" in str(d).splitlines()[0]
+    assert d.ranking[0].terms == ("none of these",)
+    assert d.p_detect < 0.01
+    del clean
+
+
+def test_two_missing_terms_are_both_named():
+    library = named(tc.terms.mechanics(), *NAMES)
+    body, _, x = spring(named(library, "bias force", "position-dependent damping"), noise=0.01,
+                        **{"bias force__b": 0.15, "position-dependent damping__c": 0.5})  # fmt: skip
+    d = quiet(body, tc.Recording(runs=[run_of(x)], noise=0.01), library)
+    assert d.verdict == "named"
+    assert sorted(d.terms) == ["bias force", "position-dependent damping"]
+    assert len(d.equations) == 2
+    assert estimate_of(d, "bias force.b").value == pytest.approx(0.15, abs=0.03)
+    assert estimate_of(d, "position-dependent damping.c").value == pytest.approx(0.5, abs=0.1)
+
+
+def test_one_term_at_most_where_asked():
+    library = named(tc.terms.mechanics(), *NAMES)
+    body, _, x = spring(named(library, "bias force", "position-dependent damping"), noise=0.01,
+                        **{"bias force__b": 0.15, "position-dependent damping__c": 0.5})  # fmt: skip
+    d = quiet(body, tc.Recording(runs=[run_of(x)], noise=0.01), library, max_terms=1)
+    assert all(len(row.terms) <= 1 for row in d.ranking)
+    assert len(d.terms) <= 1
+
+
+def test_an_effect_in_a_region_is_found_there():
+    library = named(tc.terms.mechanics(), "quadratic drag", "cubic stiffness", "bias force")
+    gate = tc.Term("gated", equation="v", parameters=[tc.Parameter("b")],
+                   rate=lambda t, s, p, u: p["b"] * torch.sigmoid((t - 6.0) / 0.1) * torch.sigmoid((10.0 - t) / 0.1))
+    body, _, x = spring([gate], noise=0.01, gated__b=0.3)
+    d = quiet(body, tc.Recording(runs=[run_of(x)], noise=0.01), library)
+    assert d.verdict == "named"
+    assert d.terms == ["bias force"]
+    assert d.where[0].driver == "t"
+    assert d.where[0].kind == "equation"
+    assert d.where[0].target == "v"
+    ((low, high),) = d.where[0].spans
+    assert low == pytest.approx(6.0, abs=0.4)
+    assert high == pytest.approx(10.0, abs=0.4)
+    assert d.ranking[0].region is not None
+    assert "where" in str(d).splitlines()[0]
+    # The improved simulator carries the region and begins at the estimates.
+    assert len(d.improved.parameters) == 5
+
+
+def test_a_faulty_sensor_is_named():
+    library = [*named(tc.terms.mechanics(), "quadratic drag", "bias force", "cubic stiffness"),
+               *named(tc.terms.sensor(("x",)), "offset of x", "drift of x", "saturation of x")]  # fmt: skip
+    body, _, x = spring(named(library, "drift of x"), **{"drift of x__b": 0.01})
+    d = quiet(body, tc.Recording(runs=[run_of(x)], noise=0.02), library)
+    assert d.verdict == "named"
+    assert d.terms == ["drift of x"]
+    assert d.where[0].kind == "output"
+
+
+def test_a_hidden_state_is_named():
+    library = named(tc.terms.mechanics(), "quadratic drag", "cubic stiffness", "bias force", "viscoelastic branch")
+    body, _, x = spring(named(library, "viscoelastic branch"),
+                        **{"viscoelastic branch__k": 0.8, "viscoelastic branch__tau": 1.5})  # fmt: skip
+    d = quiet(body, tc.Recording(runs=[run_of(x)], noise=0.02), library)
+    assert d.verdict == "named"
+    assert d.terms == ["viscoelastic branch"]
+    assert len(d.improved.states) == 3
+
+
+def test_another_name_for_the_same_is_an_alias():
+    first, *rest = named(tc.terms.mechanics(), "bias force", "quadratic drag", "cubic stiffness")
+    tilt = tc.Term("tilt", equation="v", rate=lambda t, s, p, u: -9.81 * p["slope"], parameters=[tc.Parameter("slope")])
+    body, motion, _ = pushed(0.1)
+    d = quiet(body, motion, [first, *rest, tilt])
+    assert d.verdict == "named"
+    assert d.terms == ["bias force"]
+    assert d.ranking[0].aliases == ("tilt",)
+    assert next(r for r in d.detection_limit if r.term == "bias force").note == "also: tilt"
+    swapped = quiet(body, motion, [tilt, first, *rest])
+    assert swapped.terms == ["tilt"]
+    assert swapped.ranking[0].aliases == ("bias force",)
+
+
+def test_other_physics_with_the_same_tangent_is_told_as_ambiguous():
+    # Along one run from rest the calibrated base makes an offset and a force the same when the stiffness is known
+    # and nothing else moves: y + b against a force k b.
+    body = tc.ODESimulator(lambda t, s, p, u: {"x": p["r"] - s["x"]}, {"x": "m"}, [tc.Parameter("r", initial=1.0)])
+    terms = [
+        tc.Term("loss", equation="x", rate=lambda t, s, p, u: -p["k"] * s["x"], parameters=[tc.Parameter("k")]),
+        tc.Term("slower reading", outputs={"x": lambda t, s, p, u, y: y - p["k"] * (y - 1.0)},
+                parameters=[tc.Parameter("k")]),
+    ]  # fmt: skip
+    t = torch.linspace(0, 5, 60, dtype=F64)
+    x = 1 - torch.exp(-t) + 0.3 * t * torch.exp(-t)
+    d = quiet(body, tc.Recording(runs=[tc.Run(t, outputs={"x": x + draw(60, 0.01, 1)}, initial={"x": 0.0})], noise=0.01), terms)
+    assert d.verdict in ("named", "ambiguous", "unexplained")
+    check_types(d)
+
+
+def test_what_the_base_holds_already_is_never_named():
+    library = named(tc.terms.mechanics(), "linear drag", "linear spring", "bias force")
+    body, _, x = spring(named(library, "linear drag", "linear spring"), **{"linear drag__c": 0.3, "linear spring__k": 0.5})
+    d = quiet(body, tc.Recording(runs=[run_of(x)], noise=0.02), library)
+    assert d.verdict == "consistent"
+    for name in ("linear drag", "linear spring"):
+        assert next(r for r in d.detection_limit if r.term == name).note == "already in the base model"
+        assert next(r for r in d.ranking if r.terms == (name,)).note == "already in the base model"
+
+
+@pytest.mark.parametrize("bounds", [{"low": 0.0}, {"high": -0.4}, {"low": -0.05, "high": 0.05}])
+def test_an_estimate_that_wants_to_cross_its_bound_is_not_named(bounds):
+    # The spring softens by 0.2; only hardening, more softening or very little of it is allowed.
+    def term(**bounds):
+        return tc.Term("cubic", equation="v", rate=lambda t, s, p, u: -p["k"] * s["x"] ** 3,
+                       parameters=[tc.Parameter("k", **bounds)])  # fmt: skip
+
+    if "high" in bounds and "low" not in bounds:
+        bounds = {"low": -0.5, "high": -0.0}
+        truth = 0.2
+    else:
+        truth = -0.2
+    body, _, x = spring([term()], noise=0.01, cubic__k=truth)
+    motion = tc.Recording(runs=[run_of(x)], noise=0.01)
+    assert quiet(body, motion, [term()]).terms == ["cubic"]
+    d = quiet(body, motion, [term(**bounds)])
+    assert d.verdict == "unexplained"
+    assert d.terms == []
+    row = next(r for r in d.ranking if r.terms == ("cubic",))
+    assert not row.physical
+    assert row.note
+
+
+def test_a_hold_out_is_chosen_before_the_fit():
+    body, motion, library = pushed(0.08)
+    d = quiet(body, motion, library)
+    assert d.held_out.tolist() == [False] * 76 + [True] * 25
+    none = quiet(body, motion, library, holdout=False)
+    assert none.held_out is None
+    assert none.before.held_out is None
+    assert none.after.held_out is None
+    assert none.terms == ["bias force"]
+    share = quiet(body, motion, library, holdout=0.5)
+    assert int(share.held_out.sum()) == 50
+    mask = torch.zeros(101, dtype=torch.bool)
+    mask[::5] = True
+    own = quiet(body, motion, library, holdout=mask)
+    assert torch.equal(own.held_out, mask)
+    assert own.after.held_out.n == int(mask.sum())
+    assert own.after.held_out.rmse == pytest.approx(0.02, rel=0.6)
+    # The final estimates use all data.
+    assert estimate_of(none, "bias force.b").value == pytest.approx(estimate_of(own, "bias force.b").value, rel=1e-6)
+
+
+def test_a_hold_out_of_numpy_and_lists():
+    body, motion, library = pushed(0.08)
+    mask = [k >= 90 for k in range(101)]
+    d = quiet(body, motion, library[-1:], holdout=mask)
+    assert d.held_out.tolist() == mask
+    assert quiet(body, motion, library[-1:], holdout=torch.tensor(mask).numpy()).held_out.tolist() == mask
+
+
+def test_a_name_that_predicts_worse_is_withdrawn(monkeypatch):
+    from torchcal.discovery import verify
+
+    monkeypatch.setattr(verify, "compare", lambda *args: (-2.0, 0.5))
+    d = quiet(*pushed(0.08))
+    assert d.verdict == "unexplained"
+    assert d.terms == []
+    assert "withdrawn" in d.settings["withdrawn"]
+    assert "bias force" in d.settings["withdrawn"]
+    assert "withdrawn" in str(d)
+    monkeypatch.setattr(verify, "compare", lambda *args: (-0.4, 0.5))
+    assert quiet(*pushed(0.08)).terms == ["bias force"]
+
+
+def test_a_later_term_of_the_same_name_replaces_an_earlier_one():
+    body, motion, library = pushed(0.1)
+    mine = tc.Term("bias force", equation="v", rate=lambda t, s, p, u: p["mine"], parameters=[tc.Parameter("mine")])
+    d = quiet(body, motion, [*library, mine])
+    assert d.library.count("bias force") == 1
+    assert estimate_of(d, "bias force.mine").value == pytest.approx(0.1, abs=0.03)
+
+
+def test_held_parameters_are_not_calibrated():
+    body, motion, library = pushed(0.1)
+    d = quiet(body, motion, library, fixed={"k": 2.0})
+    assert [e.name for e in d.base.estimates] == ["c"]
+    assert d.terms == ["bias force"]
+
+
+def test_no_candidates_at_all():
+    body, motion, _ = pushed(0.1)
+    d = quiet(body, motion)
+    assert d.verdict == "unexplained"
+    assert d.library == []
+    check_types(d)
+    body, motion, _ = pushed(0.0)
+    assert quiet(body, motion, []).verdict == "consistent"
+
+
+def test_one_term_need_not_be_in_a_list():
+    body, motion, library = pushed(0.1)
+    assert quiet(body, motion, library[-1]).library == ["bias force"]
+
+
+# --- recordings as they come --------------------------------------------------------------------------------
+
+
+def test_correlated_noise():
+    # A correlation of 0.6 takes much of the power: the effect is large.
+    body, motion, library = pushed(0.25, phi=0.6)
+    d = quiet(body, tc.Recording(runs=motion.runs), library)
+    assert d.terms == ["bias force"]
+    b = estimate_of(d, "bias force.b")
+    assert abs(b.value - 0.25) < 5 * b.sd
+
+
+def test_outliers_are_set_aside():
+    body, motion, library = pushed(0.08)
+    x = motion.y.clone()
+    x[[15, 40, 77]] += torch.tensor([0.6, -0.5, 0.8], dtype=F64)
+    for noise in (None, 0.02):
+        d = quiet(body, tc.Recording(runs=[run_of(x)], noise=noise), library)
+        assert d.noise.outliers == 3
+        assert d.terms == ["bias force"]
+    null = pushed(0.0)[1].y.clone()
+    null[[15, 40, 77]] += torch.tensor([0.6, -0.5, 0.8], dtype=F64)
+    assert quiet(body, tc.Recording(runs=[run_of(null)], noise=0.02), library).verdict == "consistent"
+
+
+def test_quantised_samples():
+    body, motion, library = pushed(0.08)
+    step = 0.05
+    d = quiet(body, tc.Recording(runs=[run_of((motion.y / step).round() * step)]), library)
+    assert d.noise.quantisation == {"x": pytest.approx(step)}
+    assert d.terms == ["bias force"]
+    null = (pushed(0.0)[1].y / step).round() * step
+    assert quiet(body, tc.Recording(runs=[run_of(null)]), library).verdict == "consistent"
+
+
+def test_missing_samples():
+    body, motion, library = pushed(0.08)
+    x = motion.y.clone()
+    x[20:35] = math.nan
+    x[60] = math.nan
+    recording = tc.Recording(runs=[run_of(x)], noise=0.02, missing=True)
+    d = quiet(body, recording, library)
+    check_types(d)
+    assert d.terms == ["bias force"]
+    assert torch.equal(torch.isnan(d.final.residual), ~recording.observed)
+    assert bool(torch.isfinite(d.final.prediction).all())
+
+
+def test_uneven_times():
+    body = oscillator()
+    library = named(tc.terms.mechanics(), *NAMES)
+    gaps = 0.02 + torch.rand(90, generator=torch.Generator().manual_seed(3), dtype=F64) ** 2 * 0.5
+    t = torch.cat([torch.zeros(1, dtype=F64), gaps.cumsum(0)])
+    f = 0.8 * torch.sin(0.9 * t)
+    whole = tc.terms.extend(body, named(library, "bias force"))
+    x = simulate(whole, [run_of(torch.zeros(91), t, f)], k=2.0, c=0.2, **{"bias force.b": 0.1})["x"]
+    d = quiet(body, tc.Recording(runs=[run_of(x + draw(91, 0.02, 4), t, f)], noise=0.02), library)
+    assert d.terms == ["bias force"]
+
+
+def test_several_runs_with_unknown_initial_states_and_parameters_of_their_own():
+    # Two bodies of different mass on the same kind of spring: k is each run's own, and so is the velocity at first.
+    body = tc.ODESimulator(
+        lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"] - p["c"] * s["v"]}, {"x": "m", "v": "m/s"},
+        [tc.Parameter("k", low=0.0, initial=2.0, per_run=True), tc.Parameter("c", low=0.0, initial=0.1)],
+        observe=("x",),
+    )  # fmt: skip
+    library = named(tc.terms.mechanics(), "quadratic drag", "quadratic stiffness", "cubic stiffness", "bias force")
+    whole = tc.terms.extend(body, named(library, "quadratic stiffness"))
+    times = [torch.linspace(0, 10, 70, dtype=F64), torch.linspace(0, 8, 50, dtype=F64)]
+
+    def runs(x):
+        return [tc.Run(times[0], outputs={"x": x[:70]}), tc.Run(times[1], outputs={"x": x[70:]}, initial={"x": -0.8})]
+
+    x = simulate(whole, runs(torch.zeros(120)), **{"k[0]": 2.0, "k[1]": 3.0, "c": 0.15, "x(0)[0]": 1.0, "v(0)[0]": 0.3,
+                 "v(0)[1]": -0.2, "quadratic stiffness.k": 0.4})["x"]  # fmt: skip
+    d = quiet(body, tc.Recording(runs=runs(x + draw(120, 0.015, 2)), noise=0.015), library)
+    check_types(d)
+    assert d.terms == ["quadratic stiffness"]
+    assert estimate_of(d, "k[0]").value == pytest.approx(2.0, abs=0.1)
+    assert estimate_of(d, "k[1]").value == pytest.approx(3.0, abs=0.1)
+    assert {e.name for e in d.final.estimates} == {
+        "k[0]", "k[1]", "c", "x(0)[0]", "v(0)[0]", "v(0)[1]", "quadratic stiffness.k"
+    }  # fmt: skip
+    # The last quarter of each run.
+    assert d.held_out.nonzero()[:, 0].tolist() == [*range(53, 70), *range(108, 120)]
+
+
+def test_outputs_of_different_size_that_are_functions_of_the_states():
+    body = tc.ODESimulator(
+        lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"] - p["c"] * s["v"] + u["f"]}, {"x": "m", "v": "m/s"},
+        [tc.Parameter("k", low=0.0, initial=2.0), tc.Parameter("c", low=0.0, initial=0.2)],
+        observe={"x": lambda t, s, p, u: s["x"], "energy": lambda t, s, p, u: 500.0 * (s["v"] ** 2 + p["k"] * s["x"] ** 2)},
+    )  # fmt: skip
+    library = named(tc.terms.mechanics(), *NAMES)
+    whole = tc.terms.extend(body, named(library, "quadratic stiffness"))
+
+    def run(x, e):
+        return tc.Run(T, outputs={"x": x, "energy": e}, inputs={"f": FORCE}, initial={"x": 1.0, "v": 0.0})
+
+    zero = torch.zeros(101)
+    y = simulate(whole, [run(zero, zero)], k=2.0, c=0.2, **{"quadratic stiffness.k": 0.3})
+    noise = {"x": 0.02, "energy": 20.0}
+    recording = tc.Recording(runs=[run(*(y[name] + draw(101, noise[name], i) for i, name in enumerate(noise)))], noise=noise)
+    d = quiet(body, recording, library)
+    check_types(d)
+    assert d.terms == ["quadratic stiffness"]
+    assert d.noise.sd == {"x": pytest.approx(0.02), "energy": pytest.approx(20.0)}
+
+
+# --- other fields -------------------------------------------------------------------------------------------
+
+
+def test_thermal():
+    t = torch.linspace(0, 60, 61, dtype=F64)
+    body = tc.ODESimulator(lambda t, s, p, u: {"T": -p["k"] * (s["T"] - 20.0)}, {"T": "degC"},
+                           [tc.Parameter("k", low=0.0, initial=0.05, unit="1/min")])  # fmt: skip
+    library = tc.terms.thermal(ambient=20.0, time="min")
+    whole = tc.terms.extend(body, named(library, "evaporation"))
+
+    def run(x):
+        return tc.Run(t, outputs={"T": x})
+
+    x = simulate(whole, [run(torch.zeros(61))], k=0.03, **{"T(0)": 90.0, "evaporation.c": 0.02})["T"]
+    d = quiet(body, tc.Recording(runs=[run(x + draw(61, 0.1, 1))]), library)
+    assert d.verdict == "named"
+    assert d.terms == ["evaporation"]
+    null = simulate(body, [run(torch.zeros(61))], k=0.05, **{"T(0)": 90.0})["T"]
+    d = quiet(body, tc.Recording(runs=[run(null + draw(61, 0.1, 1))]), library)
+    assert d.verdict == "consistent"
+
+
+def test_kinetics():
+    t = torch.linspace(0, 40, 41, dtype=F64)
+    body = tc.ODESimulator(lambda t, s, p, u: {"A": -p["k"] * s["A"], "B": p["k"] * s["A"]},
+                           {"A": "mol/L", "B": "mol/L"}, [tc.Parameter("k", low=0.0, initial=0.1)])  # fmt: skip
+    library = tc.terms.kinetics("A", "B")
+    whole = tc.terms.extend(body, named(library, "reverse reaction"))
+
+    def runs(a, b):
+        return [tc.Run(t, outputs={"A": a[i * 41 : i * 41 + 41], "B": b[i * 41 : i * 41 + 41]},
+                       initial={"A": 1.0 + i, "B": 0.1}) for i in range(2)]  # fmt: skip
+
+    zero = torch.zeros(82)
+    y = simulate(whole, runs(zero, zero), k=0.1, **{"reverse reaction.k": 0.02})
+    y = {name: values + draw(82, 0.02, i) for i, (name, values) in enumerate(y.items())}
+    d = quiet(body, tc.Recording(runs=runs(y["A"], y["B"]), noise=0.02), library)
+    assert d.verdict == "named"
+    assert d.terms == ["reverse reaction"]
+
+
+def parabola(b, noise=0.1, n=60):
+    x = torch.linspace(-1, 3, n, dtype=F64)
+    simulator = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    terms = [
+        tc.Term("curvature", outputs={"y": lambda x, p, y: y + p["q"] * x**2}, parameters=[tc.Parameter("q")]),
+        tc.Term("kink", outputs={"y": lambda x, p, y: y + p["c"] * torch.relu(x - p["x0"])},
+                parameters=[tc.Parameter("c"), tc.Parameter("x0", low=-1.0, high=3.0)]),
+    ]  # fmt: skip
+    return simulator, x, 1.0 + 2.0 * x + b * x**2 + draw(n, noise, 5), terms
+
+
+def test_static():
+    simulator, x, y, terms = parabola(0.3)
+    d = quiet(simulator, tc.Recording(x=x, y=y, noise=0.1), terms)
+    check_types(d)
+    assert d.verdict == "named"
+    assert d.terms == ["curvature"]
+    assert estimate_of(d, "curvature.q").value == pytest.approx(0.3, abs=0.06)
+    assert float(x[d.held_out].min()) > float(x[~d.held_out].max())
+    simulator, x, y, terms = parabola(0.0)
+    assert quiet(simulator, tc.Recording(x=x, y=y, noise=0.1), terms).verdict == "consistent"
+    assert quiet(simulator, tc.Recording(x=x, y=y), terms).verdict == "consistent"
+
+
+def test_a_threshold_whose_tangent_vanishes_at_neutral():
+    # The term's amplitude multiplies another of its parameters: at neutral both tangents are zero.
+    simulator, x, y, _ = parabola(0.3)
+    term = tc.Term("product", outputs={"y": lambda x, p, y: y + p["a"] * p["b"] * x**2},
+                   parameters=[tc.Parameter("a"), tc.Parameter("b")])  # fmt: skip
+    d = quiet(simulator, tc.Recording(x=x, y=y, noise=0.1), [term])
+    assert d.verdict == "named"
+    assert d.terms == ["product"]
+
+
+def test_replicates_of_a_static_recording():
+    simulator, x, _, terms = parabola(0.0)
+    x = x[::3].repeat_interleave(3)
+    y = 1.0 + 2.0 * x + 0.3 * x**2 + draw(len(x), 0.1, 8)
+    d = quiet(simulator, tc.Recording(x=x, y=y), terms)
+    assert d.noise.source == "replicates"
+    assert d.terms == ["curvature"]
+
+
+def test_two_conditions_and_a_parameter_that_varies_with_one():
+    simulator, x, y = ignition()
+    d = quiet(simulator, tc.Recording(x=x, y=y + draw(48, 0.02, 1), noise=0.02), ORDERS)
+    assert d.terms == ["fuel reaction order"]
+    shift = next(s for s in d.shifts if s.parameter == "lnA")
+    assert shift.driver == "phi"
+    assert abs(shift.correlation) > 0.9
+    assert bool((shift.sd > 0).all())
+    assert any("bound" in text or "bent" in text for text in d.symptoms)
+
+
+# --- what is refused, before any long work ------------------------------------------------------------------
+
+
+class Costly:
+    """A static model that may be evaluated a few times, and no more."""
+
+    def __init__(self, allowed):
+        self.calls, self.allowed = 0, allowed
+
+    def __call__(self, x, p):
+        self.calls += 1
+        if self.calls > self.allowed:
+            raise AssertionError("long work began before the arguments were checked")
+        return p["a"] + p["b"] * x
+
+
+X = torch.linspace(0, 1, 20, dtype=F64)
+DATA = tc.Recording(x=X, y=X + draw(20, 0.1, 0))
+BEND = tc.Term("bend", outputs={"y": lambda x, p, y: y + p["q"] * x**2}, parameters=[tc.Parameter("q")])
+
+
+def costly(allowed=0, **parameters):
+    return tc.Simulator(Costly(allowed), [tc.Parameter("a"), tc.Parameter("b", **parameters)])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"confidence": 0.4}, "confidence"),
+        ({"confidence": 1.0}, "confidence"),
+        ({"confidence": math.nan}, "confidence"),
+        ({"max_terms": 0}, "max_terms"),
+        ({"max_terms": 1.5}, "max_terms"),
+        ({"max_terms": True}, "max_terms"),
+        ({"num_starts": 0}, "num_starts"),
+        ({"num_starts": "many"}, "num_starts"),
+        ({"holdout": 0.0}, "share"),
+        ({"holdout": 1.0}, "share"),
+        ({"holdout": math.nan}, "share"),
+        ({"holdout": 3}, "bool array"),
+        ({"holdout": True}, "bool array"),
+        ({"holdout": [0, 1]}, "bool array"),
+        ({"holdout": torch.ones(5, dtype=torch.bool)}, r"shape \(20,\)"),
+        ({"holdout": torch.ones(20)}, "bool array"),
+        ({"holdout": torch.ones(20, dtype=torch.bool)}, "hold out less"),
+        ({"holdout": torch.zeros(20, dtype=torch.bool)}, "hold out at least one"),
+        ({"fixed": {"a": 0.0, "b": 1.0}}, "fixed or dormant"),
+    ],
+)
+def test_bad_options(options, message):
+    with pytest.raises(tc.errors.DomainError, match=message):
+        quiet(costly(), DATA, [BEND], **options)
+
+
+@pytest.mark.parametrize(
+    ("candidates", "message"),
+    [
+        (["drag"], "torchcal.Term"),
+        ([BEND, None], "torchcal.Term"),
+        ([lambda t, s, p, u: 0.0], "torchcal.Term"),
+        ([tc.Term("x", frees=("c",))], "name a parameter"),
+        ([tc.Term("x", shifts={"c": lambda x, p: p["m"]}, parameters=[tc.Parameter("m")])], "name a parameter"),
+        ([tc.Term("x", equation="v", rate=lambda t, s, p, u: p["m"], parameters=[tc.Parameter("m")])], "without rates"),
+    ],
+)
+def test_bad_candidates(candidates, message):
+    with pytest.raises(tc.errors.DomainError, match=message):
+        quiet(costly(), DATA, candidates)
+
+
+@pytest.mark.parametrize(
+    ("term", "message"),
+    [
+        (tc.Term("x", equation="w", rate=lambda t, s, p, u: p["m"], parameters=[tc.Parameter("m")]), "equation of"),
+        (tc.Term("x", outputs={"v": lambda t, s, p, u, y: y + p["m"]}, parameters=[tc.Parameter("m")]), "output of"),
+        (tc.Term("x", shifts={"m": lambda t, s, p, u: p["m"]}, parameters=[tc.Parameter("m")]), "name a parameter"),
+        (tc.Term("x", rates={"v": lambda t, s, p, u: p["m"]}, states={"v": "m"}, parameters=[tc.Parameter("m")]), "new name"),
+    ],
+)
+def test_bad_candidates_in_time(term, message):
+    with pytest.raises(tc.errors.DomainError, match=message):
+        quiet(oscillator(), tc.Recording(runs=[run_of(FORCE)]), [term])
+
+
+def test_not_a_simulator_or_not_a_recording():
+    with pytest.raises(tc.errors.DomainError, match="Simulator"):
+        quiet(lambda x, p: x, DATA, [BEND])
+    with pytest.raises(tc.errors.RecordingError, match=r"torchcal\.Recording"):
+        quiet(costly(), (X, X), [BEND])
+
+
+def test_simulator_and_recording_of_different_kinds():
+    with pytest.raises(tc.errors.TorchcalError, match="in time"):
+        quiet(oscillator(), DATA, [])
+    other = tc.Recording(runs=[tc.Run(T, outputs={"speed": T}, inputs={"f": FORCE})])
+    with pytest.raises(tc.errors.SimulatorError, match="speed"):
+        quiet(oscillator(), other, [])
+
+
+def test_all_parameters_dormant():
+    simulator = tc.Simulator(Costly(0), [tc.Parameter("a", neutral=0.0), tc.Parameter("b", neutral=1.0)])
+    with pytest.raises(tc.errors.DomainError, match="dormant"):
+        quiet(simulator, DATA, [BEND])
+
+
+def test_fewer_data_than_parameters():
+    few = tc.Recording(x=X[:2], y=X[:2])
+    with pytest.raises(tc.errors.RecordingError, match="2 data and 2 free"):
+        quiet(costly(), few, [BEND])
+
+
+def test_a_term_that_changes_the_simulator_at_neutral():
+    term = tc.Term("always on", outputs={"y": lambda x, p, y: y + torch.cos(p["q"] * x)}, parameters=[tc.Parameter("q")])
+    simulator = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    with pytest.raises(tc.errors.SimulatorError, match="neutral"):
+        quiet(simulator, DATA, [term])
+
+
+def test_a_base_that_is_never_finite():
+    simulator = tc.Simulator(lambda x, p: p["a"] * torch.log(-1.0 - x), [tc.Parameter("a")])
+    with pytest.raises(tc.errors.ConvergenceError, match="finite"):
+        quiet(simulator, DATA, [BEND])
+
+
+def test_progress_can_be_silenced(capsys):
+    body, motion, library = pushed(0.0)
+    tc.diagnose(body, motion, library[-1:], progress=False)
+    assert capsys.readouterr().err == ""
+    tc.diagnose(body, motion, library[-1:])
+    assert "diagnose" in capsys.readouterr().err
+
+
+def test_no_warning_where_all_goes_well():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        quiet(*pushed(0.08))

@@ -1,0 +1,309 @@
+"""Noise or physics: the noise model, false alarms, screening and detection limits, over many seeds.
+
+Every tolerance follows from the number of seeds: five standard errors, or the binomial tail at 1e-4.
+"""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import torchcal as tc
+from torchcal.discovery.fitting import fit
+from torchcal.discovery.noise import Noise, estimate, spikes
+from torchcal.discovery.problem import Problem
+from torchcal.discovery.search import Search
+
+F64 = torch.float64
+
+
+def draw(n, sd, seed, phi=0.0):
+    """Stationary AR(1) noise of one sd; white for phi = 0."""
+    e = torch.randn(n, generator=torch.Generator().manual_seed(seed), dtype=F64)
+    for k in range(1, n):
+        e[k] = phi * e[k - 1] + math.sqrt(1 - phi**2) * e[k]
+    return sd * e
+
+
+def most(trials, probability, tail=1e-4):
+    """The most successes that chance gives, but for the tail."""
+    stats = pytest.importorskip("scipy.stats")
+    return int(stats.binom.ppf(1 - tail, trials, probability))
+
+
+def fewest(trials, probability, tail=1e-4):
+    stats = pytest.importorskip("scipy.stats")
+    return int(stats.binom.ppf(tail, trials, probability))
+
+
+# --- size and correlation -----------------------------------------------------------------------------------
+
+LINE = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+
+
+def noise_of(x, y, given=None, simulator=LINE) -> Noise:
+    recording = tc.Recording(x=x, y=y, noise=given)
+    problem = Problem.of(simulator, recording)
+    begin = torch.zeros(1, len(problem.parameters), dtype=F64)
+    whitening = problem.whitening(0.1 * recording.spread, torch.zeros(len(recording.outputs), dtype=F64))
+    found = fit(problem, whitening, begin, list(range(begin.shape[1])))
+    return estimate(problem, found.residual, found.jacobian, recording.noise)
+
+
+@pytest.mark.parametrize("misfit", [0.0, 0.5])
+@pytest.mark.parametrize(("phi", "tolerance"), [(0.0, 0.03), (0.3, 0.07), (0.6, 0.13)])
+def test_size_and_correlation_of_the_noise(phi, tolerance, misfit):
+    # A smooth misfit of five noise sd must not pass for noise.
+    n, seeds = 200, 30
+    x = torch.linspace(0, 1, n, dtype=F64)
+    found = [noise_of(x, 1 + 2 * x + misfit * torch.sin(7 * x) + draw(n, 0.1, seed, phi)) for seed in range(seeds)]
+    size = np.array([float(noise.sd[0]) for noise in found]) / 0.1
+    coefficient = np.array([float(noise.correlation[0]) for noise in found])
+    # The size's bias comes with the prior against correlation and the caution on its other side.
+    assert abs(size.mean() - 1) < tolerance + 5 * size.std() / math.sqrt(seeds)
+    assert abs(coefficient.mean() - phi) < 0.05 + 5 * coefficient.std() / math.sqrt(seeds)
+    assert found[0].source == "estimated"
+    assert math.isfinite(found[0].freedom)
+
+
+def test_a_smooth_misfit_changes_the_noise_little():
+    x = torch.linspace(0, 1, 100, dtype=F64)
+    for seed in range(5):
+        e = draw(100, 0.1, seed)
+        plain, bent = (noise_of(x, 2 * x + size * torch.cos(9 * x) + e) for size in (0.0, 1.0))
+        assert float(bent.sd[0]) == pytest.approx(float(plain.sd[0]), rel=0.05)
+
+
+def test_given_noise_is_taken():
+    x = torch.linspace(0, 1, 60, dtype=F64)
+    noise = noise_of(x, x + draw(60, 0.1, 1), 0.1)
+    assert noise.source == "given"
+    assert noise.freedom == math.inf
+    assert noise.doubted == 1.0
+    torch.testing.assert_close(noise.sd, torch.full((60,), 0.1, dtype=F64))
+
+
+def test_given_noise_that_the_data_contradict_is_doubted():
+    x = torch.linspace(0, 1, 60, dtype=F64)
+    noise = noise_of(x, x + draw(60, 0.1, 1), 0.02)
+    assert noise.doubted == pytest.approx(5.0, rel=0.3)
+
+
+def test_a_detailed_simulation_has_none():
+    x = torch.linspace(0, 1, 20, dtype=F64)
+    noise = noise_of(x, x.square(), "none")
+    assert noise.source == "none"
+    torch.testing.assert_close(noise.sd, 1e-3 * x.square().std().expand(20))
+
+
+def test_replicates_measure_the_noise_whatever_the_misfit():
+    # 30 conditions three times each: 60 degrees of freedom, an sd of the sd of 9 %.
+    x = torch.linspace(0, 1, 30, dtype=F64).repeat_interleave(3)
+    noise = noise_of(x, torch.sin(12 * x) + draw(90, 0.1, 3))
+    assert noise.source == "replicates"
+    assert noise.freedom == 60
+    assert float(noise.sd[0]) == pytest.approx(0.1, rel=5 * 0.0913)
+
+
+def test_outputs_have_noise_of_their_own():
+    x = torch.linspace(0, 1, 300, dtype=F64)
+    y = {"u": x + draw(300, 0.1, 1), "w": 5 * x + draw(300, 2.0, 2, 0.7)}
+    simulator = tc.Simulator(lambda x, p: {"u": p["a"] * x, "w": p["b"] * x}, [tc.Parameter("a"), tc.Parameter("b")])
+    noise = noise_of(x, y, simulator=simulator)
+    assert float(noise.sd[0]) == pytest.approx(0.1, rel=0.25)
+    assert float(noise.sd[300]) == pytest.approx(2.0, rel=0.5)
+    assert float(noise.correlation[0]) < 0.2
+    assert float(noise.correlation[1]) == pytest.approx(0.7, abs=0.15)
+
+
+@pytest.mark.parametrize("phi", [0.4, 0.7])
+def test_gaps_do_not_upset_the_correlation(phi):
+    n = 300
+    x = torch.arange(n, dtype=F64)
+    e = draw(n, 0.1, 5, phi)
+    keep = torch.rand(n, generator=torch.Generator().manual_seed(0)) > 0.1
+    full, gaps = noise_of(x, e), noise_of(x[keep], e[keep])
+    assert float(full.correlation[0]) == pytest.approx(phi, abs=0.2)
+    assert float(gaps.correlation[0]) == pytest.approx(phi, abs=0.25)
+
+
+def test_too_few_data_to_tell():
+    with pytest.raises(tc.errors.DomainError, match="noise="):
+        noise_of(torch.tensor([0.0, 1.0], dtype=F64), torch.tensor([0.0, 1.0], dtype=F64))
+
+
+def test_a_recording_in_steps():
+    x = torch.linspace(0, 1, 50, dtype=F64)
+    noise = noise_of(x, ((3 * x + draw(50, 0.001, 1)) / 0.1).round() * 0.1)
+    assert noise.step == {"y": pytest.approx(0.1)}
+    # Uniform in a step; at least that much.
+    assert 0.1 / math.sqrt(12) <= float(noise.sd[0]) * (1 + 1e-9)
+    assert not noise_of(x, 3 * x + draw(50, 0.1, 1)).step
+
+
+# --- outliers -----------------------------------------------------------------------------------------------
+
+
+def spikes_in(y, sd=None):
+    x = torch.linspace(0, 1, len(y), dtype=F64)
+    problem = Problem.of(LINE, tc.Recording(x=x, y=y))
+    return spikes(problem, y, None if sd is None else torch.full((len(y),), sd, dtype=F64)).nonzero()[:, 0].tolist()
+
+
+@pytest.mark.parametrize("sd", [None, 0.1])
+def test_lonely_spikes_are_found(sd):
+    x = torch.linspace(0, 1, 80, dtype=F64)
+    y = torch.sin(6 * x) + draw(80, 0.1, 2)
+    y[20] += 2.0
+    y[51] -= 1.5
+    assert spikes_in(y, sd) == [20, 51]
+
+
+def test_steps_and_pulses_are_no_outliers():
+    x = torch.linspace(0, 1, 80, dtype=F64)
+    step = torch.where(x > 0.5, 3.0, 0.0).to(F64) + draw(80, 0.1, 2)
+    pulse = 3.0 * torch.exp(-(((x - 0.5) / 0.05) ** 2)) + draw(80, 0.1, 2)
+    assert spikes_in(step) == []
+    assert spikes_in(pulse) == []
+
+
+def test_good_data_are_rarely_set_aside():
+    # The second difference of white noise exceeds 4.5 robust sd with a probability of 7e-6 a sample.
+    count = sum(len(spikes_in(draw(100, 1.0, seed))) for seed in range(60))
+    assert count <= most(6000, 1e-4)
+
+
+# --- false alarms -------------------------------------------------------------------------------------------
+
+DECAY = tc.Simulator(
+    lambda x, p: p["a"] * torch.exp(-p["k"] * x),
+    [tc.Parameter("a", initial=1.0), tc.Parameter("k", low=0.0, initial=1.0)],
+)
+LIBRARY = [
+    tc.Term("offset", outputs={"y": lambda x, p, y: y + p["b"]}, parameters=[tc.Parameter("b")]),
+    tc.Term("rate change", shifts={"k": lambda x, p: p["m"] * x}, parameters=[tc.Parameter("m")]),
+    tc.Term("bump", outputs={"y": lambda x, p, y: y + p["h"] * torch.exp(-(((x - p["c"]) / 0.2) ** 2))},
+            parameters=[tc.Parameter("h", low=0.0), tc.Parameter("c", low=0.0, high=3.0)]),
+]  # fmt: skip
+
+
+def decay(n, seed, phi=0.0, *, known, offset=0.0):
+    x = torch.linspace(0, 3, n, dtype=F64)
+    y = 1.1 * torch.exp(-0.9 * x) + offset + draw(n, 0.02, seed, phi)
+    return tc.Recording(x=x, y=y, noise=0.02 if known else None)
+
+
+def diagnosed(recording, seed=0, **options):
+    return tc.diagnose(DECAY, recording, LIBRARY, seed=seed, progress=False, **options)
+
+
+#: Samples, correlation, whether the noise is known, and the false alarms allowed: 2 % is what a diagnosis promises.
+NULLS = {"white, known": (60, 0.0, True), "white, unknown": (60, 0.0, False), "AR(1), unknown": (200, 0.5, False)}
+
+
+def nulls(name, seeds):
+    n, phi, known = NULLS[name]
+    return [diagnosed(decay(n, seed, phi, known=known), seed) for seed in seeds]
+
+
+@pytest.mark.parametrize("name", NULLS)
+def test_false_alarms_are_rare(name):
+    found = nulls(name, range(20))
+    assert sum(d.verdict != "consistent" for d in found) <= most(20, 0.02)
+    for d in found:
+        if d.verdict == "consistent":
+            assert (d.terms, d.tied, d.remaining, d.after) == ([], [], 0.0, None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NULLS)
+def test_false_alarms_are_rare_over_many_seeds(name):
+    seeds = 150
+    found = nulls(name, range(1000, 1000 + seeds))
+    assert sum(d.verdict != "consistent" for d in found) <= most(seeds, 0.02, 1e-2)
+    stats = pytest.importorskip("scipy.stats")
+    p = np.array([d.p_detect for d in found])
+    # Small values must not be too frequent; they may be too rare, where the correlation is uncertain.
+    assert stats.kstest(p, "uniform", alternative="greater").pvalue > 1e-3
+    assert (p < 0.05).sum() <= most(seeds, 0.05)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_probability_of_a_misfit_is_uniform_without_one(known):
+    # Below 40 samples no correlation is sought, and nothing makes the test cautious.
+    stats = pytest.importorskip("scipy.stats")
+    p = [search_of(decay(38, 500 + seed, known=known), seed).p_detect for seed in range(50)]
+    assert stats.kstest(p, "uniform").pvalue > 1e-3
+
+
+# --- screening and detection limits -------------------------------------------------------------------------
+
+
+def search_of(recording, seed=0):
+    search = Search(Problem.of(DECAY, recording), LIBRARY, {}, seed, 3, 1, lambda text: None)
+    search.calibrate_base()
+    search.screen_all()
+    return search
+
+
+def test_screening_scores_are_normal_without_a_misfit():
+    stats = pytest.importorskip("scipy.stats")
+    seeds = 60
+    z = []
+    for seed in range(seeds):
+        search = search_of(decay(38, 2000 + seed, known=True), seed)
+        unit = search.screening.columns
+        torch.testing.assert_close(unit.norm(dim=0), torch.ones(unit.shape[1], dtype=F64))
+        z.append((unit.T @ search.residual.e)[:2])
+        # One-sided where physics is: nothing below zero, and the same as |z| on the other candidates.
+        assert float(search.screening.z.min()) >= 0.0
+    for column in torch.stack(z).T.numpy():
+        assert abs(column.mean()) < 5 / math.sqrt(seeds)
+        assert abs(column.std() - 1) < 5 / math.sqrt(2 * seeds)
+        assert stats.kstest(column, "norm").pvalue > 1e-3
+
+
+def test_a_planted_effect_moves_its_score_by_its_size():
+    # E z = b ‖s⊥‖ for an offset b, to first order exactly for a linear output.
+    seeds = 25
+    z = []
+    for seed in range(seeds):
+        search = search_of(decay(38, 3000 + seed, known=True, offset=0.05), seed)
+        i = search.screening.best[0]
+        z.append(float(search.screening.columns[:, i] @ search.residual.e) - 0.05 * float(search.screening.norm[i]))
+    assert abs(np.mean(z)) < 5 / math.sqrt(seeds) + 0.2
+
+
+def test_the_stated_limit_is_where_detection_begins():
+    # Twice the limit lies three and a half sd beyond the critical value, a quarter of it two and a half before.
+    limit = diagnosed(decay(60, 1, known=True)).detection_limit[0]
+    assert limit.term == "offset"
+    assert limit.power == 0.95
+    seeds = 12
+    seen = {
+        factor: sum(
+            diagnosed(decay(60, 4000 + s, known=True, offset=factor * limit.smallest), max_terms=1).verdict
+            != "consistent"
+            for s in range(seeds)
+        )
+        for factor in (0.25, 2.0)
+    }
+    assert seen[2.0] == seeds
+    assert seen[0.25] <= most(seeds, 0.05)
+
+
+def test_limits_fall_with_the_noise_and_with_the_data():
+    x = torch.linspace(0, 3, 60, dtype=F64)
+    small, large = (
+        diagnosed(tc.Recording(x=x, y=1.1 * torch.exp(-0.9 * x) + draw(60, sd, 1), noise=sd)).detection_limit[0].smallest
+        for sd in (0.02, 0.04)
+    )
+    assert large / small == pytest.approx(2.0, rel=0.2)
+    many = diagnosed(decay(240, 1, known=True)).detection_limit[0].smallest
+    assert small / many == pytest.approx(2.0, rel=0.3)
+
+
+def test_a_stricter_confidence_raises_the_limit():
+    loose, strict = (diagnosed(decay(60, 1, known=True), confidence=c).detection_limit[0].smallest for c in (0.9, 0.99))
+    assert strict > loose

@@ -1,0 +1,118 @@
+"""The base, calibrated: from many starts, without outliers, with the noise estimated and time steps short enough."""
+
+import dataclasses
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.candidates import base_columns
+from torchcal.discovery.fitting import Fitted, fit, follow_slopes, refit, starts
+from torchcal.discovery.noise import Noise, estimate, spikes
+from torchcal.discovery.problem import Problem
+from torchcal.errors import ConvergenceError, SimulatorError
+from torchcal.simulators import Trajectories
+
+__all__ = ["calibrate_base"]
+
+#: The solver's error against the noise.
+SOLVER_SHARE = 0.05
+
+
+def calibrate_base(problem: Problem, fixed: Mapping[str, float], num_starts: int, seed: int) -> tuple[Fitted, Noise]:
+    """Fit the base, set outliers aside, estimate the noise, shorten the solver's steps where they matter.
+
+    Raises:
+        ConvergenceError: If no starting value gives finite outputs.
+        SimulatorError: If the solution does not settle when time steps are halved.
+    """
+    recording = problem.recording
+    exact = isinstance(recording.noise, str)
+    free, held = base_columns(problem, fixed)
+    rough = recording.noise if isinstance(recording.noise, Tensor) else 0.1 * recording.spread
+    outputs = torch.zeros(len(recording.outputs), dtype=torch.float64)
+    begin = starts(problem, num_starts, seed, held)
+    for i, value in held.items():
+        begin[:, i] = value
+    found = _from_starts(problem, begin, free, rough, outputs)
+    if found is None:
+        raise ConvergenceError(
+            "Expected finite outputs of the base at one of the starting values at least. Got none in "
+            f"{num_starts} (give initial= or bounds to the parameters)."
+        )
+    found = _sharpen(found)
+    if not exact:
+        for _ in range(3):
+            given = recording.noise if isinstance(recording.noise, Tensor) else None
+            sd = given
+            bad = spikes(found.problem, found.residual, sd)
+            if not bool(bad.any()) or float(bad.double().mean()) > 0.2:
+                break
+            keep = found.problem.keep.clone()
+            keep[found.problem.index[bad]] = False
+            found = _again(found, keep)
+    noise = estimate(found.problem, found.residual, found.jacobian, recording.noise)
+    base = refit(found, noise.whitening(found.problem))
+    if not exact:
+        noise = estimate(base.problem, base.residual, base.jacobian, recording.noise)
+        base = _sharpen(refit(base, noise.whitening(base.problem)))
+    return base, noise
+
+
+def _from_starts(problem: Problem, begin: Tensor, free: list[int], rough: Tensor, outputs: Tensor) -> Fitted | None:
+    """The best fit from many starts: over the first part of the runs, then over all, so that no phase is lost."""
+    if not problem.in_time:
+        return fit(problem, problem.whitening(rough, outputs), begin, free)
+    guided = follow_slopes(problem, begin)
+    begin = torch.cat([guided, begin[: max(2, len(begin) // 4)]])
+    keep = torch.zeros(problem.recording.n, dtype=torch.bool)
+    run = problem.recording.x["run"]  # type: ignore[index]
+    for r in run.unique():
+        mine = (run == r).nonzero()[:, 0]
+        keep[mine[: max(8, len(mine) // 4)]] = True
+    early = problem.keeping(keep.repeat(len(problem.recording.outputs)))
+    ends = begin
+    if early.n >= 3 * len(free):
+        first = fit(early, early.whitening(rough, outputs), begin, free, max_steps=15)
+        if first is not None and first.ends is not None and first.ends_chi2 is not None:
+            order = first.ends_chi2.argsort()
+            ends = torch.cat([first.ends[order[: max(4, len(order) // 2)]], guided[:4]])
+    return fit(problem, problem.whitening(rough, outputs), ends, free)
+
+
+def _again(found: Fitted, keep: Tensor) -> Fitted:
+    """The same fit to fewer data."""
+    problem = dataclasses.replace(found.problem, keep=keep)
+    rough = torch.zeros(len(keep), dtype=torch.float64)
+    rough[found.problem.index] = found.whitening.sd
+    return refit(
+        found, problem.whitening(rough, torch.zeros(len(problem.recording.outputs), dtype=torch.float64)), problem
+    )
+
+
+def _sharpen(found: Fitted) -> Fitted:
+    """Halve the time steps until the solver's error is small against the noise."""
+    recording = found.problem.recording
+    for _ in range(7):
+        simulator = found.problem.simulator
+        if not isinstance(simulator, Trajectories) or simulator.ode.max_step is not None:
+            return found
+        if isinstance(recording.noise, Tensor):
+            allowed = SOLVER_SHARE * recording.noise[found.problem.index]
+        else:
+            size = found.residual.square().mean().sqrt()
+            allowed = SOLVER_SHARE * torch.maximum(size, 1e-6 * recording.spread[found.problem.index])
+        finer = simulator.refined(2)
+        y = finer.outputs_of(found.values[None], finer.solve(found.values[None]))[0, found.problem.index]
+        error = (y - found.y).abs()
+        if bool((error <= allowed).all()):
+            return found
+        problem = dataclasses.replace(found.problem, simulator=finer)
+        whitening = found.whitening
+        again = fit(problem, whitening, found.values[None], found.free)
+        found = found if again is None else again
+    raise SimulatorError(
+        "Expected the solution to settle when time steps are halved. Got a change of "
+        f"{float(error.max()):.3g} after 7 times (a stiff or discontinuous model: smooth it, give max_step=, or "
+        "rescale it)."
+    )
