@@ -13,7 +13,7 @@ from tqdm.auto import tqdm
 from torchcal.data import Recording
 from torchcal.discovery import explain, verify
 from torchcal.discovery.candidates import base_columns
-from torchcal.discovery.embedded import model_error_sd
+from torchcal.discovery.embedded import embed_each, model_error_sd
 from torchcal.discovery.experiment import propose
 from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.problem import Problem
@@ -160,14 +160,19 @@ def _wants_more(search: Search) -> bool:
     return search.examine(best).p_value < 0.05
 
 
+def _embeddable(search: Search) -> list[str]:
+    """The base's calibrated parameters without unknown initial states."""
+    base = [search.base.problem.parameters[i].name for i in search.base.free]
+    hidden = getattr(search.base.problem.simulator, "initial_names", [])
+    return [name for name in base if name not in hidden]
+
+
 def _scores(search: Search, found: Fitted, mask: Tensor | None) -> Scores:
     recording = search.problem.recording
     noise = search.noise
     if search.exact:  # the misfit is what predictions are uncertain by
         noise = dataclasses.replace(noise, sd=noise.sd * explain.misfit_size(found))
-    base = [search.base.problem.parameters[i].name for i in search.base.free]
-    hidden = getattr(search.base.problem.simulator, "initial_names", [])
-    width = model_error_sd(found, search.noise, [name for name in base if name not in hidden])
+    width = model_error_sd(found, search.noise, _embeddable(search))
     prediction, sd = verify.predict(found, noise)
     fitted = verify.score(recording, prediction, sd, search.problem.keep)
     if mask is None:
@@ -223,6 +228,10 @@ def _result(
         noise=search.noise.record(search.problem),
         base=base,
         final=final,
+        embedded=Table(
+            embed_each(search.base, search.noise, _embeddable(search)),
+            ("parameter", "sd", "output_sd", "log_likelihood"),
+        ),
         shifts=explain.needed_shifts(search) if decision.verdict != "consistent" else [],
         missing=explain.missing_rate(search) if decision.verdict != "consistent" else None,
         experiment=propose(decision.tied_models[:4], search.noise) if decision.tied_models else None,

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchcal.data import Recording
 from torchcal.discovery import words
+from torchcal.discovery.embedded import Embedded
 from torchcal.discovery.records import (
     Experiment,
     Fit,
@@ -48,6 +49,7 @@ class Diagnosis:
         noise: What was taken for noise.
         base: The base's fit.
         final: The fit with the accepted terms (the base's where there are none).
+        embedded: Model error embedded in one parameter of the base at a time, to first order; the likeliest first.
         shifts: The shift of each parameter that each stretch of data would need.
         missing: Non-parametric estimate of what is missing in the base.
         experiment: What would separate the tied hypotheses.
@@ -78,6 +80,7 @@ class Diagnosis:
     noise: NoiseModel
     base: Fit
     final: Fit
+    embedded: Table[Embedded]
     shifts: list[NeededShift]
     missing: MissingRate | None
     experiment: Experiment | None

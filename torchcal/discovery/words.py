@@ -93,7 +93,17 @@ def _where(d: Any) -> str:
     spans = ", ".join(f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}" for low, high in place.spans[:3])
     return (
         f"The mismatch sits in the {place.kind} {place.target} and varies with {place.driver} (largest at {spans}): a "
-        f"smooth change there removes {percent(place.share)} of the misfit beyond noise."
+        f"smooth change there removes {percent(place.share)} of the misfit beyond noise.{_embedded(d)}"
+    )
+
+
+def _embedded(d: Any) -> str:
+    if len(d.embedded) < 2 or d.embedded[0].sd <= 0:
+        return ""
+    first, second = d.embedded[:2]
+    return (
+        f" Model error embedded in one parameter at a time is likeliest in {first.parameter} (sd {first.sd:.3g}; "
+        f"{first.log_likelihood - second.log_likelihood:.1f} in log-likelihood before {second.parameter})."
     )
 
 
