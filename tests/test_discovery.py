@@ -69,8 +69,12 @@ def oscillator():
     )  # fmt: skip
 
 
-GUST = tc.Term("wind gust", equation="v", rate=lambda t, s, p, u: p["g"] * torch.exp(-(((t - p["t0"]) / 0.5) ** 2)),
-               parameters=[tc.Parameter("g", unit="m/s^2"), tc.Parameter("t0", unit="s", low=0.0, high=10.0)])  # fmt: skip
+GUST = tc.Term(
+    "wind gust",
+    equation="v",
+    rate=lambda t, s, p, u: p["g"] * torch.exp(-(((t - p["t0"]) / 0.5) ** 2)),
+    parameters=[tc.Parameter("g", unit="m/s^2"), tc.Parameter("t0", unit="s", low=0.0, high=10.0)],
+)
 
 
 @pytest.fixture(scope="module")
@@ -169,7 +173,7 @@ def test_the_design_in_time(windy, tmp_path):
     page = path.read_text(encoding="utf-8")
     assert "wind gust" in page
     assert "<img" in page or "<svg" in page
-    assert "src=\"http" not in page
+    assert 'src="http' not in page
 
 
 def test_improved_is_a_simulator_like_any_other(windy):
@@ -189,6 +193,7 @@ def test_improved_is_a_simulator_like_any_other(windy):
 
 def test_the_same_seed_gives_the_same_diagnosis():
     body, motion, candidates = pushed(0.05)
+    candidates = candidates[-2:]
     first, second = (quiet(body, motion, candidates, seed=3) for _ in range(2))
     assert str(first.ranking) == str(second.ranking)
     assert torch.equal(first.final.prediction, second.final.prediction)
@@ -241,13 +246,11 @@ def test_the_design_without_time(tmp_path):
         d.improved, delays, embedding=tc.embeddings.IndependentGaussian(),
         likelihood=tc.likelihoods.ABC(epsilon=0.1), num_samples=0, num_starts=4, seed=0,
     )  # fmt: skip
-    assert set(fit.names) == {"lnA", "E", "fuel_order"} if hasattr(fit, "names") else True
+    assert fit.map.mean.shape == (3,)
 
 
 def test_a_parameter_that_depends_on_a_condition():
     simulator, x, y = ignition()
-    simulator = tc.Simulator(simulator.function, simulator.parameters[:2] + (  # no order to free
-        tc.Parameter("fuel_order", neutral=1.0), tc.Parameter("air_order", neutral=1.0), tc.Parameter("n", neutral=0.0)))
     term = tc.Term("composition-dependent rate", shifts={"lnA": lambda x, p: p["m"] * torch.log(x["phi"])},
                    parameters=[tc.Parameter("m")])  # fmt: skip
     rival = tc.Term("temperature-dependent rate", shifts={"lnA": lambda x, p: p["m"] * (x["T0"] / 1150.0) ** 2},
@@ -371,11 +374,34 @@ def test_two_that_cannot_be_told_apart_are_both_listed():
     assert d.experiment.description in " ".join(str(d).split())
 
 
+def test_the_proposed_experiment_tells_the_tied_apart():
+    library = named(tc.terms.mechanics(), "quadratic drag", "cubic stiffness", "large-angle sine")
+    truth = tc.terms.extend(oscillator(), named(library, "large-angle sine"))
+    values = {"k": 2.0, "c": 0.2, "large-angle sine.k": 1.0}
+    body, _, x = spring(named(library, "large-angle sine"), noise=0.01, **{"large-angle sine__k": 1.0})
+    first = run_of(x)
+    experiment = quiet(body, tc.Recording(runs=[first], noise=0.01), library).experiment
+    t, c = experiment.conditions["time"], experiment.conditions
+    values |= {f"{name}(0)": 0.0 for name in ("x", "v") if name not in c["initial"]}
+
+    def run(x):
+        return tc.Run(t, outputs={"x": x}, inputs=c["inputs"], initial=c["initial"])
+
+    y = simulate(truth, [run(torch.zeros_like(t))], **values)["x"] + draw(len(t), 0.01, 77)
+    d = quiet(body, tc.Recording(runs=[first, run(y)], noise=0.01), library)
+    assert d.verdict == "named"
+    assert d.terms == ["large-angle sine"]
+
+
 def test_an_effect_outside_the_library_is_unexplained():
     library = named(tc.terms.mechanics(), "quadratic drag", "cubic stiffness", "bias force")
-    outside = tc.Term("pulses", equation="v", parameters=[tc.Parameter("a")],
-                      rate=lambda t, s, p, u: p["a"] * torch.sin(2.3 * t) * torch.exp(-(((t - 7.0) / 2.5) ** 2)))  # fmt: skip
-    body, clean, x = spring([outside], pulses__a=0.8)
+    outside = tc.Term(
+        "pulses",
+        equation="v",
+        rate=lambda t, s, p, u: p["a"] * torch.sin(2.3 * t) * torch.exp(-(((t - 7.0) / 2.5) ** 2)),
+        parameters=[tc.Parameter("a")],
+    )
+    body, _, x = spring([outside], pulses__a=0.8)
     d = quiet(body, tc.Recording(runs=[run_of(x)], noise=0.02), library)
     check_types(d)
     assert d.verdict == "unexplained"
@@ -389,7 +415,6 @@ def test_an_effect_outside_the_library_is_unexplained():
     assert "not in this library" in str(d).splitlines()[0]
     assert d.ranking[0].terms == ("none of these",)
     assert d.p_detect < 0.01
-    del clean
 
 
 def test_two_missing_terms_are_both_named():
@@ -415,10 +440,14 @@ def test_one_term_at_most_where_asked():
 
 def test_an_effect_in_a_region_is_found_there():
     library = named(tc.terms.mechanics(), "quadratic drag", "cubic stiffness", "bias force")
-    gate = tc.Term("gated", equation="v", parameters=[tc.Parameter("b")],
-                   rate=lambda t, s, p, u: p["b"] * torch.sigmoid((t - 6.0) / 0.1) * torch.sigmoid((10.0 - t) / 0.1))
-    body, _, x = spring([gate], noise=0.01, gated__b=0.3)
-    d = quiet(body, tc.Recording(runs=[run_of(x)], noise=0.01), library)
+    gate = tc.Term(
+        "gated",
+        equation="v",
+        parameters=[tc.Parameter("b")],
+        rate=lambda t, s, p, u: p["b"] * torch.sigmoid((t - 6.0) / 0.1) * torch.sigmoid((10.0 - t) / 0.1),
+    )
+    body, _, x = spring([gate], seed=31, gated__b=0.3)
+    d = quiet(body, tc.Recording(runs=[run_of(x)], noise=0.02), library)
     assert d.verdict == "named"
     assert d.terms == ["bias force"]
     assert d.where[0].driver == "t"
@@ -430,7 +459,10 @@ def test_an_effect_in_a_region_is_found_there():
     assert d.ranking[0].region is not None
     assert "where" in str(d).splitlines()[0]
     # The improved simulator carries the region and begins at the estimates.
-    assert len(d.improved.parameters) == 5
+    assert [q.name for q in d.improved.parameters] == [
+        "k", "c", "bias force.b", "bias force.window from", "bias force.window to"
+    ]  # fmt: skip
+    assert d.improved.parameters[3].initial == pytest.approx(low)
 
 
 def test_a_faulty_sensor_is_named():
@@ -468,24 +500,21 @@ def test_another_name_for_the_same_is_an_alias():
 
 
 def test_other_physics_with_the_same_tangent_is_told_as_ambiguous():
-    # Along one run from rest the calibrated base makes an offset and a force the same when the stiffness is known
-    # and nothing else moves: y + b against a force k b.
-    body = tc.ODESimulator(lambda t, s, p, u: {"x": p["r"] - s["x"]}, {"x": "m"}, [tc.Parameter("r", initial=1.0)])
-    terms = [
-        tc.Term("loss", equation="x", rate=lambda t, s, p, u: -p["k"] * s["x"], parameters=[tc.Parameter("k")]),
-        tc.Term("slower reading", outputs={"x": lambda t, s, p, u, y: y - p["k"] * (y - 1.0)},
-                parameters=[tc.Parameter("k")]),
-    ]  # fmt: skip
-    t = torch.linspace(0, 5, 60, dtype=F64)
-    x = 1 - torch.exp(-t) + 0.3 * t * torch.exp(-t)
-    d = quiet(body, tc.Recording(runs=[tc.Run(t, outputs={"x": x + draw(60, 0.01, 1)}, initial={"x": 0.0})], noise=0.01), terms)
-    assert d.verdict in ("named", "ambiguous", "unexplained")
-    check_types(d)
+    # Where a straight line is calibrated, parabolas about any centre are the same.
+    simulator, x, y, terms = parabola(0.3)
+    about = tc.Term("curvature about -3", outputs={"y": lambda x, p, y: y + p["q"] * (x + 3.0) ** 2},
+                    parameters=[tc.Parameter("q")])  # fmt: skip
+    d = quiet(simulator, tc.Recording(x=x, y=y, noise=0.1), [terms[0], about])
+    assert d.verdict == "ambiguous"
+    assert d.tied == [["curvature"], ["curvature about -3"]]
+    assert d.terms == []
+    assert d.ranking[0].aliases == ("curvature about -3",)
 
 
 def test_what_the_base_holds_already_is_never_named():
     library = named(tc.terms.mechanics(), "linear drag", "linear spring", "bias force")
-    body, _, x = spring(named(library, "linear drag", "linear spring"), **{"linear drag__c": 0.3, "linear spring__k": 0.5})
+    both = named(library, "linear drag", "linear spring")
+    body, _, x = spring(both, **{"linear drag__c": 0.3, "linear spring__k": 0.5})
     d = quiet(body, tc.Recording(runs=[run_of(x)], noise=0.02), library)
     assert d.verdict == "consistent"
     for name in ("linear drag", "linear spring"):
@@ -493,31 +522,28 @@ def test_what_the_base_holds_already_is_never_named():
         assert next(r for r in d.ranking if r.terms == (name,)).note == "already in the base model"
 
 
-@pytest.mark.parametrize("bounds", [{"low": 0.0}, {"high": -0.4}, {"low": -0.05, "high": 0.05}])
-def test_an_estimate_that_wants_to_cross_its_bound_is_not_named(bounds):
-    # The spring softens by 0.2; only hardening, more softening or very little of it is allowed.
+@pytest.mark.parametrize(("truth", "bounds"), [(-0.2, {"low": 0.0}), (0.2, {"high": 0.0})])
+def test_an_estimate_that_wants_to_cross_its_bound_is_not_named(truth, bounds):
+    # Only hardening, or only softening, is allowed, and it is what the spring does not do.
     def term(**bounds):
         return tc.Term("cubic", equation="v", rate=lambda t, s, p, u: -p["k"] * s["x"] ** 3,
                        parameters=[tc.Parameter("k", **bounds)])  # fmt: skip
 
-    if "high" in bounds and "low" not in bounds:
-        bounds = {"low": -0.5, "high": -0.0}
-        truth = 0.2
-    else:
-        truth = -0.2
     body, _, x = spring([term()], noise=0.01, cubic__k=truth)
     motion = tc.Recording(runs=[run_of(x)], noise=0.01)
     assert quiet(body, motion, [term()]).terms == ["cubic"]
     d = quiet(body, motion, [term(**bounds)])
     assert d.verdict == "unexplained"
     assert d.terms == []
-    row = next(r for r in d.ranking if r.terms == ("cubic",))
+    row = next(r for r in d.ranking if r.terms == ("cubic",) and r.region is None)
     assert not row.physical
     assert row.note
+    assert row.estimates[0].at_bound
 
 
 def test_a_hold_out_is_chosen_before_the_fit():
     body, motion, library = pushed(0.08)
+    library = library[-2:]
     d = quiet(body, motion, library)
     assert d.held_out.tolist() == [False] * 76 + [True] * 25
     none = quiet(body, motion, library, holdout=False)
@@ -603,6 +629,7 @@ def test_correlated_noise():
 
 def test_outliers_are_set_aside():
     body, motion, library = pushed(0.08)
+    library = library[-3:]
     x = motion.y.clone()
     x[[15, 40, 77]] += torch.tensor([0.6, -0.5, 0.8], dtype=F64)
     for noise in (None, 0.02):
@@ -616,6 +643,7 @@ def test_outliers_are_set_aside():
 
 def test_quantised_samples():
     body, motion, library = pushed(0.08)
+    library = library[-3:]
     step = 0.05
     d = quiet(body, tc.Recording(runs=[run_of((motion.y / step).round() * step)]), library)
     assert d.noise.quantisation == {"x": pytest.approx(step)}
@@ -681,7 +709,8 @@ def test_outputs_of_different_size_that_are_functions_of_the_states():
     body = tc.ODESimulator(
         lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"] - p["c"] * s["v"] + u["f"]}, {"x": "m", "v": "m/s"},
         [tc.Parameter("k", low=0.0, initial=2.0), tc.Parameter("c", low=0.0, initial=0.2)],
-        observe={"x": lambda t, s, p, u: s["x"], "energy": lambda t, s, p, u: 500.0 * (s["v"] ** 2 + p["k"] * s["x"] ** 2)},
+        observe={"x": lambda t, s, p, u: s["x"],
+                 "energy": lambda t, s, p, u: 500.0 * (s["v"] ** 2 + p["k"] * s["x"] ** 2)},
     )  # fmt: skip
     library = named(tc.terms.mechanics(), *NAMES)
     whole = tc.terms.extend(body, named(library, "quadratic stiffness"))
@@ -692,7 +721,8 @@ def test_outputs_of_different_size_that_are_functions_of_the_states():
     zero = torch.zeros(101)
     y = simulate(whole, [run(zero, zero)], k=2.0, c=0.2, **{"quadratic stiffness.k": 0.3})
     noise = {"x": 0.02, "energy": 20.0}
-    recording = tc.Recording(runs=[run(*(y[name] + draw(101, noise[name], i) for i, name in enumerate(noise)))], noise=noise)
+    noisy = [y[name] + draw(101, noise[name], i) for i, name in enumerate(noise)]
+    recording = tc.Recording(runs=[run(*noisy)], noise=noise)
     d = quiet(body, recording, library)
     check_types(d)
     assert d.terms == ["quadratic stiffness"]
@@ -865,15 +895,16 @@ def test_bad_candidates(candidates, message):
 
 
 @pytest.mark.parametrize(
-    ("term", "message"),
+    ("parts", "message"),
     [
-        (tc.Term("x", equation="w", rate=lambda t, s, p, u: p["m"], parameters=[tc.Parameter("m")]), "equation of"),
-        (tc.Term("x", outputs={"v": lambda t, s, p, u, y: y + p["m"]}, parameters=[tc.Parameter("m")]), "output of"),
-        (tc.Term("x", shifts={"m": lambda t, s, p, u: p["m"]}, parameters=[tc.Parameter("m")]), "name a parameter"),
-        (tc.Term("x", rates={"v": lambda t, s, p, u: p["m"]}, states={"v": "m"}, parameters=[tc.Parameter("m")]), "new name"),
+        ({"rates": {"w": lambda t, s, p, u: p["m"]}}, "equation of"),
+        ({"outputs": {"v": lambda t, s, p, u, y: y + p["m"]}}, "output of"),
+        ({"shifts": {"m": lambda t, s, p, u: p["m"]}}, "name a parameter"),
+        ({"rates": {"v": lambda t, s, p, u: p["m"]}, "states": {"v": "m"}}, "new name"),
     ],
 )
-def test_bad_candidates_in_time(term, message):
+def test_bad_candidates_in_time(parts, message):
+    term = tc.Term("x", parameters=[tc.Parameter("m")], **parts)
     with pytest.raises(tc.errors.DomainError, match=message):
         quiet(oscillator(), tc.Recording(runs=[run_of(FORCE)]), [term])
 
@@ -906,7 +937,9 @@ def test_fewer_data_than_parameters():
 
 
 def test_a_term_that_changes_the_simulator_at_neutral():
-    term = tc.Term("always on", outputs={"y": lambda x, p, y: y + torch.cos(p["q"] * x)}, parameters=[tc.Parameter("q")])
+    term = tc.Term(
+        "always on", outputs={"y": lambda x, p, y: y + torch.cos(p["q"] * x)}, parameters=[tc.Parameter("q")]
+    )
     simulator = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
     with pytest.raises(tc.errors.SimulatorError, match="neutral"):
         quiet(simulator, DATA, [term])

@@ -295,10 +295,8 @@ def test_the_stated_limit_is_where_detection_begins():
 
 def test_limits_fall_with_the_noise_and_with_the_data():
     x = torch.linspace(0, 3, 60, dtype=F64)
-    small, large = (
-        diagnosed(tc.Recording(x=x, y=1.1 * torch.exp(-0.9 * x) + draw(60, sd, 1), noise=sd)).detection_limit[0].smallest
-        for sd in (0.02, 0.04)
-    )
+    recordings = [tc.Recording(x=x, y=1.1 * torch.exp(-0.9 * x) + draw(60, sd, 1), noise=sd) for sd in (0.02, 0.04)]
+    small, large = (diagnosed(recording).detection_limit[0].smallest for recording in recordings)
     assert large / small == pytest.approx(2.0, rel=0.2)
     many = diagnosed(decay(240, 1, known=True)).detection_limit[0].smallest
     assert small / many == pytest.approx(2.0, rel=0.3)

@@ -182,13 +182,13 @@ def prepare(
         return y, jacobian
 
     y, jacobian = linear(begin[None], own)
-    size = found.whitening.sd.min()
-    change = float((y[0] - found.y).abs().max())
-    if not change <= 1e-6 * max(float(found.y.abs().max()), float(size)):
+    size = torch.maximum(found.whitening.sd, base.recording.spread[base.index])
+    change = float(((y[0] - found.y).abs() / torch.maximum(size, found.y.abs())).max())
+    if not change <= 1e-6:
         raise SimulatorError(
             f"Expected the term {' + '.join(t.name for t in terms)!r} to leave the simulator unchanged at its neutral "
-            f"values {dict(zip([problem.parameters[i].name for i in own], neutral, strict=True))}. Got a change of "
-            f"{change:.3g} (give neutral= the value at which it has no effect)."
+            f"values {dict(zip([problem.parameters[i].name for i in own], neutral, strict=True))}. Got a relative "
+            f"change of {change:.3g} (give neutral= the value at which it has no effect)."
         )
     moves = torch.nan_to_num(jacobian[0], nan=1.0, posinf=1.0, neginf=1.0).abs().amax(0) > 0
     amplitudes = [place for place, sure, m in zip(own, certain, moves.tolist(), strict=True) if sure and m]

@@ -116,8 +116,8 @@ def responses(problem: Problem, found: Fitted, forcing: Tensor) -> tuple[Tensor,
     return result, drivers, drivers["t"]
 
 
-def _plain(name: str, unit: str | None) -> str | None:
-    return None if unit is None else (f"{unit}/s" if unit else "1/s")
+def _rate_unit(unit: str | None, time: str) -> str | None:
+    return None if unit is None else f"{unit or 1}/{time}"
 
 
 def channels(problem: Problem, found: Fitted) -> list[Channel]:
@@ -133,7 +133,10 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
         kicks = torch.diag_embed(bound._h[..., None].expand(-1, -1, size))
         forcing = torch.cat([kicks, by_parameter[0]], dim=-1)
         response, drivers, time = responses(problem, found, forcing)
-        labels = [("equation", state, _plain(state, unit)) for state, unit in bound.ode.states.items()]
+        labels = [
+            ("equation", state, _rate_unit(unit, problem.recording.units.get("time", "s")))
+            for state, unit in bound.ode.states.items()
+        ]
         labels += [("parameter", names[i], problem.parameters[i].unit) for i in own]
         for m, (kind, target, unit) in enumerate(labels):
             list_.append(Channel(kind, target, unit, drivers, time, response[:, :, m]))

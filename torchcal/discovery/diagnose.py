@@ -21,7 +21,7 @@ from torchcal.discovery.records import Estimate, Hypothesis, Scores, Table
 from torchcal.discovery.result import Diagnosis
 from torchcal.discovery.search import PRIOR, Model, Search, describe
 from torchcal.discovery.several import refit_several
-from torchcal.discovery.verdict import Decision, decide
+from torchcal.discovery.verdict import PLAINLY_WHITE, Decision, decide
 from torchcal.discovery.windows import refit_local
 from torchcal.errors import ConvergenceWarning, DomainError, RecordingError
 from torchcal.simulators import Parameter, Simulator, Trajectories
@@ -85,6 +85,7 @@ def diagnose(
     given = terms
     terms = [term for term in given if not _contains(simulator, term)]
     problem = Problem.of(simulator, recording)
+    _check_fixed(problem, fixed or {})
     free, _ = base_columns(problem, fixed or {})
     if not free:
         raise DomainError("Expected at least one parameter to calibrate. Got all of them fixed or dormant.")
@@ -128,17 +129,32 @@ def _check(
         raise RecordingError(f"Expected a torchcal.Recording. Got {type(recording).__name__}.")
     if isinstance(candidates, Term):
         candidates = [candidates]
+    candidates = [] if candidates is None else candidates
     by_name: dict[str, Term] = {}
     for term in candidates:
         if not isinstance(term, Term):
             raise DomainError(f"Expected candidates as torchcal.Term objects. Got {type(term).__name__}: {term!r}.")
         by_name[term.name] = term
-    if not 0.5 < confidence < 1:
-        raise DomainError(f"Expected confidence between 0.5 and 1. Got {confidence!r}.")
+    if not 0.5 < confidence <= 0.998:
+        raise DomainError(
+            "Expected confidence above 0.5 and at most 0.998, which 1000 simulated residuals can resolve. "
+            f"Got {confidence!r}."
+        )
     for name, value in (("max_terms", max_terms), ("num_starts", num_starts)):
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
             raise DomainError(f"Expected {name} as a positive integer. Got {value!r}.")
     return list(by_name.values())
+
+
+def _check_fixed(problem: Problem, fixed: Mapping[str, float]) -> None:
+    """Raise for names that do not exist and values outside their bounds."""
+    parameters = {q.name: q for q in problem.parameters}
+    for name, value in fixed.items():
+        if name not in parameters:
+            raise DomainError(f"Expected fixed values of parameters among {list(parameters)}. Got {name!r}.")
+        if not math.isfinite(float(value)) or not parameters[name].contains(float(value)):
+            q = parameters[name]
+            raise DomainError(f"Expected the fixed parameter {name!r} within [{q.low}, {q.high}]. Got {value!r}.")
 
 
 def _contains(simulator: Simulator, term: Term) -> bool:
@@ -180,7 +196,10 @@ def _scores(search: Search, found: Fitted, mask: Tensor | None) -> Scores:
     apart = verify.held_out_fit(found, noise, mask)
     if apart is None:
         return Scores(fitted, None, None, width)
-    held = verify.score(recording, apart.prediction, apart.sd, mask & search.problem.keep)
+    seen = mask & search.problem.keep
+    if not bool(seen.any()):
+        return Scores(fitted, None, None, width)
+    held = verify.score(recording, apart.prediction, apart.sd, seen)
     return Scores(fitted, held, apart.prediction, width)
 
 
@@ -203,17 +222,18 @@ def _result(
     final = base if best is None else explain.fit_record(best.found, best.structure, best.names)
     _warn(search)
     before = _scores(search, search.base, mask)
-    after = None if shown is None else _scores(search, shown.found, mask)
+    after = None if best is None else _scores(search, best.found, mask)
     if best is None:
         improved: Simulator = simulator
     else:
         improved = _improved(simulator, best)
     remaining = 0.0 if decision.verdict == "consistent" else 1.0
     if best is not None:
-        remaining = 1.0 - explain.removed(search, best)
+        white = best.structure is not None and best.structure.p_value >= PLAINLY_WHITE and not search.exact
+        remaining = 0.0 if white else 1.0 - explain.removed(search, best)
     return Diagnosis(
         verdict=decision.verdict,
-        terms=list(best.names) if best else [],
+        terms=_in_order(search, best) if best else [],
         tied=decision.tied,
         where=explain.locate(search, shown) if decision.verdict != "consistent" else Table([], ("kind", "target")),
         ranking=_ranking(search, decision, mask),
@@ -254,6 +274,12 @@ def _result(
     )
 
 
+def _in_order(search: Search, best: Model) -> list[str]:
+    """Names of the accepted terms, the one with the most evidence of its own first."""
+    alone = {m.names[0]: m.log_evidence for m in search.models if len(m.names) == 1}
+    return sorted(best.names, key=lambda name: -alone.get(name, -math.inf))
+
+
 def _solver(simulator: Simulator) -> str:
     if isinstance(simulator, Trajectories):
         return f"classical Runge–Kutta, {simulator.num_steps} steps a run"
@@ -292,7 +318,7 @@ def _ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[H
         held = None
         if mask is not None and (place < 3 or model is decision.best):
             apart = verify.held_out_fit(model.found, search.noise, mask)
-            if apart is not None:
+            if apart is not None and bool((mask & search.problem.keep).any()):
                 held = verify.score(
                     search.problem.recording, apart.prediction, apart.sd, mask & search.problem.keep
                 ).rmse

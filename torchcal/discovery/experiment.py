@@ -28,7 +28,7 @@ def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
     if len(models) < 2:
         return None
     problem = models[0].found.problem
-    options = _in_time(problem.recording) if problem.in_time else _static(problem.recording)
+    options = _in_time(models[0].found) if problem.in_time else _static(problem.recording)
     best: Experiment | None = None
     for description, recording, conditions in options:
         distance = _separation(models, recording, noise)
@@ -101,12 +101,16 @@ def _value(found: Fitted, shared: dict[str, int], name: str) -> float:
     return float(torch.stack([found.values[i] for i in alike]).mean()) if alike else 0.0
 
 
-def _in_time(recording: Recording) -> list[tuple[str, Recording, dict[str, Any]]]:
-    found = []
-    runs = recording.runs or ()
-    first = runs[0]
-    start = {name: float(values[~torch.isnan(values)][0]) for name, values in first.outputs.items()}
-    known = {**{k: v for k, v in start.items()}, **first.initial}
+def _in_time(model: Fitted) -> list[tuple[str, Recording, dict[str, Any]]]:
+    found: list[tuple[str, Recording, dict[str, Any]]] = []
+    recording, bound = model.problem.recording, model.problem.simulator
+    if not isinstance(bound, Trajectories) or recording.runs is None:
+        return found
+    first = recording.runs[0]
+    states = bound.solve(model.values[None]) if model.warm is None else model.warm
+    known = {
+        name: float(states[0, 0, 0, i]) for i, name in enumerate(bound.ode.states) if name not in bound.ode.initial
+    }
     options: list[tuple[str, dict[str, float], float, float]] = []
     for factor in (2.0, 0.5, 3.0, -1.0):
         options.append(

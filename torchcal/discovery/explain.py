@@ -137,8 +137,8 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
     fitted = {m.numbers[0]: m for m in search.models if len(m.numbers) == 1 and m.window is None}
     rows = []
     for i, candidate in enumerate(search.candidates):
-        place = candidate.amplitudes[0]
         column = screening.best[i]
+        place = candidate.amplitudes[int(screening.amplitude[column]) if column >= 0 else 0]
         q = candidate.problem.parameters[place]
         model = fitted.get(i)
         estimate = float(model.found.values[place]) if model else None

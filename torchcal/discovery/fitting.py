@@ -139,6 +139,9 @@ def follow_slopes(problem: Problem, begin: Tensor) -> Tensor:
             rows = [torch.autograd.grad(left[:, k].sum(), leaf, retain_graph=True, allow_unused=True)[0]
                     if left.requires_grad else None for k in range(left.shape[1])]  # fmt: skip
         jacobian = torch.stack([torch.zeros_like(leaf) if row is None else row for row in rows], dim=-2)
+        sound = torch.isfinite(jacobian).flatten(1).all(-1) & torch.isfinite(left).all(-1)
+        jacobian = torch.where(sound[:, None, None], jacobian, torch.zeros_like(jacobian))
+        left = torch.nan_to_num(left.detach(), nan=0.0, posinf=0.0, neginf=0.0)
         change = torch.linalg.pinv(jacobian, rtol=1e-6) @ left.detach().unsqueeze(-1)
         moved = values[:, places] - change[..., 0]
         good = torch.isfinite(moved).all(-1)

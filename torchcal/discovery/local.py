@@ -68,7 +68,7 @@ def localised(term: Term, driver: str, low: float, high: float, span: tuple[floa
         outputs={name: (seeing if static else sensing)(function) for name, function in term.outputs.items()},
         shifts={name: around(function) for name, function in term.shifts.items()},
         parameters=[*term.parameters, *ends],
-        formula=f"{term.formula} where {region_text(driver, low, high)}",
+        formula=f"{term.formula or term.name} where {region_text(driver, low, high)}",
         description=term.description,
         scales=term.scales,
     )

@@ -27,6 +27,10 @@ SPIKE = 4.5
 SHRINK = 1.0
 #: Quantile of its posterior at which a clear correlation is taken.
 CAUTION = 0.6
+#: Smallest noise sd that is estimated, in the output's spread.
+FLOOR = 1e-7
+#: Share of supposed outliers with another one as nearest neighbour above which they are no outliers.
+TOGETHER = 0.4
 #: How much larger the noise found may be than the noise given before the given one is doubted.
 EXCESS = 1.5
 
@@ -142,6 +146,8 @@ def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor |
             wide = torch.cat([smooth_columns(problem, places), _orthonormal(own, share)], dim=1)
             bases.append(_orthonormal(wide, int(0.6 * len(places))))
             usable += len(places) - bases[-1].shape[1]
+        if usable < 2 and given is not None:
+            continue
         if usable < 2:
             raise DomainError(
                 f"Expected enough data to tell noise from misfit. Got {n} of output {recording.outputs[output]!r}. "
@@ -179,7 +185,9 @@ def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor |
                 sd[mask], freedom = scale, min(freedom, usable)
         elif scale > EXCESS * (1 + 2 / math.sqrt(2 * usable)):
             doubted = max(doubted, scale)
-    step = _quantisation(problem)
+    if given is None:  # a perfect fit would leave no unit to measure anything in
+        sd = torch.maximum(sd, FLOOR * recording.spread)
+    step = _quantisation(problem) if given is None else {}
     for name, size in step.items():
         mask = torch.arange(len(recording.y)) // recording.n == recording.outputs.index(name)
         sd[mask] = sd[mask].clamp_min(size / math.sqrt(12.0))
@@ -222,7 +230,7 @@ def _quantisation(problem: Problem) -> dict[str, float]:
     found = {}
     for name, values in problem.recording.split(problem.recording.y).items():
         seen = values[torch.isfinite(values)].unique()
-        if len(seen) < 3:
+        if len(seen) < 3 or len(seen) > 0.5 * int(torch.isfinite(values).sum()) or len(values) < 20:
             continue
         step = float(seen.diff().min())
         size = float(seen.abs().max())
@@ -247,7 +255,8 @@ def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
         if problem.order is None:
             left = _robust_left(smooth_columns(problem, places), r)
             size = max(1.4826 * float(left.abs().median()), 0.0 if sd is None else 1.0)
-            found[places] = left.abs() > SPIKE * size if size > 0 else False
+            high = left.abs() > SPIKE * size if size > 0 else torch.zeros_like(left, dtype=torch.bool)
+            found[places] = high if not _clustered(problem, places, high) else False
             continue
         bend = torch.cat([r.new_zeros(1), r[1:-1] - 0.5 * (r[:-2] + r[2:]), r.new_zeros(1)])
         robust = 1.4826 * float(bend[1:-1].abs().median())
@@ -261,6 +270,20 @@ def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
         alone = (around < -0.2).all(0) & (around > -1.0).all(0)
         found[places] = (bend.abs() > SPIKE * robust) & alone
     return found
+
+
+def _clustered(problem: Problem, places: Tensor, high: Tensor) -> bool:
+    """Whether data that stick out lie together among the conditions, as outliers do not."""
+    count = int(high.sum())
+    if count < 3:
+        return False
+    x = problem.recording.x
+    columns = [c[problem.condition_of[places]] for c in (x.values() if isinstance(x, dict) else [x])]
+    ranks = torch.stack([c.argsort().argsort().double() for c in columns], dim=-1)
+    distance = torch.cdist(ranks[high], ranks)
+    distance[torch.arange(count), high.nonzero()[:, 0]] = math.inf
+    together = float(high[distance.argmin(1)].double().mean())
+    return together > TOGETHER
 
 
 def _robust_left(columns: Tensor, values: Tensor) -> Tensor:

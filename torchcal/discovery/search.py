@@ -316,6 +316,7 @@ class Search:
             model.found = refit(model.found, fresh.whitening(model.found.problem))
             self._judge(model)
         self.residual = Residual(self.base, self.noise, seed=self.seed)
+        self.screening = screen(self.residual, self.candidates)
         self.structure = analyse(self.residual, every=True)
 
     # --- several terms ----------------------------------------------------------------------------------

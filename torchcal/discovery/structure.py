@@ -85,10 +85,7 @@ def _noise_draws(found: Fitted, noise: Noise, draws: int, seed: int) -> Tensor:
         e = w(e * unit[:, None])
     if math.isfinite(noise.freedom):
         half = torch.full((draws,), 0.5 * noise.freedom, dtype=torch.float64)
-        state = torch.random.get_rng_state()
-        torch.manual_seed(seed + 31)
-        chi2 = 2 * torch._standard_gamma(half)
-        torch.random.set_rng_state(state)
+        chi2 = 2 * torch._standard_gamma(half, generator=generator)
         e = e * (noise.freedom / chi2).sqrt()
     return e
 

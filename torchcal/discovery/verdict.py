@@ -15,6 +15,11 @@ __all__ = ["Decision", "decide"]
 NAMED = 0.97
 #: Structure left after a hypothesis with less probability than this by noise alone speaks against it.
 WHITE = 0.005
+#: Structure left with at least this probability is none; and the share of its log evidence by which a linear estimate
+#: of something unknown, which is not refitted, may be too large.
+PLAINLY_WHITE, LINEAR = 0.05, 0.02
+#: Data a free parameter below which a fit without held-out data names nothing.
+LEAST_FITTED = 4
 #: Of the tied hypotheses, those that together have this probability are listed.
 TIED = 0.98
 #: Of a recording without noise, the share of the held-out misfit that a named term must remove.
@@ -74,6 +79,8 @@ def _none_evidence(search: Search, ranked: list[Model]) -> float:
     """Log weight of "none of these": something unknown in the base, or beside the best models."""
     prior = math.log(PRIOR["none"])
     found = _unknown(search, search.structure, calibrated=False) + prior
+    if any(search.examine(model).p_value >= PLAINLY_WHITE for model in ranked[:2]):
+        found -= LINEAR * max(found, 0.0)  # refitted and white: its rival is linear, and as wrong as that
     for model in ranked[:4]:
         found = max(found, model.weight + _unknown(search, search.examine(model), calibrated=True) + prior)
     return found
@@ -160,15 +167,18 @@ def _certainty(groups: dict[frozenset[str], float], model: Model) -> float:
 def _gain(search: Search, model: Model, mask: Tensor | None, against: Model | None = None) -> float:
     """Share of the squared misfit of the base, or of another model, that a model removes on held-out data."""
     before = search.base if against is None else against.found
-    if mask is None:
-        return 1.0 - model.found.chi2 / before.chi2
+    if mask is None:  # what was fitted proves nothing where there are few data a parameter
+        enough = search.problem.n >= LEAST_FITTED * len(model.found.free)
+        return 1.0 - model.found.chi2 / before.chi2 if enough else 0.0
     seen = mask & search.problem.keep
+    if not bool(seen.any()):
+        return 0.0
     old, new = (verify.held_out_fit(found, search.noise, mask) for found in (before, model.found))
     if old is None or new is None:
         return 0.0
-    y = search.problem.recording.y[seen]
-    floor = 0.0 if search.exact else float(search.noise.sd[seen].square().sum())
-    left = [max(float((y - part.prediction[seen]).square().sum()) - floor, 0.0) for part in (old, new)]
+    y, sd = search.problem.recording.y[seen], search.noise.sd[seen]
+    floor = 0.0 if search.exact else float(len(y))
+    left = [max(float(((y - part.prediction[seen]) / sd).square().sum()) - floor, 0.0) for part in (old, new)]
     return 1.0 - left[1] / max(left[0], 1e-300)
 
 
@@ -207,7 +217,7 @@ def _decide_exact(search: Search, ranked: list[Model], mask: Tensor | None, deci
     any rival; then another may remove nearly all of what that leaves."""
     decision.none_evidence = -math.inf
     recording = search.problem.recording
-    if float(search.base.residual.abs().max()) <= 1e-6 * float(recording.spread.max()):
+    if bool((search.base.residual.abs() <= 1e-6 * recording.spread[search.base.problem.index]).all()):
         decision.verdict = "consistent"
         return decision
     clean = [m for m in ranked if not m.note]
@@ -258,6 +268,8 @@ def _prove(search: Search, decision: Decision, mask: Tensor | None) -> None:
     if before is None or after is None:
         return
     seen = mask & search.problem.keep
+    if not bool(seen.any()):
+        return
     gain, error = verify.compare(search.problem.recording, before.prediction, after.prediction, search.noise, seen)
     if gain < -error:
         decision.withdrawn = (

@@ -62,10 +62,11 @@ def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None
     if int(recording.observed.sum()) * (1 - share) < LEAST_PER_PARAMETER * parameters:
         return None
     x = recording.x
+    seen = recording.observed.reshape(len(recording.outputs), recording.n).any(0)
     if recording.runs is not None and isinstance(x, dict):
         mask = torch.zeros(recording.n, dtype=torch.bool)
         for r in x["run"].unique():
-            mine = (x["run"] == r).nonzero()[:, 0]
+            mine = ((x["run"] == r) & seen).nonzero()[:, 0]
             mask[mine[math.ceil((1 - share) * len(mine)) :]] = True
     else:
         columns = torch.stack(list(x.values()), dim=-1) if isinstance(x, dict) else x[:, None]
@@ -75,7 +76,8 @@ def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None
             middle = 0.5 * (columns.amax(0) + columns.amin(0))
             half = 0.5 * (columns.amax(0) - columns.amin(0)).clamp_min(1e-300)
             distance = ((columns - middle) / half).square().sum(-1)
-        count = max(1, int(share * len(distance)))
+        distance = torch.where(seen, distance, torch.full_like(distance, -math.inf))
+        count = max(1, int(share * int(seen.sum())))
         mask = torch.zeros(recording.n, dtype=torch.bool)
         mask[distance.argsort(descending=True, stable=True)[:count]] = True
     return mask.repeat(len(recording.outputs))

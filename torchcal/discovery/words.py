@@ -56,7 +56,7 @@ def _headline(d: Any) -> str:
 
 def _with_region(d: Any, name: str) -> str:
     for row in d.ranking:
-        if row.refitted and tuple(row.terms) == tuple(d.terms) and row.region:
+        if row.refitted and set(row.terms) == set(d.terms) and row.region:
             return f"{name}, where {row.region}"
     return name
 
@@ -114,7 +114,7 @@ def _proof(d: Any) -> str:
     if d.before.held_out is not None and d.after.held_out is not None:
         b, a = d.before.held_out, d.after.held_out
         text += (
-            f"; on {b.n} data that the fit never saw from {b.rmse:.4g} to {a.rmse:.4g} (log score {b.log_score:.3g} to "
+            f"; on {b.n} data kept from both fits from {b.rmse:.4g} to {a.rmse:.4g} (log score {b.log_score:.3g} to "
             f"{a.log_score:.3g}, 95 % intervals hold {percent(b.coverage)}, then {percent(a.coverage)})"
         )
     if d.before.model_error_sd is not None and d.after.model_error_sd is not None:
@@ -125,7 +125,7 @@ def _proof(d: Any) -> str:
 
 
 def _named(d: Any) -> list[str]:
-    top = next((row for row in d.ranking if list(row.terms) == list(d.terms)), d.ranking[0])
+    top = next((row for row in d.ranking if set(row.terms) == set(d.terms)), d.ranking[0])
     estimates = "; ".join(str(estimate) for estimate in top.estimates)
     rival = next((row for row in d.ranking if row is not top and row.terms and row.refitted), None)
     likely = "" if d.settings.get("nearly") else f"probability {top.probability:.3f}; "
