@@ -82,6 +82,8 @@ def diagnose(
     """
     begun = time.perf_counter()
     terms = _check(simulator, recording, candidates, confidence, max_terms, num_starts)
+    if isinstance(seed, bool) or not isinstance(seed, int):
+        raise DomainError(f"Expected seed as an integer. Got {seed!r}.")
     given = terms
     terms = [term for term in given if not _contains(simulator, term)]
     problem = Problem.of(simulator, recording)
@@ -130,10 +132,19 @@ def _check(
     if isinstance(candidates, Term):
         candidates = [candidates]
     candidates = [] if candidates is None else candidates
+    if not isinstance(candidates, Sequence) or isinstance(candidates, str):
+        raise DomainError(f"Expected candidates as a sequence of terms. Got {type(candidates).__name__}.")
+    if isinstance(confidence, bool) or not isinstance(confidence, int | float):
+        raise DomainError(f"Expected confidence as a number. Got {confidence!r}.")
     by_name: dict[str, Term] = {}
     for term in candidates:
         if not isinstance(term, Term):
             raise DomainError(f"Expected candidates as torchcal.Term objects. Got {type(term).__name__}: {term!r}.")
+        if any(q.per_run for q in term.parameters):
+            raise DomainError(
+                f"Expected one value of each parameter of the term {term.name!r} for all runs. Got per_run=True (make "
+                "it a parameter of the simulator, with a neutral value, and free it)."
+            )
         by_name[term.name] = term
     if not 0.5 < confidence <= 0.998:
         raise DomainError(
@@ -148,6 +159,8 @@ def _check(
 
 def _check_fixed(problem: Problem, fixed: Mapping[str, float]) -> None:
     """Raise for names that do not exist and values outside their bounds."""
+    if not isinstance(fixed, Mapping):
+        raise DomainError(f"Expected fixed as a dict from parameter names to values. Got {fixed!r}.")
     parameters = {q.name: q for q in problem.parameters}
     for name, value in fixed.items():
         if name not in parameters:

@@ -132,8 +132,11 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
     """Smallest detectable effects; ``contained`` terms are part of the simulator already."""
     screening = search.screening
     from_power = math.sqrt(2) * float(torch.special.erfinv(torch.tensor(2 * power - 1, dtype=torch.float64)))
-    # Three families of statistics share the level.
-    critical = float(screening.null.quantile(1 - alpha / 3)) if len(screening.null) else 3.5
+    # Several families of statistics share the level: each may use as much of it as leaves alpha in all.
+    level = float(search.least.quantile(alpha))
+    critical = float(screening.null.quantile(1 - level)) if len(screening.null) else 3.5
+    if math.isfinite(search.noise.freedom):  # the noise's estimate wavers, and the score with it
+        from_power *= math.sqrt(1 + critical**2 / (2 * search.noise.freedom))
     fitted = {m.numbers[0]: m for m in search.models if len(m.numbers) == 1 and m.window is None}
     rows = []
     for i, candidate in enumerate(search.candidates):

@@ -201,15 +201,25 @@ def fit(
         size = torch.maximum(size * 0.9, diagonal)
         now = values[:, free]
         stuck = ((now <= low) & (gradient < 0)) | ((now >= high) & (gradient > 0)) | (size <= 0)
-        unit = torch.where(stuck, torch.ones_like(size), size).sqrt()
-        # By singular values: the squares of nearly parallel tangents would lose what tells them apart.
-        u, s, v = torch.linalg.svd(
-            torch.where(stuck[:, None], torch.zeros_like(slope), slope / unit[:, None]), full_matrices=False
-        )
-        along = (u.transpose(-1, -2) @ residual.unsqueeze(-1))[..., 0]
-        shrink = s / (s.square() + damping[:, None] + 1e-14)
-        change = (v.transpose(-1, -2) @ (shrink * along).unsqueeze(-1))[..., 0] / unit
-        moved = torch.where(log, now * change.clamp(-2, 2).exp(), now + change).clamp(low, high)
+        held = torch.zeros_like(now)
+        for _ in range(len(free)):
+            unit = torch.where(stuck, torch.ones_like(size), size).sqrt()
+            left = residual - (slope @ held.unsqueeze(-1))[..., 0]
+            u, s, v = torch.linalg.svd(
+                torch.where(stuck[:, None], torch.zeros_like(slope), slope / unit[:, None]), full_matrices=False
+            )
+            along = (u.transpose(-1, -2) @ left.unsqueeze(-1))[..., 0]
+            shrink = s / (s.square() + damping[:, None] + 1e-14)
+            change = (v.transpose(-1, -2) @ (shrink * along).unsqueeze(-1))[..., 0] / unit
+            change = torch.where(stuck, held, change)
+            free_move = torch.where(log, now * change.clamp(-2, 2).exp(), now + change)
+            over = ~stuck & ((free_move < low) | (free_move > high))
+            if not bool(over.any()):
+                break
+            wall = free_move.clamp(low, high)
+            held = torch.where(over, torch.where(log, (wall / now).log(), wall - now), held)
+            stuck = stuck | over
+        moved = free_move.clamp(low, high)
         trial = values.clone()
         trial[:, free] = torch.where(done[:, None], now, moved)
         step = torch.where(log, (trial[:, free] / now).log(), trial[:, free] - now)
@@ -220,7 +230,7 @@ def fit(
         lost = torch.where(torch.isfinite(chi2_new) | (lost >= 3), torch.zeros_like(lost), lost + 1)
         gain = (chi2 - chi2_new) / predicted.clamp_min(1e-300)
         better = (chi2_new < chi2) & ~done
-        small = predicted <= TOLERANCE * (chi2 + 1e-3 * problem.n)
+        small = predicted.abs() <= TOLERANCE * (chi2 + 1e-3 * problem.n)
         done = done | (small & ~(chi2_new < chi2 * (1 - TOLERANCE))) | (~better & (damping > 1e10))
         for old, new in (
             (values, trial),
@@ -248,8 +258,16 @@ def fit(
     gradient = (whitening(jacobian[best]).T @ residual[best]) if free else target[:0]
     now = values[best, free]
     width = torch.where(torch.isfinite(high - low), high - low, now.abs().clamp_min(1e-300))
-    spread = (whitening(jacobian[best]).square().sum(0)).clamp_min(1e-300).sqrt() if free else target[:0]
     near = 1e-6 * width
+    spread = torch.ones_like(now)
+    if free:
+        tangents = whitening(jacobian[best])
+        edge = (now <= low + near) | (now >= high - near)
+        others = tangents[:, ~edge]
+        sizes = others.norm(dim=0).clamp_min(1e-300)
+        uu, ss, _ = torch.linalg.svd(others / sizes, full_matrices=False)
+        basis = uu[:, ss > 1e-7 * ss.max()] if others.shape[1] else tangents[:, :0]
+        spread = (tangents - basis @ (basis.T @ tangents)).norm(dim=0).clamp_min(1e-300)
     pushed = gradient / spread
     at_bound = ((now <= low + near) & (pushed < -2.0)) | ((now >= high - near) & (pushed > 2.0))
     return Fitted(

@@ -230,7 +230,7 @@ def _quantisation(problem: Problem) -> dict[str, float]:
     found = {}
     for name, values in problem.recording.split(problem.recording.y).items():
         seen = values[torch.isfinite(values)].unique()
-        if len(seen) < 3 or len(seen) > 0.5 * int(torch.isfinite(values).sum()) or len(values) < 20:
+        if len(seen) < 3 or len(seen) > 0.8 * int(torch.isfinite(values).sum()) or len(values) < 20:
             continue
         step = float(seen.diff().min())
         size = float(seen.abs().max())

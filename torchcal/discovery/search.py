@@ -95,7 +95,7 @@ class Search:
     twins: dict[int, int] = field(init=False, default_factory=dict)
     gone: set[int] = field(init=False, default_factory=set)
     p_detect: float = field(init=False, default=1.0)
-    outliers: int = 0
+    least: Tensor = field(init=False)
 
     @property
     def exact(self) -> bool:
@@ -128,7 +128,7 @@ class Search:
             max((p.evidence for p in self.structure.places if p.channel.kind in kinds), default=0.0),
             max((w.z for w in self.local), default=0.0),
         ]
-        self.p_detect = _joint(nulls, seen)
+        self.p_detect, self.least = _joint(nulls, seen)
 
     def _alike(self) -> None:
         """Which candidates have the same projected tangent as an earlier one."""
@@ -148,6 +148,8 @@ class Search:
         gone: set[int] = set()
         for i, k in self.twins.items():
             a, b = plain.get(i), plain.get(k)
+            if a is not None and b is None:
+                continue
             if a is not None and b is not None and (a.physical != b.physical or abs(a.found.chi2 - b.found.chi2) > 0.5):
                 continue
             self.aliases.setdefault(k, []).append(self.candidates[i].name)
@@ -329,8 +331,11 @@ class Search:
         return model.structure
 
 
-def _joint(nulls: Sequence[Tensor], seen: Sequence[float]) -> float:
-    """Probability that noise alone gives one of several statistics as extreme a value as the most extreme one seen."""
+def _joint(nulls: Sequence[Tensor], seen: Sequence[float]) -> tuple[float, Tensor]:
+    """Probability that noise alone gives one of several statistics as extreme a value as the most extreme one seen.
+
+    Also returns the smallest of their probabilities in every simulated residual.
+    """
     draws = len(nulls[0])
     ranks, p = [], []
     for null, value in zip(nulls, seen, strict=True):
@@ -341,9 +346,9 @@ def _joint(nulls: Sequence[Tensor], seen: Sequence[float]) -> float:
         ranks.append(above.double() / draws)
         p.append((1.0 + float((null >= value).sum())) / (1.0 + draws))
     if not p:
-        return 1.0
+        return 1.0, torch.ones(draws, dtype=torch.float64)
     least = torch.stack(ranks).amin(0)
-    return (1.0 + float((least <= min(p)).sum())) / (1.0 + draws)
+    return (1.0 + float((least <= min(p)).sum())) / (1.0 + draws), least
 
 
 def describe(model: Model) -> str | None:

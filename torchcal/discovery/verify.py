@@ -42,7 +42,12 @@ def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None
         return None
     share = SHARE
     if holdout is not None and not isinstance(holdout, float):
-        mask = holdout if isinstance(holdout, Tensor) else torch.as_tensor(np.asarray(holdout))
+        try:
+            mask = holdout if isinstance(holdout, Tensor) else torch.as_tensor(np.asarray(holdout))
+        except (TypeError, ValueError) as error:
+            raise DomainError(
+                f"Expected holdout as None, False, a share or a bool array. Got {holdout!r} ({error})."
+            ) from error
         if mask.dtype != torch.bool or mask.shape not in ((recording.n,), recording.y.shape):
             raise DomainError(
                 f"Expected holdout as False, a share, or a bool array of shape ({recording.n},), True where held out. "

@@ -126,7 +126,7 @@ def maximise(
             found = minimise(lambda u: objective(problem.propagate, u), points, progress=show)
     bar.close()
     best, ties = _first_of_the_tied(problem, found)
-    if agreeing < 2 <= total:
+    if agreeing < 2 <= len(found.values):
         warnings.warn(
             f"Only 1 of {total} starts reached the best objective {float(found.values[0]):.6g}; the next ended at "
             f"{float(found.values[1]):.6g}. The maximum may not be the global one. Raise num_starts=.",

@@ -104,11 +104,6 @@ class Term:
         names = [parameter.name for parameter in parameters]
         if len(set(names)) < len(names):
             raise DomainError(f"Expected every parameter of the term {name!r} named once. Got {names}.")
-        if any(parameter.per_run for parameter in parameters):
-            raise DomainError(
-                f"Expected one value of each parameter of the term {name!r} for all runs. Got per_run=True (make it a "
-                "parameter of the simulator, with a neutral value, and free it)."
-            )
         for state in states or {}:
             if state not in every:
                 raise DomainError(f"Expected a rate for the hidden state {state!r} of the term {name!r}. Got none.")
