@@ -963,3 +963,18 @@ def test_no_warning_where_all_goes_well():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         quiet(*pushed(0.08))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"confidence": "0.9"}, {"confidence": 0.9995}, {"seed": "a"}, {"holdout": "half"}, {"fixed": 3},
+     {"fixed": {"zzz": 1.0}}],
+)  # fmt: skip
+def test_arguments_of_the_wrong_kind(options):
+    with pytest.raises(tc.errors.DomainError):
+        quiet(costly(10**9), DATA, [BEND], **options)
+
+
+def test_candidates_that_are_no_sequence():
+    with pytest.raises(tc.errors.DomainError):
+        quiet(costly(10**9), DATA, 5)

@@ -389,3 +389,22 @@ def test_projection_takes_the_tangents_away():
     # The fit is a least-squares fit: its residual is orthogonal to the tangents already.
     torch.testing.assert_close(residual.e, found.residual, rtol=0, atol=1e-6)
     assert float((tangents.T @ residual.null).abs().max()) < 1e-10
+
+
+@pytest.mark.parametrize(("low", "high"), [(-0.05, 0.05), (-0.1, 0.1), (0.0, None)])
+@pytest.mark.parametrize("start", [0.0, 0.03])
+def test_a_bound_beside_a_nearly_parallel_tangent(low, high, start):
+    optimize = pytest.importorskip("scipy.optimize")
+    x = torch.linspace(0, 1, 40, dtype=F64)
+    y = x - 0.2 * x**3 + 0.01 * draws(40)
+    simulator = tc.Simulator(
+        lambda x, p: p["k"] * x + p["c"] * x**3, [tc.Parameter("k"), tc.Parameter("c", low=low, high=high)]
+    )
+    found = solve(simulator, tc.Recording(x=x, y=y), 0.01, begin=[[0.85, start]])
+    wanted = optimize.lsq_linear(
+        torch.stack([x, x**3], 1).numpy() / 0.01,
+        y.numpy() / 0.01,
+        bounds=([-1e9, low], [1e9, 1e9 if high is None else high]),
+    )
+    assert found.chi2 == pytest.approx(2 * wanted.cost, rel=1e-6)
+    assert found.at_bound.tolist() == [False, True]
