@@ -206,7 +206,7 @@ def _scores(search: Search, found: Fitted, mask: Tensor | None) -> Scores:
     fitted = verify.score(recording, prediction, sd, search.problem.keep)
     if mask is None:
         return Scores(fitted, None, None, width)
-    apart = verify.held_out_fit(found, noise, mask)
+    apart = verify.held_out_fit(found, noise, mask) if search.exact else search.held_out(found, mask)
     if apart is None:
         return Scores(fitted, None, None, width)
     seen = mask & search.problem.keep
@@ -330,7 +330,7 @@ def _ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[H
     for place, model in enumerate(ordered[:60]):
         held = None
         if mask is not None and (place < 3 or model is decision.best):
-            apart = verify.held_out_fit(model.found, search.noise, mask)
+            apart = search.held_out(model.found, mask)
             if apart is not None and bool((mask & search.problem.keep).any()):
                 held = verify.score(
                     search.problem.recording, apart.prediction, apart.sd, mask & search.problem.keep

@@ -45,11 +45,6 @@ class Whitening:
         """Whitened ``(*batch, n)``."""
         return self(values.unsqueeze(-1)).squeeze(-1)
 
-    @property
-    def log_det(self) -> float:
-        """log |W| of the whitening matrix W."""
-        return float(-self.sd.log().sum() - 0.5 * (1 - self.correlation.square()).log().sum())
-
     def scaled(self, factor: float) -> "Whitening":
         """With another size of the noise."""
         return dataclasses.replace(self, sd=self.sd * factor)

@@ -15,6 +15,7 @@ from torchcal.discovery.noise import Noise, estimate
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.screen import Screening, Window, screen, windows
 from torchcal.discovery.structure import Residual, Structure, analyse
+from torchcal.discovery.verify import HeldOut, held_out_fit
 from torchcal.simulators import Trajectories
 from torchcal.terms import Term
 
@@ -96,6 +97,7 @@ class Search:
     gone: set[int] = field(init=False, default_factory=set)
     p_detect: float = field(init=False, default=1.0)
     least: Tensor = field(init=False)
+    _held_out: dict[int, tuple[Fitted, HeldOut | None]] = field(init=False, default_factory=dict)
 
     @property
     def exact(self) -> bool:
@@ -182,6 +184,13 @@ class Search:
                 self.models.append(model)
         self._reweigh()
         self.merge()
+
+    def held_out(self, found: Fitted, mask: Tensor) -> HeldOut | None:
+        """A model of this search fitted without the data in ``mask``; computed once."""
+        key = id(found)
+        if key not in self._held_out:  # the fit is kept beside it, so that its id stays its own
+            self._held_out[key] = (found, held_out_fit(found, self.noise, mask))
+        return self._held_out[key][1]
 
     def _drivers(self) -> dict[str, Tensor]:
         return self.base.problem.drivers(self.base.values[None], self.base.warm)

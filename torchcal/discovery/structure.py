@@ -120,8 +120,8 @@ class Structure:
     Attributes:
         places: By falling evidence.
         p_value: Probability of so much structure by noise alone.
-        chi2_p: Probability of so large a χ² by noise alone; None where the noise is not known.
         channels: All of them.
+        null_best: Largest evidence in each simulated residual.
     """
 
     places: list[Place]

@@ -173,7 +173,7 @@ def _gain(search: Search, model: Model, mask: Tensor | None, against: Model | No
     seen = mask & search.problem.keep
     if not bool(seen.any()):
         return 0.0
-    old, new = (verify.held_out_fit(found, search.noise, mask) for found in (before, model.found))
+    old, new = (search.held_out(found, mask) for found in (before, model.found))
     if old is None or new is None:
         return 0.0
     y, sd = search.problem.recording.y[seen], search.noise.sd[seen]
@@ -263,8 +263,8 @@ def _prove(search: Search, decision: Decision, mask: Tensor | None) -> None:
     """Withdraw a name that predicts held-out data worse than the base does."""
     if decision.best is None or mask is None:
         return
-    before = verify.held_out_fit(search.base, search.noise, mask)
-    after = verify.held_out_fit(decision.best.found, search.noise, mask)
+    before = search.held_out(search.base, mask)
+    after = search.held_out(decision.best.found, mask)
     if before is None or after is None:
         return
     seen = mask & search.problem.keep

@@ -1,12 +1,22 @@
 """Flows and stores that a model of a tank leaves out."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import torch
 
-from torchcal.simulators import Parameter
-from torchcal.terms.pieces import Units, amplitude, check_name, excess, own_name, quantity, shape, square_root, titled
+from torchcal.terms.pieces import (
+    Units,
+    adder,
+    amplitude,
+    check_name,
+    excess,
+    own_name,
+    quantity,
+    shape,
+    square_root,
+    titled,
+)
 from torchcal.terms.term import Term
 
 __all__ = ["hydraulics"]
@@ -53,20 +63,8 @@ def hydraulics(
     """
     h = check_name(level, "level")
     units = Units(length, time)
-    terms = []
-
-    def add(
-        name: str,
-        rate: Callable[..., Any],
-        parameters: list[Parameter],
-        formula: str,
-        description: str,
-        scales: Mapping[str, str] | None = None,
-    ) -> None:
-        terms.append(
-            Term(titled(name, label), equation=h, rate=rate, parameters=parameters, scales=scales,
-                 formula=f"d{h}/dt ∋ {formula}", description=description)
-        )  # fmt: skip
+    terms: list[Term] = []
+    add = adder(terms, h, label)
 
     add("leak", lambda t, s, p, u: -p["c"] * square_root(s[h]), [amplitude("c", f"{length}^0.5/{time}", low=0.0)],
         f"-c √{h}", "Hole in the bottom, discharging by Torricelli's law.")  # fmt: skip

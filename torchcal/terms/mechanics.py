@@ -9,6 +9,7 @@ from torchcal.simulators import Parameter
 from torchcal.terms.pieces import (
     Quantity,
     Units,
+    adder,
     amplitude,
     check_name,
     check_names,
@@ -76,20 +77,8 @@ def mechanics(
         positions = check_names(position, "positions", (2, 3))
         return _in_space(positions, check_names(velocity, "velocities", (len(positions),)), units, label)
     x, v = check_name(position, "position"), check_name(velocity, "velocity")
-    terms = []
-
-    def add(
-        name: str,
-        rate: Callable[..., Any],
-        parameters: list[Parameter],
-        formula: str,
-        description: str,
-        scales: Mapping[str, str] | None = None,
-    ) -> None:
-        terms.append(
-            Term(titled(name, label), equation=v, rate=rate, parameters=parameters, scales=scales,
-                 formula=f"d{v}/dt ∋ {formula}", description=description)
-        )  # fmt: skip
+    terms: list[Term] = []
+    add = adder(terms, v, label)
 
     add("linear drag", lambda t, s, p, u: -p["c"] * s[v], [amplitude("c", units(0, 1), low=0.0)],
         f"-c {v}", "Viscous drag, proportional to the speed.")  # fmt: skip

@@ -9,11 +9,13 @@ from torch import Tensor
 
 from torchcal.errors import DomainError
 from torchcal.simulators import Parameter
+from torchcal.terms.term import Term
 
 __all__ = [
     "Named",
     "Quantity",
     "Units",
+    "adder",
     "amplitude",
     "check_name",
     "check_names",
@@ -46,6 +48,25 @@ def amplitude(
 def shape(name: str, unit: str, low: float | None = None, high: float | None = None) -> Parameter:
     """A threshold, width, time or exponent: without effect while the amplitude is 0."""
     return Parameter(name, unit=unit, low=low, high=high)
+
+
+def adder(terms: list[Term], equation: str, label: str | None) -> Callable[..., None]:
+    """A function that appends terms of one equation: ``add(name, rate, parameters, formula, description, scales)``."""
+
+    def add(
+        name: str,
+        rate: Callable[..., Any],
+        parameters: list[Parameter],
+        formula: str,
+        description: str,
+        scales: Mapping[str, str] | None = None,
+    ) -> None:
+        terms.append(
+            Term(titled(name, label), equation=equation, rate=rate, parameters=parameters, scales=scales,
+                 formula=f"d{equation}/dt ∋ {formula}", description=description)
+        )  # fmt: skip
+
+    return add
 
 
 def check_name(value: Any, what: str) -> str:

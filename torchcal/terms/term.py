@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from torchcal.errors import DomainError
@@ -286,8 +285,3 @@ def neutral_of(parameter: Parameter) -> float | None:
     if parameter.neutral is not None:
         return parameter.neutral
     return 0.0 if parameter.transform != "log" and parameter.contains(0.0) else None
-
-
-def expand_like(value: Any, like: Tensor) -> Tensor:
-    """A number or tensor in the shape of another tensor."""
-    return torch.as_tensor(value, dtype=like.dtype).expand(like.shape)
