@@ -4,7 +4,7 @@ from torchcal import discovery, embeddings, errors, likelihoods, models, polycha
 from torchcal.data import Recording, Run
 from torchcal.discovery import diagnose
 from torchcal.errors import TorchcalError, TorchcalWarning
-from torchcal.inference import calibrate, calibrate_additive
+from torchcal.inference import calibrate, calibrate_additive, calibrate_many
 from torchcal.prediction import scores
 from torchcal.propagation import NISP
 from torchcal.simulators import (
@@ -32,6 +32,7 @@ __all__ = [
     "build_surrogate",
     "calibrate",
     "calibrate_additive",
+    "calibrate_many",
     "diagnose",
     "discovery",
     "embeddings",

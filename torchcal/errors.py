@@ -22,6 +22,7 @@ __all__ = [
     "ToleranceWarning",
     "TorchcalError",
     "TorchcalWarning",
+    "WorkerWarning",
 ]
 
 
@@ -91,3 +92,7 @@ class SurrogateWarning(TorchcalWarning):
 
 class ExtrapolationWarning(TorchcalWarning):
     """A model or surrogate is used outside the region that it was built for."""
+
+
+class WorkerWarning(TorchcalWarning):
+    """Workers of an executor died; their work was done again."""

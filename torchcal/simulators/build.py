@@ -64,7 +64,8 @@ def build_surrogate(
             default ``order + 1`` is exact for polynomials of the order; more of them changed the error
             of smooth functions by less than a tenth, where a higher order divides it.
         outputs: Names of the outputs to keep, where there are several; by default all.
-        executor: Any ``concurrent.futures.Executor`` for functions of plain floats; None evaluates here.
+        executor: Any ``concurrent.futures.Executor`` for functions of plain floats; None evaluates here. When a
+            worker dies, only what it had not handed over is repeated, in a fresh process pool where that broke.
         cache: For functions of plain floats: a file (.npz) that evaluations are kept in and taken from, or
             the ``.partial`` of an error. One kept evaluation is repeated, to see that the function is the same.
         progress: Whether to show a bar.
@@ -82,6 +83,7 @@ def build_surrogate(
 
     Warns:
         SurrogateWarning: If the error is above `threshold`.
+        TorchcalWarning: If workers died; nothing is lost then.
 
     Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 41-43.
 

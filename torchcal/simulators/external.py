@@ -40,7 +40,8 @@ class ExternalSimulator(Simulator):
         parameters: In the order in which results list them.
         executor: Any ``concurrent.futures.Executor``; None calls the function here. For a process pool the
             function must be defined at the top level of a module. All parameter values of a call go in one map,
-            identical ones once.
+            identical ones once. When a worker dies, what it was doing is repeated; a process pool, which breaks then,
+            is replaced by one of the same kind for as long as it is kept.
         vectorized: Whether one call does all conditions.
         step: Relative step of the differences. The default errs by 1e-8 of f''' (truncation) and 1e4 times
             the function's own noise: take a larger one for a code whose last digits are not reproducible.
@@ -49,7 +50,10 @@ class ExternalSimulator(Simulator):
     Raises:
         DomainError: If an argument has no meaning.
         SimulatorError: If the function cannot be sent to the executor's processes. Later, named with its point: if
-            an evaluation raises, or returns something that is not a real number.
+            an evaluation raises, kills a worker again and again, or returns something that is not a real number.
+
+    Warns:
+        TorchcalWarning: If workers died; nothing is lost then.
 
     A calibration calls a simulator thousands of times: for an expensive one build a surrogate first
     (`build_surrogate`).
@@ -202,7 +206,10 @@ class _Job:
         values: list[Value | None] = [None] * len(rows)
         tasks = rows.tolist()
         try:
-            run_tasks(call, tasks, executor=self.simulator.executor, on_result=values.__setitem__)
+            # Thousands of calls share the executor: a pool that stands in for a broken one is not opened for each.
+            run_tasks(
+                call, tasks, executor=self.simulator.executor, on_result=values.__setitem__, keep_pool=True
+            )
         except TaskError as failure:
             raise failed_evaluation(failure, call.describe(tasks[failure.index])) from failure.error
         done = [value for value in values if value is not None]

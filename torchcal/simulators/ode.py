@@ -1,5 +1,6 @@
 """Simulators in time: ordinary differential equations with inputs, several runs and unknown initial states."""
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -117,4 +118,8 @@ class ODESimulator(Simulator):
 
 
 def _state(name: str) -> Callable[..., Tensor]:
-    return lambda t, s, p, u: s[name]
+    return functools.partial(_read, name)  # and no lambda, which no other process can be sent
+
+
+def _read(name: str, t: Tensor, s: Mapping[str, Tensor], p: Mapping[str, Tensor], u: Mapping[str, Tensor]) -> Tensor:
+    return s[name]

@@ -2,7 +2,6 @@
 
 import numbers
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import BrokenExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcal.errors import SimulatorError
-from torchcal.simulators.executor import TaskError
+from torchcal.simulators.executor import TaskError, worker_died
 
 __all__ = ["ArrayCall", "PointCall", "Value", "describe_point", "failed_evaluation"]
 
@@ -97,7 +96,7 @@ def describe_point(row: Sequence[float], conditions: tuple[str, ...] | None, par
 def failed_evaluation(failure: TaskError, point: str) -> SimulatorError:
     """The error of an evaluation that failed, named with its point."""
     error = failure.error
-    if isinstance(error, BrokenExecutor):
+    if worker_died(error):
         others = f" or one of the {failure.suspects - 1} pieces of work sent after it" if failure.suspects > 1 else ""
         return SimulatorError(
             f"A worker process died at {point}{others} ({error}). Call the function there without an executor to "
