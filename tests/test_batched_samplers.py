@@ -1,4 +1,4 @@
-"""The batched sampler against exact targets: distributions, boundaries, kinks and other samplers."""
+"""The batched samplers against exact targets: distributions, boundaries, kinks and other samplers."""
 
 import math
 
@@ -7,13 +7,15 @@ import pytest
 import torch
 
 from torchcal.errors import ConvergenceError
-from torchcal.inference import diagnostics, nuts_step
-from torchcal.inference.batched import run_batched_nuts
+from torchcal.inference import diagnostics, hmc_step, nuts_step
+from torchcal.inference.batched import run_batched
+from torchcal.inference.coordinates import Laplace, Whitened
 from torchcal.priors import Bounds
 
 stats = pytest.importorskip("scipy.stats")
 
 INF = math.inf
+KERNELS = pytest.mark.parametrize("kernel", ["nuts", "hmc"])
 
 
 def free(size):
@@ -21,15 +23,15 @@ def free(size):
 
 
 def run(log_density, size, transform=None, **options):
+    factor = options.pop("scale_tril", torch.eye(size, dtype=torch.float64))
     defaults = {
-        "loc": torch.zeros(size, dtype=torch.float64),
-        "scale_tril": torch.eye(size, dtype=torch.float64),
+        "modes": [Laplace(torch.zeros(size, dtype=torch.float64), factor)],
         "num_samples": 200,
         "num_chains": 32,
         "num_warmup": 60,
         "seed": 3,
     }
-    return run_batched_nuts(log_density, transform or free(size), **{**defaults, **options})
+    return run_batched(log_density, transform or free(size), **{**defaults, **options})
 
 
 def independent(draws, column):
@@ -68,13 +70,15 @@ def test_leapfrog_conserves_energy_to_second_order():
     assert errors[0] / errors[1] == pytest.approx(8, rel=0.3)
 
 
-def test_correlated_normal_in_the_wrong_coordinates():
+@KERNELS
+def test_correlated_normal_in_the_wrong_coordinates(kernel):
     size = 5
     generator = torch.Generator().manual_seed(1)
     factor = torch.randn(size, size, dtype=torch.float64, generator=generator).tril() + 2 * torch.eye(size)
     precision = torch.linalg.inv(factor @ factor.T)
     mean = torch.arange(size, dtype=torch.float64)
-    draws = run(lambda u: -0.5 * ((u - mean) @ precision * (u - mean)).sum(-1), size, num_warmup=150).alpha
+    target = lambda u: -0.5 * ((u - mean) @ precision * (u - mean)).sum(-1)  # noqa: E731
+    draws = run(target, size, num_warmup=150, kernel=kernel).alpha
     flat = draws.flatten(0, 1)
     ess = diagnostics.bulk_ess(draws)
     sd = (factor @ factor.T).diagonal().sqrt()
@@ -100,8 +104,9 @@ def test_correlated_normal_in_the_wrong_coordinates():
         ),
     ],
 )
-def test_shapes_that_are_not_normal(name, log_density, distribution):
-    draws = run(log_density, 2, num_samples=400).alpha
+@KERNELS
+def test_shapes_that_are_not_normal(name, log_density, distribution, kernel):
+    draws = run(log_density, 2, num_samples=400, kernel=kernel).alpha
     for i in range(2):
         sample = independent(draws, i)
         if distribution is not None:
@@ -114,37 +119,40 @@ def test_shapes_that_are_not_normal(name, log_density, distribution):
 
 
 @pytest.mark.parametrize(("low", "high"), [(0.0, INF), (-INF, 0.3), (-0.2, 0.5)])
-def test_a_hard_boundary_cuts_the_density_and_nothing_else(low, high):
+@KERNELS
+def test_a_hard_boundary_cuts_the_density_and_nothing_else(low, high, kernel):
     transform = Bounds(torch.tensor([low], dtype=torch.float64), torch.tensor([high], dtype=torch.float64))
 
     def log_density(u):
         return -0.5 * transform.bound(u).square().sum(-1) + transform.log_slope(u)
 
-    draws = run(log_density, 1, transform, num_samples=400).alpha
+    draws = run(log_density, 1, transform, num_samples=400, kernel=kernel).alpha
     assert float(draws.min()) >= low
     assert float(draws.max()) <= high
     exact = stats.truncnorm(low, high)
     assert stats.kstest(independent(draws, 0), exact.cdf).pvalue > 1e-3
 
 
-def test_the_kink_of_the_residual():
+@KERNELS
+def test_the_kink_of_the_residual(kernel):
     """exp(-(σ - |μ|)² / 2ε²) has a concave kink in its exponent at μ = 0, between two humps."""
     sigma = 0.6
 
     def log_density(u):
         return (-0.5 * u.square() - 0.5 * (sigma - (u.square() + 1e-6).sqrt()).square() / 0.3**2).sum(-1)
 
-    draws = run(log_density, 1, num_samples=400).alpha
+    draws = run(log_density, 1, num_samples=400, kernel=kernel).alpha
     grid = np.linspace(-8, 8, 20001)
     density = np.exp(log_density(torch.tensor(grid)[:, None]).numpy())
     cdf = np.cumsum(density) / density.sum()
     assert stats.kstest(independent(draws, 0), lambda v: np.interp(v, grid, cdf)).pvalue > 1e-3
 
 
-def test_the_same_seed_gives_the_same_draws_and_leaves_the_global_state():
+@KERNELS
+def test_the_same_seed_gives_the_same_draws_and_leaves_the_global_state(kernel):
     torch.manual_seed(5)
     before = torch.random.get_rng_state()
-    options = {"num_samples": 20, "num_chains": 3, "num_warmup": 20}
+    options = {"num_samples": 20, "num_chains": 3, "num_warmup": 20, "kernel": kernel}
     first = run(lambda u: -0.5 * u.square().sum(-1), 2, **options).alpha
     second = run(lambda u: -0.5 * u.square().sum(-1), 2, **options).alpha
     assert torch.equal(first, second)
@@ -158,17 +166,24 @@ def test_a_density_that_is_nowhere_finite():
         run(lambda u: u.sum(-1) * math.nan, 2)
 
 
-def test_divergences_are_counted():
-    """A cliff that no step size resolves: the density falls from 1 to 0 within 1e-9."""
-    draws = run(lambda u: -0.5 * u.square().sum(-1) - 1e13 * (u[..., 0] - 0.5).clamp_min(0), 2, num_samples=100)
+@KERNELS
+def test_divergences_are_counted(kernel):
+    """A wall that no slope announces: trajectories that meet it end there, and are counted."""
+
+    def wall(u):
+        return torch.where(u[..., 0] > 0.5, -math.inf, -0.5 * u.square().sum(-1))
+
+    draws = run(wall, 2, num_samples=100, target_accept=0.8, kernel=kernel)
     assert draws.divergences > 0
 
 
-def test_r_hat_sees_separate_modes():
+@KERNELS
+def test_r_hat_sees_separate_modes(kernel):
     def two(u):
         return torch.logaddexp(-0.5 * (u - 12).square(), -0.5 * (u + 12).square()).sum(-1)
 
-    draws = run(two, 1, scale_tril=12 * torch.eye(1, dtype=torch.float64), num_samples=100, num_chains=8).alpha
+    wide = 12 * torch.eye(1, dtype=torch.float64)
+    draws = run(two, 1, scale_tril=wide, num_samples=100, num_chains=8, kernel=kernel).alpha
     assert float(diagnostics.r_hat(draws)[0]) > 1.5
 
 
@@ -190,3 +205,76 @@ def test_diagnostics_agree_with_arviz():
         assert float(diagnostics.bulk_ess(draws)[i]) == pytest.approx(float(arviz.ess(values)), rel=0.1)
         tail = float(arviz.ess(values, method="tail"))
         assert float(diagnostics.tail_ess(draws)[i]) == pytest.approx(tail, rel=0.2)
+
+
+def normal_with_factor(factor):
+    precision = torch.linalg.inv(factor @ factor.T)
+    return lambda u: -0.5 * (u @ precision * u).sum(-1)
+
+
+@KERNELS
+def test_chains_start_from_every_mode_with_its_weight_and_keep_to_widths_within_modes(kernel):
+    """Two narrow humps 100 widths apart that hold 3/4 and 1/4."""
+    def two(u):
+        left, right = -0.5 * (u + 50).square().sum(-1), -0.5 * (u - 50).square().sum(-1)
+        return torch.logaddexp(math.log(0.75) + left, math.log(0.25) + right)
+
+    eye = torch.eye(2, dtype=torch.float64)
+    modes = [Laplace(-50 * torch.ones(2, dtype=torch.float64), eye, 0.75)]
+    modes.append(Laplace(50 * torch.ones(2, dtype=torch.float64), eye, 0.25))
+    found = run_batched(
+        two, free(2), modes=modes, num_samples=100, num_chains=16, num_warmup=60, seed=1, kernel=kernel
+    ).alpha
+    right = found[:, :, 0] > 0
+    assert bool((right.all(1) | ~right.any(1)).all())
+    assert int(right[:, 0].sum()) == 4
+    within = found[~right[:, 0]] + 50
+    ess = float(diagnostics.bulk_ess(within).min())
+    assert ess > 300  # 1200 draws; coordinates that were as wide as the gap would leave next to none
+    assert abs(float(within.std()) - 1) < 5 / math.sqrt(2 * ess)
+
+
+@KERNELS
+def test_sampling_goes_on_until_there_is_enough(kernel):
+    def enough(alpha, groups):
+        assert groups.shape == (4,)
+        sizes.append(alpha.shape[1])
+        return 500 / (alpha.shape[0] * alpha.shape[1])
+
+    sizes = []
+    draws = run(
+        lambda u: -0.5 * u.square().sum(-1), 2, num_samples=1000, num_chains=4, enough=enough, kernel=kernel
+    ).alpha
+    assert sizes[0] == 100
+    assert sizes[-1] == draws.shape[1]
+    assert 125 <= draws.shape[1] < 200
+    sizes.clear()
+    draws = run(
+        lambda u: -0.5 * u.square().sum(-1), 2, num_samples=110, num_chains=4, enough=enough, kernel=kernel
+    ).alpha
+    assert draws.shape[1] == 110  # never more than num_samples
+
+
+def test_sampling_gives_up_where_more_draws_do_not_help():
+    draws = run(
+        lambda u: -0.5 * u.square().sum(-1), 2, num_samples=100_000, num_chains=4, enough=lambda alpha, groups: 2.0
+    ).alpha
+    assert draws.shape[1] < 1000
+
+
+def test_the_trajectory_length_is_that_of_the_density():
+    """A quarter period in white coordinates; longer where one direction is 20 times as wide as the others."""
+    def length(factor):
+        eye = torch.eye(len(factor), dtype=torch.float64)
+        space = Whitened(normal_with_factor(factor), 0 * eye[0], eye)
+        generator = torch.Generator().manual_seed(0)
+        z = torch.randn(64, len(factor), dtype=torch.float64, generator=generator) @ factor.T
+        state = hmc_step.init(z, space.potential)
+        return hmc_step.tuned_length(
+            state, space.potential, torch.zeros(64, dtype=torch.long), step_size=0.5, generator=generator
+        )[0]
+
+    white = length(torch.eye(5, dtype=torch.float64))
+    assert 0.5 * hmc_step.QUARTER <= white <= 1.5 * hmc_step.QUARTER
+    wide = length(torch.diag(torch.tensor([1, 1, 1, 1, 4], dtype=torch.float64)))
+    assert wide > white

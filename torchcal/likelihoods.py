@@ -334,11 +334,13 @@ class Full(Likelihood):
             extra = extra + noise.square()
         # A floor relative to the largest variance keeps the factor finite where outputs move as one.
         floor = 1e-10 * covariance.diagonal(dim1=-2, dim2=-1).amax(-1, keepdim=True)
-        factor = torch.linalg.cholesky(covariance + torch.diag_embed(extra + floor))
+        # Samples that overflowed have no covariance: that trial is impossible, and the others of its batch go on.
+        factor, info = torch.linalg.cholesky_ex(covariance + torch.diag_embed(extra + floor))
         white = torch.linalg.solve_triangular(factor, (y - samples).transpose(-1, -2), upper=False)
         log_det = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)
         kernels = -0.5 * white.square().sum(-2)
-        return kernels.logsumexp(-1) - math.log(count) - log_det - 0.5 * n * math.log(2 * math.pi)
+        value = kernels.logsumexp(-1) - math.log(count) - log_det - 0.5 * n * math.log(2 * math.pi)
+        return torch.where((info == 0) & torch.isfinite(value), value, -torch.inf)
 
 
 _KERNEL_FLOOR = 1e-6

@@ -27,9 +27,10 @@ def calibrate_additive(
     recording: Recording,
     *,
     fixed: Mapping[str, float] | None = None,
-    num_samples: int = 1000,
-    num_chains: int = 4,
+    num_samples: int | None = None,
+    num_chains: int | None = None,
     num_warmup: int | None = None,
+    target_ess: float | None = None,
     num_starts: int = 32,
     seed: int = 0,
     device: torch.device | str | None = None,
@@ -48,15 +49,19 @@ def calibrate_additive(
         simulator: The model, as for `torchcal.calibrate`.
         recording: The data. A known noise sd s adds s² to σ².
         fixed: Parameters to hold.
-        num_samples: Posterior draws a chain; 0 for the MAP alone.
-        num_chains: Chains.
+        num_samples: Posterior draws a chain; 0 for the MAP alone; by default 1000. With ``target_ess`` the most of
+            them, by default 20,000.
+        num_chains: Chains; by default 4, and with ``target_ess`` up to 256.
         num_warmup: Draws thrown away a chain.
+        target_ess: Draw until the effective sample size of every α, bulk and tail, is at least this and every R-hat
+            below 1.01.
         num_starts: Starting points of the optimiser.
         seed: Of every random number.
         device: Where the tensors live.
         dtype: Of the sampler's arithmetic; the maximum is always found in float64.
-        sampler: ``"nuts"``, all chains as one batched tensor program; or ``"pyro"``, Pyro's NUTS on the Pyro model,
-            chain after chain, which is the reference.
+        sampler: ``"nuts"``, all chains as one batched tensor program; ``"hmc"``, the same with one trajectory length
+            for all chains, faster where many draws of a few α are wanted; or ``"pyro"``, Pyro's NUTS on the Pyro
+            model, chain after chain, which is the reference.
         target_accept: Mean acceptance that the step size aims at, between 0 and 1; by default 0.8, and more where
             trajectories diverge.
         progress: Whether to show a bar.
@@ -65,7 +70,9 @@ def calibrate_additive(
         ImproperPosteriorError: If the model fits the data exactly, or has as many parameters as there are data:
             the likelihood then grows without limit as σ → 0.
     """
-    plan = Plan(num_samples, num_chains, num_warmup, sampler, seed, dtype, target_accept, progress)
+    plan = Plan(
+        num_samples, num_chains, num_warmup, sampler, seed, dtype, target_accept, progress, target_ess
+    )
     check_run(num_starts, device)
     simulator, free = check_inputs(simulator, recording, fixed)
     observed = recording.observed
@@ -98,7 +105,7 @@ def calibrate_additive(
     )
     estimate = maximise(problem, fit.scaled, starts=None, num_starts=num_starts, seed=seed, progress=progress)
     draws = None
-    if num_samples:
+    if plan.samples:
         draws = draw(problem, estimate, models.additive, plan)
     names = (*propagate.pattern.names, "ln sigma")
     samples = None if draws is None else draws.alpha

@@ -1,20 +1,23 @@
-"""Batched No-U-Turn sampling: many chains at once, step size and coordinates adapted across them."""
+"""Batched sampling: many chains as one tensor program, step size and coordinates adapted across them."""
 
 import math
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchcal.errors import ConvergenceError, ConvergenceWarning
-from torchcal.inference import nuts_step
+from torchcal.inference import hmc_step, nuts_step
+from torchcal.inference.coordinates import Laplace, Whitened, starting_points
 from torchcal.inference.draws import Draws
+from torchcal.inference.nuts_step import Outcome
 from torchcal.priors import Bounds
 
-__all__ = ["run_batched_nuts"]
+__all__ = ["MOST_ELEMENTS", "run_batched"]
 
 _WINDOWS = (0.3, 0.3, 0.4)
 """Shares of the warm-up: two windows that end in new coordinates, and one that sets the step size for good."""
@@ -24,6 +27,15 @@ DIVERGING = 5e-4
 
 _WARM_UP_CHAINS = 64
 """Chains that adapt together: pooled draws make the covariance reliable after a few transitions each."""
+
+MOST_ELEMENTS = 2**22
+"""Numbers that one evaluation of all chains may handle where the number of chains is ours to choose."""
+
+_ENOUGH = 1.05
+"""Draws that are taken over those that a wanted sample size seems to need."""
+
+_STUCK = 0.8
+"""Where more draws leave this much of what was missing, twice in a row, chains stay apart, and more do not help."""
 
 
 @dataclass
@@ -53,55 +65,88 @@ class _DualAveraging:
         return math.exp(min(self.log_step, 3.0))
 
 
-class _Whitened:
-    """A log-density in coordinates z with u = loc + scale_tril z, with its gradient for the sampler."""
+class _Kernel(Protocol):
+    """Moves all chains on; every call finishes some of their transitions."""
 
-    def __init__(self, log_density: Callable[[Tensor], Tensor], loc: Tensor, scale_tril: Tensor) -> None:
-        self.log_density, self.loc, self.scale_tril = log_density, loc, scale_tril
+    def init(self, z: Tensor, space: Whitened, step_size: float) -> Any: ...
 
-    def potential(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        leaf = z.detach().requires_grad_(True)
-        with torch.enable_grad():
-            energy = -self.log_density(self.outer(leaf))
-            (slope,) = torch.autograd.grad(energy.sum(), leaf)
-        energy = energy.detach()
-        good = torch.isfinite(energy) & torch.isfinite(slope).all(-1)
-        return torch.where(good, energy, torch.inf), torch.where(good[:, None], slope, 0.0)
+    def step(self, state: Any, space: Whitened, step_size: float) -> tuple[Any, Outcome]: ...
 
-    def outer(self, z: Tensor) -> Tensor:
-        return self.loc + z @ self.scale_tril.T
+    def positions(self, state: Any) -> Tensor: ...
 
-    def refined(self, z: Tensor) -> tuple["_Whitened", Tensor]:
-        """Coordinates in which the pooled draws z ``(S, P)`` are white, and the map of positions into them."""
-        count, size = z.shape
-        mean = z.mean(0)
-        offset = z - mean
-        identity = torch.eye(size, dtype=z.dtype, device=z.device)
-        # Shrunk to what the coordinates assume already, with the weight of a few draws (as in Stan).
-        covariance = (offset.T @ offset + 5 * identity) / (count + 5)
-        factor = torch.linalg.cholesky(covariance)
-        other = _Whitened(self.log_density, self.outer(mean), self.scale_tril @ factor)
-        return other, factor
-
-    def moved(self, z: Tensor, other: "_Whitened") -> Tensor:
-        """Positions z of these coordinates in the other ones."""
-        offset = (self.outer(z) - other.loc).T
-        return torch.linalg.solve_triangular(other.scale_tril, offset, upper=False).T
+    def tune(self, z: Tensor, groups: Tensor, space: Whitened, step_size: float) -> Tensor: ...
 
 
-def run_batched_nuts(
+class _NUTS:
+    """See `nuts_step`. Trees are short at first: a step size that starts far too small must not cost thousands."""
+
+    def __init__(self, max_tree_depth: int, device: torch.device, generator: torch.Generator) -> None:
+        self.generator = generator
+        self.full = nuts_step.Tables.build(max_tree_depth, device)
+        self.tables = nuts_step.Tables.build(min(max_tree_depth, 6), device)
+
+    def init(self, z: Tensor, space: Whitened, step_size: float) -> nuts_step.State:
+        return nuts_step.init(
+            z, space.potential, step_size=step_size, tables=self.tables, generator=self.generator
+        )
+
+    def step(
+        self, state: nuts_step.State, space: Whitened, step_size: float
+    ) -> tuple[nuts_step.State, Outcome]:
+        return nuts_step.step(
+            state, space.potential, step_size=step_size, tables=self.tables, generator=self.generator
+        )
+
+    def positions(self, state: nuts_step.State) -> Tensor:
+        return state.proposal[:, 0]
+
+    def tune(self, z: Tensor, groups: Tensor, space: Whitened, step_size: float) -> Tensor:
+        self.tables = self.full
+        return z
+
+
+class _HMC:
+    """See `hmc_step`."""
+
+    def __init__(self, generator: torch.Generator) -> None:
+        self.generator = generator
+        self.length = hmc_step.QUARTER
+
+    def init(self, z: Tensor, space: Whitened, step_size: float) -> hmc_step.State:
+        return hmc_step.init(z, space.potential)
+
+    def step(
+        self, state: hmc_step.State, space: Whitened, step_size: float
+    ) -> tuple[hmc_step.State, Outcome]:
+        return hmc_step.step(
+            state, space.potential, step_size=step_size, length=self.length, generator=self.generator
+        )
+
+    def positions(self, state: hmc_step.State) -> Tensor:
+        return state.position
+
+    def tune(self, z: Tensor, groups: Tensor, space: Whitened, step_size: float) -> Tensor:
+        state = self.init(z, space, step_size)
+        self.length, state = hmc_step.tuned_length(
+            state, space.potential, groups, step_size=step_size, generator=self.generator
+        )
+        return state.position
+
+
+def run_batched(
     log_density: Callable[[Tensor], Tensor],
     transform: Bounds,
     *,
-    loc: Tensor,
-    scale_tril: Tensor,
+    modes: Sequence[Laplace],
     num_samples: int,
     num_chains: int,
     num_warmup: int,
     seed: int,
+    kernel: str = "nuts",
     cost: int = 1,
     target_accept: float | None = None,
     max_tree_depth: int = 10,
+    enough: Callable[[Tensor, Tensor], float] | None = None,
     progress: bool = False,
 ) -> Draws:
     """Draw from a density of unbounded coordinates u.
@@ -109,73 +154,52 @@ def run_batched_nuts(
     Args:
         log_density: ``u (C, P) -> (C,)``, the transform's Jacobian included.
         transform: From u to α.
-        loc: Where chains start, ``(P,)``.
-        scale_tril: Their spread, ``(P, P)``: the Laplace approximation.
-        num_samples: Draws a chain.
+        modes: Normal approximations that chains start from, the best first: its covariance is the first metric.
+        num_samples: Draws a chain; the most of them where ``enough`` is given.
         num_chains: Chains.
         num_warmup: Transitions of a chain that are thrown away.
         seed: Of every random number.
+        kernel: ``"nuts"`` or ``"hmc"``.
         cost: Numbers that one evaluation of one chain handles; dear densities warm up with fewer chains.
         target_accept: Mean acceptance that the step size aims at; by default 0.8, and more where trajectories
             diverge at the end of the warm-up: a curved ridge needs smaller steps than its width suggests.
-        max_tree_depth: Largest depth of a trajectory, 2**depth steps.
+        max_tree_depth: Largest depth of a No-U-Turn tree, 2**depth steps.
+        enough: From the draws so far, α ``(C, n, P)``, and the mode that each chain began at ``(C,)``, to the factor
+            by which there must be more; at most 1 when there are enough.
         progress: Whether to show a bar.
 
     Raises:
-        ConvergenceError: If the density is not finite around ``loc``, or it was interrupted before any draw.
+        ConvergenceError: If the density is not finite around a mode, or it was interrupted before any draw.
     """
-    device = loc.device
-    generator = torch.Generator(device=device).manual_seed(seed)
-    tables = nuts_step.Tables.build(max_tree_depth, device)
-    crowd = max(num_chains, min(_WARM_UP_CHAINS, max(4, 2**22 // max(1, cost))))
-    space = _Whitened(log_density, loc, scale_tril)
-    z = _starting_points(space, crowd, generator)
-    accept = 0.8 if target_accept is None else target_accept
-    averaging = _DualAveraging(math.log(0.5), accept)
-    bar = tqdm(total=num_warmup + num_samples, desc="NUTS", disable=not progress, leave=False)
-    stored = torch.full((num_samples, num_chains, len(loc)), torch.nan, dtype=loc.dtype, device=device)
-    filled = torch.zeros(num_chains, dtype=torch.long, device=device)
-    divergences = steps = 0
+    loc = modes[0].loc
+    generator = torch.Generator(device=loc.device).manual_seed(seed)
+    moves: _Kernel = _HMC(generator) if kernel == "hmc" else _NUTS(max_tree_depth, loc.device, generator)
+    crowd = max(num_chains, min(_WARM_UP_CHAINS, max(4, MOST_ELEMENTS // max(1, cost))))
+    bar = tqdm(total=num_warmup + num_samples, desc=kernel.upper(), disable=not progress, leave=False)
+    collector = _Collector(num_chains, len(loc), loc)
     try:
-        for number, share in enumerate(_WINDOWS):
-            length = max(4, round(share * num_warmup))
-            # Short trees at first: a step size that starts far too small must not cost thousands of gradients.
-            depth = min(max_tree_depth, 6) if number == 0 else max_tree_depth
-            window = nuts_step.Tables.build(depth, device)
-            pooled, z, diverging = _adapt(space, z, averaging, length, window, generator, bar)
-            if number < len(_WINDOWS) - 1:
-                other, _ = space.refined(pooled)
-                z = space.moved(z, other)
-                space = other
-                averaging = _DualAveraging(averaging.averaged, accept)
-        while target_accept is None and diverging > DIVERGING and accept < 0.98:
-            accept = 0.5 * (1 + accept)
-            averaging = _DualAveraging(averaging.averaged, accept)
-            _, z, diverging = _adapt(space, z, averaging, length, window, generator, bar)
-        step_size = math.exp(averaging.averaged)
-        state = nuts_step.init(
-            z[:num_chains], space.potential, step_size=step_size, tables=tables, generator=generator
-        )
-        rows = torch.arange(num_chains, device=device)
-        while int(filled.min()) < num_samples:
-            state, outcome = nuts_step.step(
-                state, space.potential, step_size=step_size, tables=tables, generator=generator
-            )
-            steps += 1
-            take = outcome.done & (filled < num_samples)
-            chosen = rows[take]
-            if not len(chosen):
-                continue
-            before = int(filled.min())
-            stored[filled[chosen], chosen] = outcome.position[chosen]
-            filled[chosen] += 1
-            divergences += int((outcome.divergent & take).sum())
-            bar.update(int(filled.min()) - before)
+        space = Whitened(log_density, loc, modes[0].scale_tril)
+        z, groups = starting_points(space, modes, crowd, generator)
+        space, z, step_size = _warm_up(moves, space, z, groups, num_warmup, target_accept, bar)
+        state = moves.init(z[:num_chains], space, step_size)
+        goal = num_samples if enough is None else min(num_samples, 100)
+        before, stuck = math.inf, 0
+        while True:
+            state = collector.collect(moves, state, space, step_size, goal, bar)
+            if enough is None or goal == num_samples:
+                break
+            more = enough(_alpha(collector.draws(goal), space, transform), groups[:num_chains])
+            stuck = stuck + 1 if more > _STUCK * before else 0
+            if more <= 1 or stuck == 2:
+                break
+            before = more
+            goal = min(num_samples, math.ceil(goal * min(max(_ENOUGH * more, 1.15), 8.0)))
+        stored = collector.draws(goal)
     except KeyboardInterrupt:
-        have = int(filled.min())
+        have = collector.least
         if have < 4:
             raise ConvergenceError("The sampler was interrupted before it had drawn anything.") from None
-        stored = stored[:have]
+        stored = collector.draws(have)
         warnings.warn(
             f"The sampler was interrupted. It keeps {have} of {num_samples} draws of each of {num_chains} chains.",
             ConvergenceWarning,
@@ -183,45 +207,56 @@ def run_batched_nuts(
         )
     finally:
         bar.close()
-    alpha = transform.bound(space.outer(stored)).transpose(0, 1)
-    return Draws(alpha.detach().to(device="cpu", dtype=torch.float64), divergences)
+    return Draws(_alpha(stored, space, transform), collector.divergences(len(stored)))
 
 
-def _starting_points(space: _Whitened, count: int, generator: torch.Generator) -> Tensor:
-    """Draws of the normal approximation, drawn in where the density is not finite there."""
-    z = torch.randn((count, len(space.loc)), dtype=space.loc.dtype, device=space.loc.device, generator=generator)
-    for _ in range(20):
-        bad = ~torch.isfinite(space.potential(z)[0])
-        if not bool(bad.any()):
-            return z
-        z = torch.where(bad[:, None], 0.5 * z, z)
-    raise ConvergenceError(
-        "Expected a finite posterior around the best point found. Got none. Look at the simulator there."
-    )
+def _alpha(z: Tensor, space: Whitened, transform: Bounds) -> Tensor:
+    alpha = transform.bound(space.outer(z)).transpose(0, 1)
+    return alpha.detach().to(device="cpu", dtype=torch.float64)
+
+
+def _warm_up(
+    moves: _Kernel,
+    space: Whitened,
+    z: Tensor,
+    groups: Tensor,
+    num_warmup: int,
+    target_accept: float | None,
+    bar: tqdm,
+) -> tuple[Whitened, Tensor, float]:
+    """Coordinates, positions in them, and the step size."""
+    accept = 0.8 if target_accept is None else target_accept
+    averaging = _DualAveraging(math.log(0.5), accept)
+    diverging, length = 0.0, 0
+    for number, share in enumerate(_WINDOWS):
+        length = max(4, round(share * num_warmup))
+        pooled, owners, z, diverging = _adapt(moves, space, z, averaging, length, bar)
+        if number < len(_WINDOWS) - 1:
+            other = space.refined(pooled, groups[owners])
+            z = other.inner(space.outer(z))
+            space = other
+            z = moves.tune(z, groups, space, math.exp(averaging.averaged))
+            averaging = _DualAveraging(averaging.averaged, accept)
+    while target_accept is None and diverging > DIVERGING and accept < 0.98:
+        accept = 0.5 * (1 + accept)
+        averaging = _DualAveraging(averaging.averaged, accept)
+        _, _, z, diverging = _adapt(moves, space, z, averaging, length, bar)
+    return space, z, math.exp(averaging.averaged)
 
 
 def _adapt(
-    space: _Whitened,
-    z: Tensor,
-    averaging: _DualAveraging,
-    length: int,
-    tables: nuts_step.Tables,
-    generator: torch.Generator,
-    bar: tqdm,
-) -> tuple[Tensor, Tensor, float]:
-    """One warm-up window: the draws of its second half, where every chain is, and the share that diverged in it."""
+    moves: _Kernel, space: Whitened, z: Tensor, averaging: _DualAveraging, length: int, bar: tqdm
+) -> tuple[Tensor, Tensor, Tensor, float]:
+    """One warm-up window: draws of its second half, whose they are, where all chains end, and the share diverged."""
     chains = len(z)
-    state = nuts_step.init(
-        z, space.potential, step_size=averaging.step_size, tables=tables, generator=generator
-    )
+    state = moves.init(z, space, averaging.step_size)
     finished = shown = 0
     pooled: list[Tensor] = []
+    owners: list[Tensor] = []
     accepted: list[Tensor] = []
     waiting = diverged = 0
     while finished < length * chains:
-        state, outcome = nuts_step.step(
-            state, space.potential, step_size=averaging.step_size, tables=tables, generator=generator
-        )
+        state, outcome = moves.step(state, space, averaging.step_size)
         count = int(outcome.done.sum())
         if not count:
             continue
@@ -236,8 +271,52 @@ def _adapt(
             waiting = 0
         if finished > length * chains // 2:
             pooled.append(outcome.position[outcome.done])
+            owners.append(outcome.done.nonzero()[:, 0])
             diverged += int(outcome.divergent.sum())
         bar.update(finished // chains - shown)
         shown = finished // chains
     draws = torch.cat(pooled)
-    return draws, state.proposal[:, 0], diverged / len(draws)
+    return draws, torch.cat(owners), moves.positions(state), diverged / len(draws)
+
+
+class _Collector:
+    """Draws of chains that need not be equally far, ``(n, C, P)``; room grows as it is needed.
+
+    What a chain draws while others catch up is kept for later: the draw that ends next after some fixed time would
+    more often be one of a long trajectory.
+    """
+
+    def __init__(self, chains: int, size: int, like: Tensor) -> None:
+        self.stored = like.new_empty((64, chains, size))
+        self.filled = torch.zeros(chains, dtype=torch.long, device=like.device)
+        self.rows = torch.arange(chains, device=like.device)
+        self.diverged = torch.zeros((64, chains), dtype=torch.bool, device=like.device)
+        self.least = 0
+
+    def collect(
+        self, moves: _Kernel, state: Any, space: Whitened, step_size: float, goal: int, bar: tqdm
+    ) -> Any:
+        """Go on until every chain has ``goal`` draws."""
+        while self.least < goal:
+            state, outcome = moves.step(state, space, step_size)
+            chosen = self.rows[outcome.done]
+            if not len(chosen):
+                continue
+            if int(self.filled.max()) == len(self.stored):
+                self.stored = torch.cat([self.stored, torch.empty_like(self.stored)])
+                self.diverged = torch.cat([self.diverged, torch.zeros_like(self.diverged)])
+            self.stored[self.filled[chosen], chosen] = outcome.position[chosen]
+            self.diverged[self.filled[chosen], chosen] = outcome.divergent[chosen]
+            self.filled[chosen] += 1
+            least = int(self.filled.min())
+            bar.update(least - self.least)
+            self.least = least
+        return state
+
+    def draws(self, count: int) -> Tensor:
+        """The first draws of every chain."""
+        return self.stored[:count]
+
+    def divergences(self, count: int) -> int:
+        """How many of them ended a divergent trajectory."""
+        return int(self.diverged[:count].sum())

@@ -45,9 +45,10 @@ def calibrate(
     likelihood: likelihoods.Likelihood | str = "abc",
     prior: PriorMaker = Flat,
     fixed: Mapping[str, float] | None = None,
-    num_samples: int = 1000,
-    num_chains: int = 4,
+    num_samples: int | None = None,
+    num_chains: int | None = None,
     num_warmup: int | None = None,
+    target_ess: float | None = None,
     order: int | None = None,
     rule: Any = None,
     starts: Tensor | None = None,
@@ -74,10 +75,13 @@ def calibrate(
             data's sd.
         prior: A function from the propagation to a prior on α, such as a class of `torchcal.priors`.
         fixed: Parameters to hold, ``{name: physical value}``.
-        num_samples: Posterior draws a chain; 0 for the MAP alone.
-        num_chains: Chains.
+        num_samples: Posterior draws a chain; 0 for the MAP alone; by default 1000. With ``target_ess`` the most of
+            them, by default 20,000.
+        num_chains: Chains; by default 4, and with ``target_ess`` up to 256.
         num_warmup: Draws thrown away a chain; by default 100, and half of ``num_samples`` but at least 300 for
             ``sampler="pyro"``.
+        target_ess: Draw until the effective sample size of every α, bulk and tail, is at least this and every R-hat
+            below 1.01.
         order: Degree of the output expansion; None for the full variance, 1 as in the paper's case studies.
         rule: Quadrature, see `torchcal.NISP`; by default found by itself.
         starts: Starting points of the optimiser ``(S, P)`` in scaled coordinates; by default made.
@@ -85,8 +89,9 @@ def calibrate(
         seed: Of every random number; the global state is left as it was.
         device: Where the tensors live; the CPU by default.
         dtype: Of the sampler's arithmetic; the maximum is always found in float64.
-        sampler: ``"nuts"``, all chains as one batched tensor program; or ``"pyro"``, Pyro's NUTS on the Pyro model,
-            chain after chain, which is the reference.
+        sampler: ``"nuts"``, all chains as one batched tensor program; ``"hmc"``, the same with one trajectory length
+            for all chains, faster where many draws of a few α are wanted; or ``"pyro"``, Pyro's NUTS on the Pyro
+            model, chain after chain, which is the reference.
         target_accept: Mean acceptance that the step size aims at, between 0 and 1; by default 0.8, and more where
             trajectories diverge.
         progress: Whether to show a bar.
@@ -105,7 +110,9 @@ def calibrate(
 
     Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276.
     """
-    plan = Plan(num_samples, num_chains, num_warmup, sampler, seed, dtype, target_accept, progress)
+    plan = Plan(
+        num_samples, num_chains, num_warmup, sampler, seed, dtype, target_accept, progress, target_ess
+    )
     check_run(num_starts, device)
     embedding = Gaussian() if embedding is None else embedding
     if not isinstance(embedding, Embedding):
@@ -151,11 +158,9 @@ def calibrate(
     propagate = problem.propagate
     draws: Draws | None = None
     samples: Tensor | None = None
-    if num_samples:
+    if plan.samples:
         draws = draw(problem, estimate, models.embedded, plan)
         samples = draws.alpha
-        if problem.prior.symmetric:
-            samples = propagate.pattern.flip(samples, estimate.alpha.to(samples))
     check = _check_propagation(propagate, estimate.alpha, samples)
     prediction = embedded_prediction(propagate, estimate.alpha, None if samples is None else samples.flatten(0, 1))
     quality = diagnose(estimate, draws, samples, propagate, propagate.alpha_names, check)

@@ -4,12 +4,21 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from torchcal.results.diagnostics import Mode
+
 __all__ = ["Draws"]
 
 
 @dataclass(frozen=True)
 class Draws:
-    """Posterior draws of α ``(chains, draws, P)`` and the number of divergent transitions."""
+    """Posterior draws.
+
+    Attributes:
+        alpha: ``(chains, draws, P)``.
+        divergences: Number of divergent transitions among them.
+        modes: Where chains began.
+    """
 
     alpha: Tensor
     divergences: int
+    modes: tuple[Mode, ...] = ()

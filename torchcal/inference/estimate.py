@@ -10,7 +10,8 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchcal.errors import ConvergenceError, ConvergenceWarning, IdentifiabilityWarning, ShapeError
-from torchcal.inference.newton import Minima, hessian, minimise
+from torchcal.inference.coordinates import Laplace
+from torchcal.inference.newton import Minima, gradient, hessian, minimise
 from torchcal.inference.randomness import preserve_random_state
 from torchcal.inference.tangent import search
 from torchcal.models import Problem
@@ -18,7 +19,7 @@ from torchcal.propagation import NISP
 from torchcal.results.in_time import refine_in_time
 from torchcal.simulators import Trajectories
 
-__all__ = ["Estimate", "Laplace", "check_starts", "laplace", "maximise"]
+__all__ = ["Estimate", "check_starts", "laplace", "maximise", "modes_of"]
 
 NULL_CURVATURE = 1e-7
 """Curvature, relative to the largest, below which a direction counts as not seen by the data. The differences
@@ -26,6 +27,15 @@ behind the Hessian are good to about 1e-9 of its largest entry."""
 
 AGREEMENT = 1e-6
 """Relative difference of objectives up to which two starts count as the same maximum."""
+
+MODE_GAP = 15.0
+"""Log-posterior below the best from which on a maximum is not worth a chain, unless it is a million times wider."""
+
+LEAST_WEIGHT = 1e-3
+"""Share of the posterior from which on a mode gets chains."""
+
+MOST_MODES = 6
+"""Maxima that are looked at."""
 
 SAME_MEANS = 1e-3
 """Difference of scaled means up to which two starts ended at one maximum."""
@@ -45,6 +55,7 @@ class Estimate:
         null_directions: Unit vectors in α along which the log-posterior does not change, ``(k, P)``.
         unseen: Names of parameters whose means the data do not determine.
         improper: Those of them that no bounds hold either, or whose spread is as free.
+        others: Where the other starts ended, if not far below the best, ``(k, P)``.
     """
 
     alpha: Tensor
@@ -56,14 +67,7 @@ class Estimate:
     null_directions: Tensor
     unseen: tuple[str, ...]
     improper: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Laplace:
-    """A normal approximation in the sampler's unbounded coordinates: ``loc`` and the factor of its covariance."""
-
-    loc: Tensor
-    scale_tril: Tensor
+    others: Tensor
 
 
 def maximise(
@@ -158,6 +162,7 @@ def maximise(
         null_directions=null,
         unseen=unseen,
         improper=_unheld(problem, unseen),
+        others=transform.bound(found.points[found.values - found.values[0] < MODE_GAP]),
     )
 
 
@@ -268,13 +273,52 @@ def _starting_points(problem: Problem, leading: Tensor, num_starts: int, seed: i
     return torch.maximum(torch.minimum(points, high - inner), low + inner)
 
 
-def laplace(problem: Problem, estimate: Estimate) -> Laplace:
-    """The normal approximation at the mode in the sampler's coordinates, which differ from α at bounds only.
+def modes_of(problem: Problem, estimate: Estimate) -> list[Laplace]:
+    """Normal approximations at the separate maxima that starts have found, best first, weights adding up to one.
 
-    Directions that the data do not see get one unit of scaled coordinates, rather than an infinite width.
+    Each weight is the integral of the approximation, density times width. Where an end of a start is no maximum yet (a
+    long flat valley), or is one of the others seen through a reversed germ, it does not count.
+    """
+    pattern = problem.propagate.pattern
+    best, height = laplace(problem, estimate.alpha)
+    found, heights = [best], [height]
+    ends = estimate.others
+    if problem.prior.symmetric and pattern.num_germs:
+        ends = pattern.flip(ends, estimate.alpha)
+
+    def objective(u: Tensor) -> Tensor:
+        return -problem.log_prob(problem.prior.transform.bound(u)) - problem.prior.transform.log_slope(u)
+
+    for end in ends:
+        start = problem.prior.transform.unbound(end)
+        if any(_apart(start, mode) < 1 for mode in found) or len(found) == MOST_MODES:
+            continue
+        mode, height = laplace(problem, end)
+        slope = gradient(objective, mode.loc[None])[1][0]
+        if any(_apart(mode.loc, other) < 1 for other in found) or float((mode.scale_tril.T @ slope).norm()) > 0.1:
+            continue
+        found.append(mode)
+        heights.append(height)
+    share = torch.tensor(heights, dtype=torch.float64).softmax(0)
+    kept = [(mode, float(w)) for mode, w in zip(found, share, strict=True) if mode is best or w >= LEAST_WEIGHT]
+    total = sum(w for _, w in kept)
+    return [Laplace(mode.loc, mode.scale_tril, w / total) for mode, w in kept]
+
+
+def _apart(point: Tensor, mode: Laplace) -> float:
+    """Distance from a mode in its own widths."""
+    offset = (point - mode.loc)[:, None]
+    return float(torch.linalg.solve_triangular(mode.scale_tril, offset, upper=False).norm())
+
+
+def laplace(problem: Problem, alpha: Tensor) -> tuple[Laplace, float]:
+    """The normal approximation at a mode in the sampler's coordinates, which differ from α at bounds only.
+
+    Directions that the data do not see get one unit of scaled coordinates, rather than an infinite width. With it
+    comes the logarithm of its integral, up to a constant.
     """
     transform = problem.prior.transform
-    loc = transform.unbound(estimate.alpha)
+    loc = transform.unbound(alpha)
 
     def objective(u: Tensor) -> Tensor:
         return -problem.log_prob(transform.bound(u)) - transform.log_slope(u)
@@ -286,4 +330,7 @@ def laplace(problem: Problem, estimate: Estimate) -> Laplace:
     values, vectors = torch.linalg.eigh(curvature)
     values = values.abs().clamp_min(max(1.0, 1e-12 * float(values.abs().max())))
     covariance = (vectors / values) @ vectors.T
-    return Laplace(loc, torch.linalg.cholesky(0.5 * (covariance + covariance.T)))
+    factor = torch.linalg.cholesky(0.5 * (covariance + covariance.T))
+    with torch.no_grad():
+        height = -float(objective(loc[None])[0]) + float(factor.diagonal().log().sum())
+    return Laplace(loc, factor), height

@@ -1,20 +1,31 @@
 """Which sampler draws, from where, and how much."""
 
+import math
 import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from torchcal import models
 from torchcal.errors import ConvergenceWarning, DomainError, ImproperPosteriorError
-from torchcal.inference.batched import run_batched_nuts
+from torchcal.inference.batched import MOST_ELEMENTS, run_batched
+from torchcal.inference.coordinates import Laplace
+from torchcal.inference.diagnostics import bulk_ess, r_hat, tail_ess
 from torchcal.inference.draws import Draws
-from torchcal.inference.estimate import Estimate, Laplace, laplace
+from torchcal.inference.estimate import Estimate, modes_of
 from torchcal.inference.nuts import run_nuts
 from torchcal.models import Problem
+from torchcal.results.diagnostics import R_HAT_THRESHOLD, Mode
 
 __all__ = ["Plan", "draw"]
+
+_FEWEST_CHAINS, _MOST_CHAINS = 32, 256
+"""Where there is a target: so few chains cost no more than one, and so many use all of a core."""
+
+MOST_DRAWS = 20_000
+"""Draws of a chain at which a search for a wanted sample size gives up."""
 
 
 @dataclass(frozen=True)
@@ -22,31 +33,33 @@ class Plan:
     """How much to draw, how, and with which seed. Checked when it is made.
 
     Attributes:
-        num_samples: Draws a chain; 0 for none.
-        num_chains: Chains.
+        num_samples: Draws a chain, the most of them where there is a target; 0 for none; None to choose.
+        num_chains: Chains; None to choose.
         num_warmup: Draws thrown away a chain; None for the sampler's default.
-        sampler: ``"nuts"`` or ``"pyro"``.
+        sampler: ``"nuts"``, ``"hmc"`` or ``"pyro"``.
         seed: Of every random number.
         dtype: Of the sampler's arithmetic.
         target_accept: Mean acceptance that the step size aims at; None to choose.
         progress: Whether to show a bar.
+        target_ess: Effective sample size of the worst α at which to stop, or None.
     """
 
-    num_samples: int
-    num_chains: int
+    num_samples: int | None
+    num_chains: int | None
     num_warmup: int | None
     sampler: str
     seed: int
     dtype: torch.dtype
     target_accept: float | None
     progress: bool
+    target_ess: float | None = None
 
     def __post_init__(self) -> None:
-        if self.sampler not in ("nuts", "pyro"):
-            raise DomainError(f"Expected sampler 'nuts' or 'pyro'. Got {self.sampler!r}.")
+        if self.sampler not in ("nuts", "hmc", "pyro"):
+            raise DomainError(f"Expected sampler 'nuts', 'hmc' or 'pyro'. Got {self.sampler!r}.")
         for name, least in (("num_samples", 0), ("num_chains", 1), ("num_warmup", 1), ("seed", 0)):
             value = getattr(self, name)
-            if name == "num_warmup" and value is None:
+            if name != "seed" and value is None:
                 continue
             if isinstance(value, bool) or not isinstance(value, int) or value < least:
                 raise DomainError(f"Expected {name} as an integer of at least {least}. Got {value!r}.")
@@ -55,43 +68,123 @@ class Plan:
         accept = self.target_accept
         if accept is not None and not (isinstance(accept, float) and 0 < accept < 1):
             raise DomainError(f"Expected target_accept between 0 and 1, or None. Got {accept!r}.")
+        if self.target_ess is not None:
+            self._check_target(self.target_ess)
+
+    def _check_target(self, target: Any) -> None:
+        if isinstance(target, bool) or not isinstance(target, int | float) or not 0 < target < math.inf:
+            raise DomainError(f"Expected target_ess as a positive number or None. Got {target!r}.")
+        if self.sampler == "pyro":
+            raise DomainError(
+                "Expected sampler 'nuts' or 'hmc' with target_ess=. Got 'pyro', whose chains run one after another: "
+                "give num_samples= and look at the diagnostics."
+            )
+        if self.num_samples == 0:
+            raise DomainError("Expected num_samples of at least 1 with target_ess=. Got 0.")
+
+    @property
+    def samples(self) -> int:
+        """Draws a chain, or the most of them."""
+        if self.num_samples is not None:
+            return self.num_samples
+        return 1000 if self.target_ess is None else MOST_DRAWS
+
+    def chains(self, cost: int) -> int:
+        """Chains; with a target about 200 draws of each are meant to reach it, as R-hat asks for long chains."""
+        if self.num_chains is not None:
+            return self.num_chains
+        if self.target_ess is None:
+            return 4
+        wanted = min(max(_FEWEST_CHAINS, math.ceil(self.target_ess / 200)), _MOST_CHAINS)
+        return max(4, min(wanted, MOST_ELEMENTS // max(1, cost)))
 
     @property
     def warmup(self) -> int:
         """Draws thrown away a chain. Pooled over a crowd, adaptation needs fewer of each than chain by chain."""
         if self.num_warmup is not None:
             return self.num_warmup
-        return 100 if self.sampler == "nuts" else max(300, self.num_samples // 2)
+        return max(300, self.samples // 2) if self.sampler == "pyro" else 100
 
 
 def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
-    """Draw from the posterior of a problem, in coordinates whitened at its mode, as planned."""
+    """Draw from the posterior of a problem, in coordinates whitened at its mode, as planned.
+
+    Germs are reversed, draw by draw, to agree with the maximum where the prior does not tell either way.
+    """
     if estimate.improper:
         raise ImproperPosteriorError(
             "Expected a proper posterior to draw from. Got one that does not change with "
             f"{', '.join(estimate.improper)}, under a flat prior. Hold a parameter with fixed=, use a Uniform prior, "
             "or num_samples=0 for the maximum alone."
         )
-    approximation = laplace(problem, estimate)
+    modes = modes_of(problem, estimate)
     _warn_of_rounding(estimate, plan.dtype)
-    problem = problem.cast(plan.dtype)
-    approximation = Laplace(approximation.loc.to(plan.dtype), approximation.scale_tril.to(plan.dtype))
-    if plan.sampler == "nuts":
-        transform = problem.prior.transform
-        return run_batched_nuts(
-            lambda u: problem.log_prob(transform.bound(u)) + transform.log_slope(u),
+    cast = problem.cast(plan.dtype)
+    starts = [mode.to(plan.dtype) for mode in modes]
+    pattern = problem.propagate.pattern
+
+    def folded(alpha: Tensor) -> Tensor:
+        return pattern.flip(alpha, estimate.alpha.to(alpha)) if problem.prior.symmetric else alpha
+
+    if plan.sampler == "pyro":
+        draws = _draw_with_pyro(cast, starts[0], model, plan)
+    else:
+        transform = cast.prior.transform
+        cost = cast.propagate.num_nodes * len(cast.y)
+        draws = run_batched(
+            lambda u: cast.log_prob(transform.bound(u)) + transform.log_slope(u),
             transform,
-            loc=approximation.loc,
-            scale_tril=approximation.scale_tril,
-            num_samples=plan.num_samples,
-            num_chains=plan.num_chains,
+            modes=starts,
+            num_samples=plan.samples,
+            num_chains=plan.chains(cost),
             num_warmup=plan.warmup,
             seed=plan.seed,
-            cost=problem.propagate.num_nodes * len(problem.y),
+            kernel=plan.sampler,
+            cost=cost,
             target_accept=plan.target_accept,
+            enough=None if plan.target_ess is None else lambda alpha, groups: _more(folded(alpha), plan, groups),
             progress=plan.progress,
         )
-    prior = problem.prior.whitened(approximation.loc, approximation.scale_tril)
+    alpha = folded(draws.alpha)
+    if plan.target_ess is not None and _more(alpha, plan) > 1:
+        ess = float(torch.minimum(bulk_ess(alpha), tail_ess(alpha)).min())
+        warnings.warn(
+            f"Wanted an effective sample size of {plan.target_ess:g} and R-hat below {R_HAT_THRESHOLD}. Got {ess:.0f} "
+            f"and {float(r_hat(alpha).max()):.3f} after {alpha.shape[1]} draws of each of {alpha.shape[0]} chains.",
+            ConvergenceWarning,
+            stacklevel=3,
+        )
+    return Draws(alpha, draws.divergences, tuple(_mode(problem, mode) for mode in modes))
+
+
+def _mode(problem: Problem, mode: Laplace) -> Mode:
+    with torch.no_grad():
+        alpha = problem.prior.transform.bound(mode.loc)
+        objective = -float(problem.log_prob(alpha))
+    return Mode(tuple(alpha.cpu().tolist()), objective, mode.weight)
+
+
+def _more(alpha: Tensor, plan: Plan, groups: Tensor | None = None) -> float:
+    """By which factor draws ``(C, n, P)`` must grow to reach a plan's target; at most 1 if they do.
+
+    With ``groups`` ``(C,)`` draws are judged about the mean of their group. Modes that chains never leave would
+    otherwise keep R-hat up however long they are.
+    """
+    if alpha.shape[1] < 4:
+        return 2.0
+    if groups is not None and int(groups.max()):
+        alpha = alpha.clone()
+        for group in groups.unique():
+            alpha[groups == group] -= alpha[groups == group].mean((0, 1))
+    factor = (plan.target_ess or 0.0) / float(torch.minimum(bulk_ess(alpha), tail_ess(alpha)).min())
+    excess = float(r_hat(alpha).max()) - 1
+    if not excess < R_HAT_THRESHOLD - 1:  # the excess falls in proportion to the length
+        factor = max(factor, excess / (R_HAT_THRESHOLD - 1), 1.2)
+    return factor
+
+
+def _draw_with_pyro(problem: Problem, mode: Laplace, model: Any, plan: Plan) -> Draws:
+    prior = problem.prior.whitened(mode.loc, mode.scale_tril)
     arguments: tuple[Any, ...] = (problem.y, problem.propagate)
     if model is models.additive:
         arguments += (prior, problem.noise, problem.observed, problem.unit)
@@ -101,8 +194,8 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
         model,
         arguments,
         prior,
-        num_samples=plan.num_samples,
-        num_chains=plan.num_chains,
+        num_samples=plan.samples,
+        num_chains=plan.chains(1),
         num_warmup=plan.warmup,
         seed=plan.seed,
         target_accept=0.8 if plan.target_accept is None else plan.target_accept,

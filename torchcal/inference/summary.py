@@ -30,6 +30,9 @@ __all__ = [
     "warn_of_tolerance",
 ]
 
+MOST_DIVERGENCES = 1e-4
+"""Share of transitions that may diverge: one of ten thousand or more is no region that chains cannot enter."""
+
 
 def diagnose(
     estimate: Estimate,
@@ -63,7 +66,12 @@ def diagnose(
         worst = min(few, key=lambda name: few[name])
         if not few[worst] >= wanted:
             problems.append(f"effective sample size of {worst} is {few[worst]:.0f} (threshold {wanted:.0f})")
-        if draws.divergences:
+        if loud and len(draws.modes) > 1:
+            problems.append(
+                f"chains began at {len(draws.modes)} separate maxima and have not mixed: how many draws each has rests "
+                "on normal approximations (" + ", ".join(f"{mode.weight:.2g}" for mode in draws.modes) + ")"
+            )
+        if draws.divergences > MOST_DIVERGENCES * samples.shape[0] * samples.shape[1]:
             problems.append(f"{draws.divergences} divergent transitions")
         converged = not problems
     return Diagnostics(
@@ -80,6 +88,7 @@ def diagnose(
         map_variance=math.nan,
         converged=converged,
         problems=tuple(problems),
+        modes=() if draws is None else draws.modes,
     )
 
 

@@ -3,19 +3,20 @@ r"""Non-intrusive spectral projection: from α to the mean and standard deviatio
 Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 25-29.
 """
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from torchcal import polychaos
 from torchcal.embeddings import Embedding, Pattern
 from torchcal.errors import DomainError, EmbeddingError, ShapeError
 from torchcal.propagation import choice, convergence, parameters
 from torchcal.propagation.convergence import PropagationCheck
+from torchcal.propagation.pieces import forgetful, over_batch
 from torchcal.propagation.rules import RuleChoice
 from torchcal.simulators import Conditions, Scaling, Simulator, free_parameters
 
@@ -155,6 +156,10 @@ class NISP(nn.Module):
     def extra_repr(self) -> str:
         """Shown by ``print``."""
         return f"alpha={list(self.alpha_names)}, nodes={self.num_nodes}, order={self.order or 'full'}"
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The simulator at its conditions is a closure, which no process can be sent.
+        return {**self.__dict__, "_evaluate": None}
 
     def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> "NISP":
         self._evaluate = None
@@ -358,13 +363,16 @@ class NISP(nn.Module):
 
     def _weighted(self, alpha: Tensor, matrix: Tensor) -> Tensor:
         """Σ_q matrix[q, k] f_q, shape ``(*batch, k, n)``, node piece by node piece."""
-        total: Tensor | None = None
-        for piece in self._node_pieces(alpha):
-            part = matrix[piece].transpose(-1, -2) @ self._outputs(alpha, self._psi[piece])
-            total = part if total is None else total + part
-        if total is None:
-            raise DomainError("Expected a rule with at least one node. Got none.")
-        return total
+        pieces = self._node_pieces(alpha)
+
+        def part(block: Tensor, piece: slice) -> tuple[Tensor]:
+            return (matrix[piece].transpose(-1, -2) @ self._outputs(block, self._psi[piece]),)
+
+        if len(pieces) == 1:
+            return part(alpha, pieces[0])[0]
+        return functools.reduce(
+            torch.add, (forgetful(functools.partial(part, piece=piece), alpha)[0] for piece in pieces)
+        )
 
     def _moments(self, alpha: Tensor) -> tuple[Tensor, Tensor]:
         if self._projection is not None:
@@ -378,11 +386,15 @@ class NISP(nn.Module):
             return mean, self.weights @ offset.square()
         with torch.no_grad():  # a shift near the mean keeps the sum of squares from cancelling
             shift = self._weighted(alpha.detach(), self.weights[:, None])
+
+        def sums(block: Tensor, piece: slice) -> tuple[Tensor, Tensor]:
+            offset = self._outputs(block, self._psi[piece]) - shift
+            return self.weights[piece] @ offset, self.weights[piece] @ offset.square()
+
         first = second = alpha.new_zeros(())
         for piece in pieces:
-            offset = self._outputs(alpha, self._psi[piece]) - shift
-            first = first + self.weights[piece] @ offset
-            second = second + self.weights[piece] @ offset.square()
+            one, two = forgetful(functools.partial(sums, piece=piece), alpha)
+            first, second = first + one, second + two
         return shift[..., 0, :] + first, (second - first.square()).clamp_min(0)
 
     def _node_pieces(self, alpha: Tensor) -> list[slice]:
@@ -398,22 +410,8 @@ class NISP(nn.Module):
         self, alpha: Tensor, function: Callable[[Tensor], tuple[Tensor, ...]]
     ) -> tuple[Tensor, ...]:
         """Apply a function of a batch of α in pieces of bounded size."""
-        batch = alpha.shape[:-1]
-        rows = math.prod(batch)
-        size = max(1, self.max_elements // (self.num_nodes * self._n))
-        if rows * self.num_nodes * self._n <= self.max_elements or rows == 0:
-            return function(alpha)
-        flat = alpha.reshape(rows, -1)
-        parts = []
-        for start in range(0, rows, size):
-            block = flat[start : start + size]
-            if torch.is_grad_enabled() and block.requires_grad:
-                parts.append(checkpoint(function, block, use_reentrant=False))
-            else:
-                parts.append(function(block))
-        return tuple(
-            torch.cat(items).reshape(*batch, *items[0].shape[1:]) for items in zip(*parts, strict=True)
-        )
+        size = max(1, self.max_elements // max(1, self.num_nodes * self._n))
+        return over_batch(function, alpha, size)
 
     # --- rules -------------------------------------------------------------------------------------------
 

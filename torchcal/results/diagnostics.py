@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchcal.propagation import PropagationCheck
 
-__all__ = ["ESS_THRESHOLD", "R_HAT_THRESHOLD", "Diagnostics", "Quality", "r_hat_threshold", "table"]
+__all__ = ["ESS_THRESHOLD", "R_HAT_THRESHOLD", "Diagnostics", "Mode", "Quality", "r_hat_threshold", "table"]
 
 R_HAT_THRESHOLD = 1.01
 """Largest R-hat that passes for chains of 400 draws or more (Vehtari et al. 2021)."""
@@ -33,6 +33,21 @@ class Quality:
 
 
 @dataclass(frozen=True)
+class Mode:
+    """A maximum of the posterior at which chains began.
+
+    Attributes:
+        alpha: Where it is.
+        objective: Negative log-posterior there.
+        weight: Its share of the posterior, by the normal approximations at all of them.
+    """
+
+    alpha: tuple[float, ...]
+    objective: float
+    weight: float
+
+
+@dataclass(frozen=True)
 class Diagnostics:
     """Convergence of optimiser, propagation and chains.
 
@@ -50,6 +65,7 @@ class Diagnostics:
         map_variance: σ² at the MAP, mean over the data.
         converged: Whether every figure is within its threshold; None without draws.
         problems: What is not, in words.
+        modes: Maxima at which chains began, the best first; empty without draws.
     """
 
     alpha: Mapping[str, Quality]
@@ -65,6 +81,7 @@ class Diagnostics:
     map_variance: float
     converged: bool | None
     problems: tuple[str, ...] = field(default=())
+    modes: tuple[Mode, ...] = field(default=())
 
     @property
     def r_hat(self) -> float:
@@ -84,6 +101,9 @@ class Diagnostics:
         lines = [f"starts that agree: {self.agreeing} of {self.starts}"]
         if self.ties > 1:
             lines.append(f"different maxima of the same objective: {self.ties}")
+        if len(self.modes) > 1:
+            shares = ", ".join(f"{mode.objective:.6g} (weight {mode.weight:.2g})" for mode in self.modes)
+            lines.append(f"chains began at {len(self.modes)} separate maxima, objectives {shares}")
         if len(self.null_directions):
             lines.append(f"directions that the data do not see: {len(self.null_directions)}")
         if self.alpha:

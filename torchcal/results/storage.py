@@ -16,7 +16,7 @@ from torchcal.data import Recording, Run
 from torchcal.errors import DomainError, EmbeddingError, MissingDependencyError, RecordingError, TorchcalError
 from torchcal.prediction import AdditivePrediction, Moments, Prediction
 from torchcal.propagation import NISP, PropagationCheck, RuleChoice
-from torchcal.results.diagnostics import Diagnostics, Quality
+from torchcal.results.diagnostics import Diagnostics, Mode, Quality
 from torchcal.results.estimate import MapEstimate
 from torchcal.simulators import ODESimulator, Scaling, Simulator, Trajectories
 
@@ -419,6 +419,9 @@ def _diagnostics(groups: Mapping[str, Any], meta: Mapping[str, Any]) -> Diagnost
     if values["propagation"] is not None:
         values["propagation"] = PropagationCheck(**values["propagation"])
     values["problems"] = tuple(values["problems"])
+    values["modes"] = tuple(
+        Mode(**{**mode, "alpha": tuple(mode["alpha"])}) for mode in values.get("modes", ())
+    )
     if "null_directions" in groups:
         null = groups["null_directions"]["direction"]
     else:

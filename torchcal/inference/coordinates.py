@@ -1,0 +1,110 @@
+"""White coordinates for samplers, and the points that chains start from."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcal.errors import ConvergenceError
+
+__all__ = ["Laplace", "Whitened", "group_means", "starting_points"]
+
+
+@dataclass(frozen=True)
+class Laplace:
+    """A normal approximation at a mode in unbounded coordinates.
+
+    Attributes:
+        loc: The mode, ``(P,)``.
+        scale_tril: Factor of its covariance, ``(P, P)``.
+        weight: Its share of the posterior among all modes, as far as the normal approximations tell.
+    """
+
+    loc: Tensor
+    scale_tril: Tensor
+    weight: float = 1.0
+
+    def to(self, dtype: torch.dtype) -> "Laplace":
+        """In another dtype."""
+        return Laplace(self.loc.to(dtype), self.scale_tril.to(dtype), self.weight)
+
+
+class Whitened:
+    """A log-density in coordinates z with u = loc + scale_tril z, with its gradient for the sampler."""
+
+    def __init__(self, log_density: Callable[[Tensor], Tensor], loc: Tensor, scale_tril: Tensor) -> None:
+        self.log_density, self.loc, self.scale_tril = log_density, loc, scale_tril
+
+    def potential(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """Negative log-density ``(C,)`` and its gradient ``(C, P)``; +inf and 0 where they are not finite."""
+        leaf = z.detach().requires_grad_(True)
+        with torch.enable_grad():
+            energy = -self.log_density(self.outer(leaf))
+            (slope,) = torch.autograd.grad(energy.sum(), leaf)
+        energy = energy.detach()
+        good = torch.isfinite(energy) & torch.isfinite(slope).all(-1)
+        return torch.where(good, energy, torch.inf), torch.where(good[:, None], slope, 0.0)
+
+    def outer(self, z: Tensor) -> Tensor:
+        """u of z."""
+        return torch.addmm(self.loc, z, self.scale_tril.T) if z.ndim == 2 else self.loc + z @ self.scale_tril.T
+
+    def inner(self, u: Tensor) -> Tensor:
+        """Z of u, ``(C, P)``."""
+        return torch.linalg.solve_triangular(self.scale_tril, (u - self.loc).T, upper=False).T
+
+    def refined(self, z: Tensor, groups: Tensor) -> "Whitened":
+        """Coordinates in which pooled draws are white: z ``(S, P)``, each about the mean of its group ``(S,)``.
+
+        Groups are the modes that chains began at: where they stay apart, the distance between modes is no width.
+        """
+        count, size = z.shape
+        means = group_means(z, groups)
+        offset = z - means[groups]
+        mean = means[0]
+        identity = torch.eye(size, dtype=z.dtype, device=z.device)
+        # Shrunk to what the coordinates assume already, with the weight of a few draws (as in Stan).
+        covariance = (offset.T @ offset + 5 * identity) / (count + 5)
+        factor = torch.linalg.cholesky(covariance)
+        return Whitened(self.log_density, self.outer(mean[None])[0], self.scale_tril @ factor)
+
+
+def group_means(values: Tensor, groups: Tensor) -> Tensor:
+    """Mean of the rows ``(S, P)`` of each group ``(S,)``, ``(G, P)``."""
+    member = torch.nn.functional.one_hot(groups).to(values)
+    return (member.T @ values) / member.sum(0).clamp_min(1)[:, None]
+
+
+def starting_points(
+    space: Whitened, modes: Sequence[Laplace], count: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Draws of the normal approximations at the modes, as many of each as its weight, drawn in where not finite.
+
+    Returns:
+        Points ``(C, P)`` and the mode of each ``(C,)``, dealt out so that any first few chains have their share of
+        each mode.
+
+    Raises:
+        ConvergenceError: If the density is not finite around a mode.
+    """
+    size = len(space.loc)
+    normal = torch.randn((count, size), dtype=space.loc.dtype, device=space.loc.device, generator=generator)
+    weights = torch.tensor([mode.weight for mode in modes], dtype=torch.float64)
+    dealt = torch.zeros_like(weights)
+    chosen = []
+    for number in range(count):
+        which = int((weights / weights.sum() * (number + 1) - dealt).argmax())
+        dealt[which] += 1
+        chosen.append(which)
+    center = space.inner(torch.stack([mode.loc for mode in modes]))[chosen]
+    spread = torch.linalg.solve_triangular(space.scale_tril, torch.stack([m.scale_tril for m in modes]), upper=False)
+    offset = (spread[chosen] @ normal[:, :, None])[:, :, 0]
+    for _ in range(20):
+        bad = ~torch.isfinite(space.potential(center + offset)[0])
+        if not bool(bad.any()):
+            return center + offset, torch.tensor(chosen, device=space.loc.device)
+        offset = torch.where(bad[:, None], 0.5 * offset, offset)
+    raise ConvergenceError(
+        "Expected a finite posterior around the best point found. Got none. Look at the simulator there."
+    )
