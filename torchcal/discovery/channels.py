@@ -120,8 +120,32 @@ def _rate_unit(unit: str | None, time: str) -> str | None:
     return None if unit is None else f"{unit or 1}/{time}"
 
 
+def definitions(bound: Trajectories, values: Tensor, states: Tensor) -> set[str]:
+    """States whose equation only says what another state is, as dx/dt = v does: there is no physics to leave out.
+
+    Args:
+        bound: The simulator.
+        values: Its parameters ``(d,)``.
+        states: A trajectory, ``(1, R, nodes, S)``.
+    """
+    generator = torch.Generator().manual_seed(0)
+    nodes = torch.linspace(0, states.shape[2] - 1, 6).round().long()
+    here = states[0][:, nodes].transpose(0, 1)  # (H, R, S)
+    spread = here.abs().amax((0, 1)).clamp_min(1e-12)
+    here = here + 0.1 * spread * torch.randn(here.shape, generator=generator, dtype=here.dtype)
+    moved = values * (1 + 0.1 * torch.rand(len(nodes), len(values), generator=generator, dtype=values.dtype))
+    rates = bound.slopes(moved, here)
+    names = list(bound.ode.states)
+    same = [
+        name
+        for i, name in enumerate(names)
+        if any(j != i and torch.equal(rates[..., i], here[..., j]) for j in range(len(names)))
+    ]
+    return set(same) if len(same) < len(names) else set()
+
+
 def channels(problem: Problem, found: Fitted) -> list[Channel]:
-    """Every equation, every free parameter and every output."""
+    """Every equation that is no definition, every free parameter and every output."""
     list_: list[Channel] = []
     bound = problem.simulator
     names = [q.name for q in problem.parameters]
@@ -138,7 +162,10 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
             for state, unit in bound.ode.states.items()
         ]
         labels += [("parameter", names[i], problem.parameters[i].unit) for i in own]
+        given = definitions(bound, found.values, states)
         for m, (kind, target, unit) in enumerate(labels):
+            if kind == "equation" and target in given:
+                continue
             list_.append(Channel(kind, target, unit, drivers, time, response[:, :, m]))
         at_data = {
             name: values[problem.condition_of] for name, values in problem.drivers(found.values[None], states).items()

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchcal import polychaos
 from torchcal.embeddings import Embedding, Pattern
 from torchcal.errors import DomainError, EmbeddingError, ShapeError
-from torchcal.propagation import choice, convergence, parameters
+from torchcal.propagation import choice, convergence, parameters, polynomials
 from torchcal.propagation.convergence import PropagationCheck
 from torchcal.propagation.pieces import forgetful, over_batch
 from torchcal.propagation.rules import RuleChoice
@@ -70,6 +70,7 @@ class NISP(nn.Module):
     _projection: Tensor | None
     _template: Tensor
     _places: Tensor
+    _table: Tensor | None
     _x0: Tensor
 
     def __init__(
@@ -121,6 +122,10 @@ class NISP(nn.Module):
             "_places", torch.tensor([i for i, name in enumerate(simulator.names) if name in position])
         )
         self._evaluate: Callable[[Tensor], Tensor] | None = None
+        self._polynomial: Tensor | None = None
+        found = polynomials.expansion(self)
+        self.register_buffer("_table", None if found is None else found[1], persistent=False)
+        self._polynomial = None if found is None else found[0]
         self._wanted_rule = rule
         self.set_rule(choice.choose(self, rule))
 
@@ -353,7 +358,18 @@ class NISP(nn.Module):
 
     def _outputs(self, alpha: Tensor, psi: Tensor) -> Tensor:
         """Outputs ``(*batch, S, n)`` at rows of Ψ, ``(S, K)``."""
-        return self._simulate(self.scaling.physical(psi @ self.pattern.matrix(alpha).transpose(-1, -2)))
+        return self._finished(self._features(alpha, psi))
+
+    def _features(self, alpha: Tensor, psi: Tensor) -> Tensor:
+        """What outputs are linear in, ``(*batch, S, M)``: Legendre products of the parameters, or the outputs."""
+        scaled = psi @ self.pattern.matrix(alpha).transpose(-1, -2)
+        if self._polynomial is not None:
+            return polychaos.evaluate(polychaos.LEGENDRE, self._polynomial, scaled)
+        return self._simulate(self.scaling.physical(scaled))
+
+    def _finished(self, features: Tensor) -> Tensor:
+        """Outputs ``(*batch, S, n)`` of (sums of) features."""
+        return features if self._table is None else features @ self._table
 
     def _simulate(self, values: Tensor) -> Tensor:
         """Outputs ``(*batch, n)`` at values of the free parameters ``(*batch, d)``."""
@@ -366,12 +382,14 @@ class NISP(nn.Module):
         pieces = self._node_pieces(alpha)
 
         def part(block: Tensor, piece: slice) -> tuple[Tensor]:
-            return (matrix[piece].transpose(-1, -2) @ self._outputs(block, self._psi[piece]),)
+            return (matrix[piece].transpose(-1, -2) @ self._features(block, self._psi[piece]),)
 
         if len(pieces) == 1:
-            return part(alpha, pieces[0])[0]
-        return functools.reduce(
-            torch.add, (forgetful(functools.partial(part, piece=piece), alpha)[0] for piece in pieces)
+            return self._finished(part(alpha, pieces[0])[0])
+        return self._finished(
+            functools.reduce(
+                torch.add, (forgetful(functools.partial(part, piece=piece), alpha)[0] for piece in pieces)
+            )
         )
 
     def _moments(self, alpha: Tensor) -> tuple[Tensor, Tensor]:
@@ -415,6 +433,15 @@ class NISP(nn.Module):
 
     # --- rules -------------------------------------------------------------------------------------------
 
+    def _whole_order(self, rule_choice: RuleChoice) -> int | None:
+        """Degree of a polynomial's whole expansion in the germs, where the rule has nodes enough for it."""
+        exact, degree = choice.exact_count(self), self.simulator.degree
+        if self._polynomial is None or exact is None or not degree:
+            return None
+        if rule_choice.kind != "tensor" or rule_choice.size < exact:
+            return None
+        return degree * max(1, self.pattern.order)
+
     def set_rule(self, rule_choice: RuleChoice) -> None:
         """Use another quadrature rule."""
         basis, indices = self.pattern.basis, self.pattern.indices
@@ -422,7 +449,7 @@ class NISP(nn.Module):
         rule = rule_choice.build(basis, self.pattern.num_germs)
         self._choice = rule_choice
         projection = None
-        order = self.order if self.order is not None else rule_choice.carried_order
+        order = self.order if self.order is not None else rule_choice.carried_order or self._whole_order(rule_choice)
         if order is not None and self.pattern.num_germs:
             terms = polychaos.multi_indices(self.pattern.num_germs, order)
             values = polychaos.evaluate(basis, terms, rule.nodes)

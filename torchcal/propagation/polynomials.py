@@ -1,0 +1,56 @@
+r"""Simulators that are polynomials in their parameters: coefficients in place of outputs at every node.
+
+Where :math:`f_i(\lambda) = \sum_m B_{im} L_m(\tilde\lambda)`, sums over nodes are taken of the few :math:`L_m` and not
+of the many outputs:
+
+.. math:: \sum_q W_{qk} f_i(\lambda_q) = \sum_m B_{im} \Bigl(\sum_q W_{qk} L_m(\tilde\lambda_q)\Bigr)
+"""
+
+import math
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchcal import polychaos
+
+if TYPE_CHECKING:
+    from torchcal.propagation.nisp import NISP
+
+__all__ = ["expansion"]
+
+MOST_TERMS = 500
+"""Terms beyond which nothing is gained."""
+
+TOLERANCE = 1e-9
+"""How well the polynomial must hold at points that it was not made from, relative to the largest output."""
+
+_SPARE = 8
+"""Points to test it at."""
+
+
+def expansion(propagate: "NISP") -> tuple[Tensor, Tensor] | None:
+    """Multi-indices ``(M, d)`` and coefficients ``(M, n)`` of the outputs in Legendre products of scaled parameters.
+
+    None where the simulator says nothing of a degree, a parameter is on a logarithmic scale, or what it says does not
+    hold: then nodes are evaluated as of any other simulator.
+    """
+    degree, d = propagate.simulator.degree, len(propagate.free)
+    if degree is None or d == 0 or bool(propagate.scaling.log.any()):
+        return None
+    count = math.comb(degree + d, d)
+    if count > MOST_TERMS:
+        return None
+    terms = polychaos.multi_indices(d, degree)
+    generator = torch.Generator().manual_seed(0)
+    points = 2 * torch.rand(2 * count + _SPARE, d, dtype=torch.float64, generator=generator) - 1
+    with torch.no_grad():
+        values = propagate._simulate(propagate.scaling.physical(points))
+    psi = polychaos.evaluate(polychaos.LEGENDRE, terms, points)
+    if not bool(torch.isfinite(values).all()):
+        return None
+    table = torch.linalg.lstsq(psi[_SPARE:], values[_SPARE:], driver="gelsd").solution
+    error = (psi[:_SPARE] @ table - values[:_SPARE]).abs().max()
+    if not float(error) <= TOLERANCE * float(values.abs().max()):
+        return None
+    return terms, table
