@@ -11,10 +11,10 @@ PYTEST := $(PY) -m pytest --numprocesses $(WORKERS) --maxprocesses 8 --dist load
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 .NOTPARALLEL: # two installations into one environment must not overlap
-.PHONY: help demo figures physics test test-slow lint docs bench clean
+.PHONY: help demo figures physics test test-slow lint docs bench bench-sampling clean
 
 help: ## show this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: $(STAMPS)/arviz,ignition ## calibrate a one-step methane mechanism, and find what it leaves out, with figures and report
 	$(PY) -m examples.demo
@@ -42,6 +42,9 @@ docs: $(STAMPS)/docs ## build the documentation into docs/_build/html; a warning
 
 bench: $(STAMPS)/bench ## the concealed-effects suite: 300 cases, the peers, the score (hours; ARGS=--small for 16 cases)
 	$(PY) -m benchmarks.concealed $(ARGS)
+
+bench-sampling: $(STAMPS)/bench ## torchcal's samplers beside Pyro, NumPyro, PyTUQ and emcee (hours; ARGS=--small for minutes)
+	$(PY) -m benchmarks.sampling $(ARGS)
 
 clean: ## remove what was built, and the caches (not .venv)
 	rm -rf build dist outputs docs/_build docs/_generated .mypy_cache .pytest_cache .ruff_cache

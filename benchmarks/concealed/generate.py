@@ -295,6 +295,8 @@ def strength(family: Family, item: Planted, traces: Sequence[Trace], number: int
             b = np.full_like(b, np.std(b))
         added += float(np.sum(a[active] ** 2))
         base += float(np.sum(b[active] ** 2))
+    if not base > 0:
+        raise Failure("acts nowhere, or where the base does nothing")
     return float(np.sqrt(added / base))
 
 

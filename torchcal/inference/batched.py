@@ -35,7 +35,7 @@ _ENOUGH = 1.05
 """Draws that are taken over those that a wanted sample size seems to need."""
 
 _STUCK = 0.8
-"""Where more draws leave this much of what was missing, twice in a row, chains stay apart, and more do not help."""
+"""Where twice the draws leave this much of what was missing, twice in a row, chains stay apart."""
 
 
 @dataclass
@@ -183,16 +183,19 @@ def run_batched(
         space, z, step_size = _warm_up(moves, space, z, groups, num_warmup, target_accept, bar)
         state = moves.init(z[:num_chains], space, step_size)
         goal = num_samples if enough is None else min(num_samples, 100)
-        before, stuck = math.inf, 0
+        before, half, stuck = math.inf, goal, 0
         while True:
             state = collector.collect(moves, state, space, step_size, goal, bar)
             if enough is None or goal == num_samples:
                 break
             more = enough(_alpha(collector.draws(goal), space, transform), groups[:num_chains])
-            stuck = stuck + 1 if more > _STUCK * before else 0
-            if more <= 1 or stuck == 2:
+            if more <= 1:
                 break
-            before = more
+            if goal >= 2 * half:
+                stuck = stuck + 1 if more > _STUCK * before else 0
+                before, half = more, goal
+            if stuck == 2:
+                break
             goal = min(num_samples, math.ceil(goal * min(max(_ENOUGH * more, 1.15), 8.0)))
         stored = collector.draws(goal)
     except KeyboardInterrupt:

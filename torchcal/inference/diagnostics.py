@@ -3,69 +3,105 @@
 Source: Vehtari, Gelman, Simpson, Carpenter & Bürkner (2021), Bayesian Analysis 16, 667-718.
 """
 
+from typing import NamedTuple
+
 import torch
 from pyro.ops.stats import effective_sample_size, split_gelman_rubin
 from torch import Tensor
 
-__all__ = ["bulk_ess", "r_hat", "tail_ess"]
+__all__ = ["Figures", "bulk_ess", "figures", "r_hat", "tail_ess"]
+
+
+class Figures(NamedTuple):
+    """Convergence of every quantity, the shape of the draws without chains and draws.
+
+    Attributes:
+        r_hat: The larger of the rank-normalised split R-hat of the draws and of their distances from the median; 1
+            where nothing varies, NaN with fewer than 4 draws.
+        ess_bulk: Effective sample size of the rank-normalised split chains: how well the centre is known.
+        ess_tail: Smaller effective sample size of the 5 % and 95 % quantiles: how well the tails are known.
+    """
+
+    r_hat: Tensor
+    ess_bulk: Tensor
+    ess_tail: Tensor
+
+    @property
+    def least_ess(self) -> float:
+        """The smallest effective sample size of all quantities."""
+        return float(torch.minimum(self.ess_bulk, self.ess_tail).min())
+
+    @property
+    def worst_r_hat(self) -> float:
+        """The largest R-hat of all quantities."""
+        return float(self.r_hat.max())
+
+
+def figures(draws: Tensor) -> Figures:
+    """R-hat and effective sample sizes of draws ``(chains, draws, ...)``."""
+    chains, count = draws.shape[:2]
+    rest = draws.shape[2:]
+    values = draws.to(torch.float64).flatten(2).permute(2, 0, 1).contiguous()  # (Q, C, n)
+    if count < 4:
+        nothing = torch.full(rest, torch.nan, dtype=torch.float64)
+        return Figures(nothing, nothing, nothing)
+    ordered, order = values.flatten(1).sort(dim=1)
+    scores = _normal_scores(order).reshape(values.shape)
+    middle = ordered[:, (chains * count - 1) // 2, None, None]
+    folded = _normal_scores((values - middle).abs().flatten(1).argsort(dim=1)).reshape(values.shape)
+    spread = torch.maximum(_split_r_hat(scores), _split_r_hat(folded))
+    ends = [_quantile(ordered, q) for q in (0.05, 0.95)]
+    tail = torch.minimum(*(_ess((values <= end[:, None, None]).to(torch.float64)) for end in ends))
+    constant = ordered[:, 0] == ordered[:, -1]
+    total = torch.full_like(tail, float(chains * count))
+    return Figures(
+        torch.where(constant, torch.ones_like(total), spread).reshape(rest),
+        torch.where(constant, total, _ess(scores)).reshape(rest),
+        torch.where(constant, total, tail).reshape(rest),
+    )
 
 
 def r_hat(draws: Tensor) -> Tensor:
-    """Larger of the rank-normalised split R-hat of the draws and of their distances from the median.
-
-    Args:
-        draws: ``(chains, draws, ...)``.
-
-    Returns:
-        Shape of the rest; 1 where nothing varies, NaN with fewer than 4 draws.
-    """
-    if draws.shape[1] < 4:
-        return torch.full(draws.shape[2:], torch.nan, dtype=torch.float64)
-    flat = draws.to(torch.float64).flatten(0, 1)
-    folded = (draws - flat.median(0).values).abs()
-    bulk, spread = (split_gelman_rubin(_even(_normal_scores(v))) for v in (draws, folded))
-    return _where_varying(draws, torch.maximum(bulk, spread), 1.0)
+    """See `Figures`."""
+    return figures(draws).r_hat
 
 
 def bulk_ess(draws: Tensor) -> Tensor:
-    """Effective sample size of the rank-normalised split chains: how well the centre is known."""
-    return _ess(draws, _normal_scores(draws))
+    """See `Figures`."""
+    return figures(draws).ess_bulk
 
 
 def tail_ess(draws: Tensor) -> Tensor:
-    """Smaller effective sample size of the 5 % and 95 % quantiles: how well the tails are known."""
-    flat = draws.flatten(0, 1).to(torch.float64)
-    ends = [(draws <= torch.quantile(flat, q, dim=0)).to(torch.float64) for q in (0.05, 0.95)]
-    return torch.minimum(*(_ess(draws, end) for end in ends))
+    """See `Figures`."""
+    return figures(draws).ess_tail
 
 
-def _ess(draws: Tensor, values: Tensor) -> Tensor:
-    if draws.shape[1] < 4:
-        return torch.full(draws.shape[2:], torch.nan, dtype=torch.float64)
-    half = values.shape[1] // 2
-    split = torch.cat([values[:, :half], values[:, -half:]])
-    total = float(draws.shape[0] * draws.shape[1])
+def _split_r_hat(values: Tensor) -> Tensor:
+    """Of ``(Q, C, n)``, ``(Q,)``."""
+    even = values.shape[2] // 2 * 2
+    return split_gelman_rubin(values[:, :, :even].permute(1, 2, 0))
+
+
+def _ess(values: Tensor) -> Tensor:
+    """Of ``(Q, C, n)``, chains split in halves, ``(Q,)``."""
+    half = values.shape[2] // 2
+    split = torch.cat([values[:, :, :half], values[:, :, -half:]], dim=1).permute(1, 2, 0)
+    total = float(values.shape[1] * values.shape[2])
     found = torch.nan_to_num(effective_sample_size(split), nan=total, posinf=total)
-    found = found.clamp_min(1.0)  # the estimate from a few draws can be negative
-    return _where_varying(draws, found, total)
+    return found.clamp_min(1.0)  # the estimate from a few draws can be negative
 
 
-def _even(values: Tensor) -> Tensor:
-    return values[:, : values.shape[1] // 2 * 2]
+def _normal_scores(order: Tensor) -> Tensor:
+    """Normal quantiles of the ranks, from the order of the draws ``(Q, S)``."""
+    count = order.shape[1]
+    places = torch.arange(1, count + 1, dtype=torch.float64)
+    score = torch.special.ndtri((places - 0.375) / (count + 0.25))
+    return torch.empty(order.shape, dtype=torch.float64).scatter_(1, order, score.expand_as(order))
 
 
-def _normal_scores(draws: Tensor) -> Tensor:
-    flat = draws.to(torch.float64).flatten(0, 1)
-    count = len(flat)
-    order = flat.argsort(dim=0)
-    ranks = torch.empty_like(flat)
-    places = torch.arange(1, count + 1, dtype=torch.float64).reshape(-1, *[1] * (flat.ndim - 1))
-    ranks.scatter_(0, order, places.expand_as(flat).clone())
-    uniform = (ranks - 0.375) / (count + 0.25)
-    return (torch.special.ndtri(uniform)).reshape(draws.shape)
-
-
-def _where_varying(draws: Tensor, value: Tensor, otherwise: float) -> Tensor:
-    flat = draws.flatten(0, 1)
-    constant = (flat == flat[:1]).all(0)
-    return torch.where(constant, torch.full_like(value, otherwise), value)
+def _quantile(ordered: Tensor, q: float) -> Tensor:
+    """Of sorted values ``(Q, S)``, between neighbours in proportion, ``(Q,)``."""
+    place = q * (ordered.shape[1] - 1)
+    low = int(place)
+    high = min(low + 1, ordered.shape[1] - 1)
+    return ordered[:, low] + (place - low) * (ordered[:, high] - ordered[:, low])

@@ -37,6 +37,9 @@ LEAST_WEIGHT = 1e-3
 MOST_MODES = 6
 """Maxima that are looked at."""
 
+DEAR, MOST_KEPT = 1_000_000, 8
+"""Numbers that one gradient of all starts handles from which on the worse starts are given up, and how many are not."""
+
 SAME_MEANS = 1e-3
 """Difference of scaled means up to which two starts ended at one maximum."""
 
@@ -113,7 +116,9 @@ def maximise(
     if in_time and len(begin) > 2:
         found = search(objective, problem.propagate, begin, leading, progress=show)
     else:
-        found = minimise(lambda u: objective(problem.propagate, u), begin, progress=show)
+        cost = problem.propagate.num_nodes * len(problem.y) * begin.numel()
+        keep = MOST_KEPT if cost > DEAR else None
+        found = minimise(lambda u: objective(problem.propagate, u), begin, keep=keep, progress=show)
     if not bool(torch.isfinite(found.values[0])):
         raise ConvergenceError(
             f"Expected a finite posterior at some starting point. Got none at {len(starts)}. Check the "

@@ -17,6 +17,9 @@ Hessian is good to 1e-7 of its largest entry, and Newton steps need no more."""
 _SAME = 1e-8
 """Relative difference of two objectives below which two starts are taken to be in one basin."""
 
+_ROUND = 6
+"""Iterations after which the worse half of the starts is given up where they are dear."""
+
 _LADDER = [0.0, 1e-12, 1e-10, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0, 1e3]
 """Dampings, relative to the largest curvature."""
 
@@ -71,6 +74,7 @@ def minimise(
     *,
     max_iterations: int = 200,
     tolerance: float = 1e-10,
+    keep: int | None = None,
     progress: Callable[[int, Tensor], None] | None = None,
 ) -> Minima:
     r"""Damped Newton steps with absolute curvatures, from every start at once.
@@ -85,6 +89,8 @@ def minimise(
         max_iterations: Most iterations.
         tolerance: A start is done when three iterations in a row gain less than this, relative to the objective plus
             one: log-densities differ by nothing that matters then.
+        keep: For dear objectives: every six iterations the worse half of the starts still under way is left where it
+            is, until so many are.
         progress: Called with the iteration and the values so far.
     """
     points = starts.detach().clone()
@@ -115,6 +121,9 @@ def minimise(
         active[rows] = (stalls[rows] < 3) & (better | (stalls[rows] < 1))
         if iteration % 4 == 0:
             join(values, active, leader)
+        if keep is not None and iteration % _ROUND == 0:
+            rows = active.nonzero()[:, 0]
+            active[rows[values[rows].argsort()[max(keep, -(-len(rows) // 2)) :]]] = False
         if progress is not None:
             progress(iteration, values)
     for _ in range(len(points)):  # a leader may itself have joined another

@@ -12,7 +12,7 @@ from torchcal import models
 from torchcal.errors import ConvergenceWarning, DomainError, ImproperPosteriorError
 from torchcal.inference.batched import MOST_ELEMENTS, run_batched
 from torchcal.inference.coordinates import Laplace
-from torchcal.inference.diagnostics import bulk_ess, r_hat, tail_ess
+from torchcal.inference.diagnostics import Figures, figures
 from torchcal.inference.draws import Draws
 from torchcal.inference.estimate import Estimate, modes_of
 from torchcal.inference.nuts import run_nuts
@@ -103,7 +103,7 @@ class Plan:
         """Draws thrown away a chain. Pooled over a crowd, adaptation needs fewer of each than chain by chain."""
         if self.num_warmup is not None:
             return self.num_warmup
-        return max(300, self.samples // 2) if self.sampler == "pyro" else 100
+        return max(300, self.samples // 2) if self.sampler == "pyro" else 60
 
 
 def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
@@ -126,6 +126,9 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
     def folded(alpha: Tensor) -> Tensor:
         return pattern.flip(alpha, estimate.alpha.to(alpha)) if problem.prior.symmetric else alpha
 
+    def enough(alpha: Tensor, groups: Tensor) -> float:
+        return _more(folded(alpha), groups.cpu(), plan.target_ess or 0.0)
+
     if plan.sampler == "pyro":
         draws = _draw_with_pyro(cast, starts[0], model, plan)
     else:
@@ -142,19 +145,20 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
             kernel=plan.sampler,
             cost=cost,
             target_accept=plan.target_accept,
-            enough=None if plan.target_ess is None else lambda alpha, groups: _more(folded(alpha), plan, groups),
+            enough=enough if plan.target_ess is not None else None,
             progress=plan.progress,
         )
     alpha = folded(draws.alpha)
-    if plan.target_ess is not None and _more(alpha, plan) > 1:
-        ess = float(torch.minimum(bulk_ess(alpha), tail_ess(alpha)).min())
+    found = figures(alpha)
+    if plan.target_ess is not None and _missing(found, plan.target_ess) > 1:
         warnings.warn(
-            f"Wanted an effective sample size of {plan.target_ess:g} and R-hat below {R_HAT_THRESHOLD}. Got {ess:.0f} "
-            f"and {float(r_hat(alpha).max()):.3f} after {alpha.shape[1]} draws of each of {alpha.shape[0]} chains.",
+            f"Wanted an effective sample size of {plan.target_ess:g} and R-hat below {R_HAT_THRESHOLD}. Got "
+            f"{found.least_ess:.0f} and {found.worst_r_hat:.3f} after {alpha.shape[1]} draws of each of "
+            f"{alpha.shape[0]} chains.",
             ConvergenceWarning,
             stacklevel=3,
         )
-    return Draws(alpha, draws.divergences, tuple(_mode(problem, mode) for mode in modes))
+    return Draws(alpha, draws.divergences, tuple(_mode(problem, mode) for mode in modes), found)
 
 
 def _mode(problem: Problem, mode: Laplace) -> Mode:
@@ -164,20 +168,24 @@ def _mode(problem: Problem, mode: Laplace) -> Mode:
     return Mode(tuple(alpha.cpu().tolist()), objective, mode.weight)
 
 
-def _more(alpha: Tensor, plan: Plan, groups: Tensor | None = None) -> float:
-    """By which factor draws ``(C, n, P)`` must grow to reach a plan's target; at most 1 if they do.
+def _more(alpha: Tensor, groups: Tensor, target: float) -> float:
+    """By which factor draws ``(C, n, P)`` must grow to reach a sample size and an R-hat; at most 1 if they do.
 
-    With ``groups`` ``(C,)`` draws are judged about the mean of their group. Modes that chains never leave would
-    otherwise keep R-hat up however long they are.
+    Draws are judged about the mean of their group ``(C,)``: modes that chains never leave would otherwise keep R-hat up
+    however long they are.
     """
     if alpha.shape[1] < 4:
         return 2.0
-    if groups is not None and int(groups.max()):
+    if int(groups.max()):
         alpha = alpha.clone()
         for group in groups.unique():
             alpha[groups == group] -= alpha[groups == group].mean((0, 1))
-    factor = (plan.target_ess or 0.0) / float(torch.minimum(bulk_ess(alpha), tail_ess(alpha)).min())
-    excess = float(r_hat(alpha).max()) - 1
+    return _missing(figures(alpha), target)
+
+
+def _missing(found: Figures, target: float) -> float:
+    excess = found.worst_r_hat - 1
+    factor = target / found.least_ess
     if not excess < R_HAT_THRESHOLD - 1:  # the excess falls in proportion to the length
         factor = max(factor, excess / (R_HAT_THRESHOLD - 1), 1.2)
     return factor

@@ -48,7 +48,7 @@ def diagnose(
     problems: list[str] = []
     converged: bool | None = None
     if draws is not None and samples is not None:
-        alpha = _quality(samples, names)
+        alpha = _quality(samples, names, draws.figures)
         if propagate is not None:
             labels, moments = _parameter_draws(propagate, samples)
             parameters = _quality(moments, labels)
@@ -92,9 +92,11 @@ def diagnose(
     )
 
 
-def _quality(draws: Tensor, names: tuple[str, ...]) -> dict[str, Quality]:
-    figures = (measure.r_hat(draws), measure.bulk_ess(draws), measure.tail_ess(draws))
-    return {name: Quality(*(float(figure[i]) for figure in figures)) for i, name in enumerate(names)}
+def _quality(
+    draws: Tensor, names: tuple[str, ...], known: measure.Figures | None = None
+) -> dict[str, Quality]:
+    found = measure.figures(draws) if known is None else known
+    return {name: Quality(*(float(figure[i]) for figure in found)) for i, name in enumerate(names)}
 
 
 def _parameter_draws(propagate: NISP, samples: Tensor) -> tuple[tuple[str, ...], Tensor]:

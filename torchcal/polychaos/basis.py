@@ -227,6 +227,10 @@ def _check_indices(indices: Tensor) -> int:
     return int(indices.max())
 
 
+_MANY = 200_000
+"""Values from which on the arithmetic costs more than the calls."""
+
+
 def evaluate(basis: Basis, indices: Tensor, xi: Tensor) -> Tensor:
     r"""Evaluate the multivariate polynomials :math:`\Psi_k(\xi) = \prod_j \psi_{k_j}(\xi_j)`.
 
@@ -253,12 +257,33 @@ def evaluate(basis: Basis, indices: Tensor, xi: Tensor) -> Tensor:
     count, dim = indices.shape
     if xi.ndim == 0 or xi.shape[-1] != dim:
         raise ShapeError(f"Expected xi of shape (..., {dim}), as indices have. Got {xi.shape=}.")
+    if dim and xi.numel() // dim * count > _MANY:
+        return _by_prefixes(basis, indices, xi, order)
     table = basis.evaluate(xi, order)
     columns = indices.to(device=xi.device, dtype=torch.int64)
     result = xi.new_ones((*xi.shape[:-1], count))
     for j in range(dim):
         result = result * table[..., j, :].index_select(-1, columns[:, j])
     return result
+
+
+def _by_prefixes(basis: Basis, indices: Tensor, xi: Tensor, order: int) -> Tensor:
+    """The same, one product a polynomial: most are another one of the set times one factor more."""
+    one = torch.ones_like(xi[..., 0])
+    factors = [basis.evaluate(x, order).unbind(-1) for x in xi.unbind(-1)]
+    known: dict[tuple[tuple[int, int], ...], Tensor] = {(): one}
+    columns = []
+    for row in indices.tolist():
+        prefix: tuple[tuple[int, int], ...] = ()
+        for j, degree in enumerate(row):
+            if degree == 0:
+                continue
+            longer = (*prefix, (j, degree))
+            if longer not in known:
+                known[longer] = known[prefix] * factors[j][degree] if prefix else factors[j][degree]
+            prefix = longer
+        columns.append(known[prefix])
+    return torch.stack(columns, dim=-1)
 
 
 def norms(basis: Basis, indices: Tensor) -> Tensor:

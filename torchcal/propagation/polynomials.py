@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchcal import polychaos
+from torchcal.simulators import ExternalSimulator, PolynomialSurrogate
 
 if TYPE_CHECKING:
     from torchcal.propagation.nisp import NISP
@@ -25,6 +26,9 @@ MOST_TERMS = 500
 TOLERANCE = 1e-9
 """How well the polynomial must hold at points that it was not made from, relative to the largest output."""
 
+_DEAR = (ExternalSimulator, PolynomialSurrogate)
+"""Simulators that are not called again once their coefficients are known, or that take them anyway."""
+
 _SPARE = 8
 """Points to test it at."""
 
@@ -32,14 +36,14 @@ _SPARE = 8
 def expansion(propagate: "NISP") -> tuple[Tensor, Tensor] | None:
     """Multi-indices ``(M, d)`` and coefficients ``(M, n)`` of the outputs in Legendre products of scaled parameters.
 
-    None where the simulator says nothing of a degree, a parameter is on a logarithmic scale, or what it says does not
-    hold: then nodes are evaluated as of any other simulator.
+    None where the simulator says nothing of a degree, a parameter is on a logarithmic scale, what it says does not
+    hold, or there are fewer outputs than coefficients: then nodes are evaluated as of any other simulator.
     """
     degree, d = propagate.simulator.degree, len(propagate.free)
     if degree is None or d == 0 or bool(propagate.scaling.log.any()):
         return None
     count = math.comb(degree + d, d)
-    if count > MOST_TERMS:
+    if count > MOST_TERMS or (count > propagate._n and not isinstance(propagate.simulator, _DEAR)):
         return None
     terms = polychaos.multi_indices(d, degree)
     generator = torch.Generator().manual_seed(0)
