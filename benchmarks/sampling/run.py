@@ -40,7 +40,7 @@ class Settings:
     out: Path
     goals: tuple[int, ...] = (1000, 50_000)
     limit: float = 120.0
-    reference: int = 200_000
+    reference: int = 50_000
     reference_limit: float = 300.0
     threads: int = 2
 

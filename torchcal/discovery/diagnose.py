@@ -179,8 +179,8 @@ def _contains(simulator: Simulator, term: Term) -> bool:
 
 
 def _wants_more(search: Search) -> bool:
-    """Whether one term is not the whole story."""
-    physical = [m for m in search.models if m.physical]
+    """Whether one term is not the whole story, as far as a window in it does not stand in for another one."""
+    physical = [m for m in search.models if m.physical and m.window is None]
     if not physical:
         return True
     best = max(physical, key=lambda m: m.weight)

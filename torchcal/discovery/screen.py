@@ -18,7 +18,7 @@ from torchcal.discovery.channels import responses
 from torchcal.discovery.structure import Residual
 from torchcal.simulators import Trajectories
 
-__all__ = ["Screening", "Window", "contributions", "screen", "windows"]
+__all__ = ["Screening", "Window", "contributions", "screen", "windows", "windows_of"]
 
 #: A tangent whose projection keeps less than this share of it says nothing new.
 VANISHED = 1e-5
@@ -165,40 +165,60 @@ def windows(residual: Residual, candidates: Sequence[Candidate], screening: Scre
     parts, drivers = contributions(residual, candidates, screening)
     for i, response in parts.items():
         column = screening.best[i]
-        response = residual.tangent(response)
-        total = float(response.sum(1).norm())
         sign = candidates[i].one_sided(candidates[i].amplitudes[int(screening.amplitude[column])])
-        for name, driver in drivers.items():
-            order = driver.argsort(stable=True)
-            if not float(driver[order[-1]]) > float(driver[order[0]]):
-                continue
-            running = torch.cat([response.new_zeros(len(response), 1), response[:, order].cumsum(1)], dim=1)
-            cuts = torch.linspace(0, len(order), 13).round().long().unique()
-            edges = [
-                (int(a), int(b))
-                for x, a in enumerate(cuts)
-                for b in cuts[x + 1 :]
-                if (int(a), int(b)) != (0, len(order))
-            ]
-            columns = torch.stack([running[:, b] - running[:, a] for a, b in edges], dim=-1)
-            norm = columns.norm(dim=0)
-            keep = norm > max(VANISHED * total, 1e-300)
-            if not bool(keep.any()):
-                continue
-            unit = torch.where(keep, columns / norm.clamp_min(1e-300), torch.zeros_like(columns))
-            z = unit.T @ residual.e
-            simulated = unit.T @ residual.null
-            if sign:
-                z, simulated = (sign * z).clamp_min(0), (sign * simulated).clamp_min(0)
-            null = torch.maximum(null, simulated.abs().amax(0))
-            ordered = driver[order]
-            chosen = int(z.abs().argmax())
-            open_ended = torch.tensor([a == 0 or b == len(order) for a, b in edges])
-            simple = int(torch.where(open_ended, z.abs(), torch.zeros_like(z)).argmax())
-            for k in dict.fromkeys((chosen, simple)):
-                a, b = edges[k]
-                low = -math.inf if a == 0 else float(0.5 * (ordered[a - 1] + ordered[a]))
-                high = math.inf if b == len(order) else float(0.5 * (ordered[b - 1] + ordered[b]))
-                size = float((unit[:, k] @ residual.e) / norm[k].clamp_min(1e-300))
-                found.append(Window(i, name, low, high, float(z[k].abs()), size))
+        mine, largest = windows_of(i, residual, response, drivers, sign)
+        found += mine
+        null = torch.maximum(null, largest)
+    return found, null
+
+
+def windows_of(
+    number: int, residual: Residual, response: Tensor, drivers: dict[str, Tensor], sign: int
+) -> tuple[list[Window], Tensor]:
+    """The best window of one change, and the best with an open end, in every driver.
+
+    Args:
+        number: Of the candidate.
+        residual: What is to be explained.
+        response: Of the data to the change at each point, ``(n, K)``.
+        drivers: At the points, ``(K,)`` each.
+        sign: Which the change must have; 0 for either.
+
+    Returns:
+        Windows, and the largest score in each simulated residual.
+    """
+    found: list[Window] = []
+    null = torch.zeros(residual.null.shape[1], dtype=torch.float64)
+    response = residual.tangent(response)
+    total = float(response.sum(1).norm())
+    for name, driver in drivers.items():
+        order = driver.argsort(stable=True)
+        if not float(driver[order[-1]]) > float(driver[order[0]]):
+            continue
+        running = torch.cat([response.new_zeros(len(response), 1), response[:, order].cumsum(1)], dim=1)
+        cuts = torch.linspace(0, len(order), 13).round().long().unique()
+        edges = [
+            (int(a), int(b)) for x, a in enumerate(cuts) for b in cuts[x + 1 :] if (int(a), int(b)) != (0, len(order))
+        ]
+        columns = torch.stack([running[:, b] - running[:, a] for a, b in edges], dim=-1)
+        norm = columns.norm(dim=0)
+        keep = norm > max(VANISHED * total, 1e-300)
+        if not bool(keep.any()):
+            continue
+        unit = torch.where(keep, columns / norm.clamp_min(1e-300), torch.zeros_like(columns))
+        z = unit.T @ residual.e
+        simulated = unit.T @ residual.null
+        if sign:
+            z, simulated = (sign * z).clamp_min(0), (sign * simulated).clamp_min(0)
+        null = torch.maximum(null, simulated.abs().amax(0))
+        ordered = driver[order]
+        chosen = int(z.abs().argmax())
+        open_ended = torch.tensor([a == 0 or b == len(order) for a, b in edges])
+        simple = int(torch.where(open_ended, z.abs(), torch.zeros_like(z)).argmax())
+        for k in dict.fromkeys((chosen, simple)):
+            a, b = edges[k]
+            low = -math.inf if a == 0 else float(0.5 * (ordered[a - 1] + ordered[a]))
+            high = math.inf if b == len(order) else float(0.5 * (ordered[b - 1] + ordered[b]))
+            size = float((unit[:, k] @ residual.e) / norm[k].clamp_min(1e-300))
+            found.append(Window(number, name, low, high, float(z[k].abs()), size))
     return found, null

@@ -221,14 +221,18 @@ class Search:
         row = candidate.begin.clone()
         row[candidate.own] = candidate.shapes[shape]
         row[candidate.amplitudes[amplitude]] += size
-        w = self.base.whitening
-        slope, tangent = w(self.base.jacobian), w(candidate.tangents[shape, :, amplitude, None])
-        unit = slope.norm(dim=0).clamp_min(1e-300)
-        change = torch.linalg.lstsq(slope / unit, tangent, driver="gelsd").solution[:, 0] / unit
+        change = self.made_up(candidate.tangents[shape, :, amplitude])
         names = [q.name for q in candidate.problem.parameters]
         for i, moved in zip(self.base.free, change.tolist(), strict=True):
             row[names.index(self.base.problem.parameters[i].name)] -= size * moved
         return row
+
+    def made_up(self, effect: Tensor) -> Tensor:
+        """The change of the base's free parameters that has most of an effect on the data ``(n,)``, to first order."""
+        w = self.base.whitening
+        slope = w(self.base.jacobian)
+        unit = slope.norm(dim=0).clamp_min(1e-300)
+        return torch.linalg.lstsq(slope / unit, w(effect[:, None]), driver="gelsd").solution[:, 0] / unit
 
     def _blind_begin(self, candidate: Candidate) -> Tensor:
         """Amplitudes of all magnitudes, where the tangent says nothing."""

@@ -3,8 +3,9 @@
 import math
 
 import torch
+from torch import Tensor
 
-from torchcal.discovery.candidates import drivers_scale, prepare
+from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
 from torchcal.discovery.screen import screen
 from torchcal.discovery.search import PRIOR, Model, Search
 from torchcal.discovery.structure import Residual
@@ -13,7 +14,9 @@ from torchcal.errors import DomainError, SimulatorError
 __all__ = ["refit_several"]
 
 #: Pairs that are refitted at most.
-MOST = 12
+MOST = 14
+#: Of them from the linear search; and the correlation of two tangents from which on they are one.
+FROM_LINEAR, NEARLY_SAME = 8, 0.999
 
 
 def refit_several(search: Search) -> None:
@@ -22,15 +25,15 @@ def refit_several(search: Search) -> None:
     count = len(search.candidates)
     if count < 2 or search.max_terms < 2:
         return
-    wanted: dict[tuple[int, ...], None] = {}
-    for pair in _linear_pairs(search):
-        wanted[pair] = None
+    wanted: dict[tuple[int, ...], tuple[int, int] | None] = {}
+    for columns in _linear_pairs(search):
+        wanted[tuple(int(search.screening.owner[k]) for k in columns)] = columns
     for model in single[:3]:
         for j in _next_terms(search, model)[:5]:
-            wanted[tuple(sorted((model.numbers[0], j)))] = None
+            wanted.setdefault(tuple(sorted((model.numbers[0], j))), None)
     pairs = [pair for pair in wanted if len(set(pair)) == 2][:MOST]
     prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))
-    tried = [_refit_terms(search, pair, prior) for pair in pairs]
+    tried = [_refit_terms(search, pair, prior, wanted[pair]) for pair in pairs]
     fitted = [m for m in tried if m is not None]
     search.models += fitted
     if search.max_terms < 3 or not fitted:
@@ -47,16 +50,57 @@ def refit_several(search: Search) -> None:
 
 
 def _linear_pairs(search: Search) -> list[tuple[int, int]]:
-    usable = [i for i in range(len(search.candidates)) if search.screening.best[i] >= 0 and i not in search.gone]
+    """Columns of two candidates, each at any of its shapes, that explain most together; the best of each two."""
+    screening = search.screening
+    usable = (screening.norm > 0).nonzero()[:, 0]
+    usable = usable[[int(i) not in search.gone for i in screening.owner[usable]]]
     if len(usable) < 2:
         return []
-    columns = search.screening.columns[:, [search.screening.best[i] for i in usable]]
+    columns, owner = screening.columns[:, usable], screening.owner[usable]
     z = columns.T @ search.residual.e
     c = columns.T @ columns
-    gain = (z[:, None].square() + z.square() - 2 * c * z[:, None] * z) / (1 - c.square()).clamp_min(1e-6)
-    gain = torch.where(c.abs() > 0.9995, torch.zeros_like(gain), gain).triu(1)
-    order = gain.flatten().argsort(descending=True)[:8]
-    return [(usable[int(k) // len(usable)], usable[int(k) % len(usable)]) for k in order]
+    rest = (1 - c.square()).clamp_min(1e-6)
+    size = (z[:, None] - c * z) / rest  # of the first of the two
+    gain = (z[:, None].square() + z.square() - 2 * c * z[:, None] * z) / rest
+    sided = [search.candidates[int(owner[k])].one_sided(_amplitude(search, int(usable[k]))) for k in range(len(usable))]
+    sign = torch.tensor(sided, dtype=torch.float64)[:, None]
+    allowed = sign * size >= 0
+    allowed &= allowed.T & (c.abs() < NEARLY_SAME) & (owner[:, None] < owner)
+    gain = torch.where(allowed, gain, torch.zeros_like(gain))
+    chosen: dict[tuple[int, int], tuple[int, int]] = {}
+    for k in gain.flatten().argsort(descending=True).tolist():
+        i, j = k // len(usable), k % len(usable)
+        if float(gain[i, j]) <= 0 or len(chosen) == FROM_LINEAR:
+            break
+        chosen.setdefault((int(owner[i]), int(owner[j])), (int(usable[i]), int(usable[j])))
+    return list(chosen.values())
+
+
+def _amplitude(search: Search, column: int) -> int:
+    """Place of a column's amplitude among its candidate's parameters."""
+    candidate = search.candidates[int(search.screening.owner[column])]
+    return candidate.amplitudes[int(search.screening.amplitude[column])]
+
+
+def _linear_row(search: Search, candidate: Candidate, columns: tuple[int, int]) -> Tensor:
+    """Starting values of a pair: the linear estimate at the shapes of two columns, the base moved to make up for it."""
+    screening = search.screening
+    pair = screening.columns[:, list(columns)]
+    sizes = torch.linalg.lstsq(pair, search.residual.e[:, None], driver="gelsd").solution[:, 0]
+    sizes = sizes / screening.norm[list(columns)]
+    names = [q.name for q in candidate.problem.parameters]
+    row = candidate.begin.clone()
+    effect = torch.zeros(search.base.problem.n, dtype=torch.float64)
+    for column, size in zip(columns, sizes, strict=True):
+        single = search.candidates[int(screening.owner[column])]
+        g, place = int(screening.shape[column]), _amplitude(search, column)
+        for i, value in zip(single.own, single.shapes[g].tolist(), strict=True):
+            row[names.index(single.problem.parameters[i].name)] = value
+        row[names.index(single.problem.parameters[place].name)] += float(size)
+        effect += size * single.tangents[g, :, int(screening.amplitude[column])]
+    for i, moved in zip(search.base.free, search.made_up(effect).tolist(), strict=True):
+        row[names.index(search.base.problem.parameters[i].name)] -= moved
+    return row
 
 
 def _next_terms(search: Search, model: Model) -> list[int]:
@@ -78,7 +122,9 @@ def _next_terms(search: Search, model: Model) -> list[int]:
     return [j for _, j in sorted(scores)]
 
 
-def _refit_terms(search: Search, numbers: tuple[int, ...], prior: float) -> Model | None:
+def _refit_terms(
+    search: Search, numbers: tuple[int, ...], prior: float, columns: tuple[int, int] | None = None
+) -> Model | None:
     terms = [term for i in numbers for term in search.candidates[i].terms]
     search.tick("refit with " + ", ".join(term.name for term in terms))
     try:
@@ -111,4 +157,6 @@ def _refit_terms(search: Search, numbers: tuple[int, ...], prior: float) -> Mode
                 value = float(fitted.found.values[place]) if fitted is not None else neutral
                 row[k] = neutral + 0.02 * (value - neutral) if place in source.amplitudes else value
         rows.append(row)
+    if columns is not None:
+        rows.append(_linear_row(search, candidate, columns))
     return search._refit(numbers, candidate, torch.stack(rows), prior)

@@ -3,16 +3,22 @@
 import dataclasses
 import math
 
+import torch
+
 from torchcal.discovery.candidates import prepare
+from torchcal.discovery.channels import responses
 from torchcal.discovery.local import localised
-from torchcal.discovery.screen import Window
+from torchcal.discovery.screen import Window, windows_of
 from torchcal.discovery.search import PRIOR, Model, Search
+from torchcal.discovery.structure import Residual
+from torchcal.discovery.verdict import PLAINLY_WHITE
 from torchcal.errors import DomainError, SimulatorError
+from torchcal.simulators import Trajectories
 
 __all__ = ["refit_local", "refit_window"]
 
-#: Refits at most.
-MOST = 6
+#: Refits at most; around one refitted term; and how many of those.
+MOST, MOST_AROUND, LEADING = 6, 2, 2
 #: Data below which no window is sought; nor is any without noise, where a window bends to whatever is left.
 LEAST = 30
 
@@ -35,10 +41,58 @@ def refit_local(search: Search) -> None:
         model = refit_window(search, w, prior)
         if model is not None:
             search.models.append(model)
+    for single in sorted((m for m in search.models if m.window is None), key=lambda m: -m.log_evidence)[:LEADING]:
+        if search.examine(single).p_value >= PLAINLY_WHITE:
+            continue
+        for w in _around(search, single)[:MOST_AROUND]:
+            search.tick(f"refit with local {search.candidates[w.candidate].name}")
+            model = refit_window(search, w, prior, single)
+            if model is not None:
+                search.models.append(model)
 
 
-def refit_window(search: Search, w: Window, prior: float) -> Model | None:
-    """Base and one local term, begun at the window that the screening found."""
+def _around(search: Search, model: Model) -> list[Window]:
+    """Where a refitted term acts more than elsewhere, or where it does not act at all: the best window a driver.
+
+    At the base a strong effect is far from linear; here only its range is still wrong.
+    """
+    found, term = model.found, model.candidate.terms[0]
+    if term.states or term.frees or term.outputs:
+        return []
+    residual = model.residual or Residual(found, search.noise, seed=search.seed, draws=10)
+    number = model.numbers[0]
+    column = search.screening.best[number]
+    if column < 0:
+        return []
+    place = model.candidate.amplitudes[int(search.screening.amplitude[column])]
+    bound = found.problem.simulator
+    if isinstance(bound, Trajectories):
+        with torch.no_grad():
+            forcing = bound._step_derivatives(found.values[None], found.warm, [place])[2][0]
+        response, drivers, _ = responses(found.problem, found, forcing)
+        response = response[:, :, 0]
+    elif place in found.free:
+        response = torch.diag(found.jacobian[:, found.free.index(place)])
+        at = found.problem.drivers(found.values[None], None)
+        drivers = {name: values[found.problem.condition_of] for name, values in at.items()}
+    else:
+        return []
+    value = float(found.values[place] - model.candidate.neutral[model.candidate.own.index(place)])
+    kept: dict[str, Window] = {}
+    for w in sorted(windows_of(number, residual, response, drivers, 0)[0], key=lambda w: -w.z):
+        if w.driver not in search._drivers() or w.driver in kept or w.z < 3.5:
+            continue
+        if w.amplitude * value < 0:  # too much of it there: it acts on the other side
+            if math.isfinite(w.low) and math.isfinite(w.high):
+                continue
+            low = w.high if math.isfinite(w.high) else -math.inf
+            w = dataclasses.replace(w, low=low, high=w.low if math.isfinite(w.low) else math.inf, amplitude=0.0)
+        kept[w.driver] = w
+    return list(kept.values())
+
+
+def refit_window(search: Search, w: Window, prior: float, near: Model | None = None) -> Model | None:
+    """Base and one local term, begun at the window that the screening found, from the base or near a model of it."""
     plain = search.candidates[w.candidate]
     driver = search._drivers()[w.driver]
     span = (float(driver.min()), float(driver.max()))
@@ -56,12 +110,12 @@ def refit_window(search: Search, w: Window, prior: float) -> Model | None:
     amplitude = plain.problem.parameters[plain.amplitudes[int(search.screening.amplitude[column])]].name
     begin = candidate.begin.clone()
     values[amplitude] += 0.02 * w.amplitude
-    for i in candidate.own:
-        name = candidate.problem.parameters[i].name
-        if name in values:
-            begin[i] = values[name]
-        else:
-            begin[i] = w.low if name.endswith("from") else w.high
+    if near is not None:
+        values = dict(zip([q.name for q in near.found.problem.parameters], near.found.values.tolist(), strict=True))
+        values[amplitude] += w.amplitude
+    ends = {f"{term.name}.window from": w.low, f"{term.name}.window to": w.high}
+    for i, q in enumerate(candidate.problem.parameters):
+        begin[i] = ends.get(q.name, values.get(q.name, float(begin[i])))
     # Windows were searched on a grid of about 12 edges: the best of so many costs its logarithm.
     model = search._refit(
         (w.candidate,), candidate, begin[None], prior - math.log(3.0 * len(search._drivers())), window=w
