@@ -5,6 +5,7 @@ import math
 import time
 import warnings
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from typing import Any
 
 from torch import Tensor
@@ -25,6 +26,7 @@ from torchcal.discovery.verdict import PLAINLY_WHITE, Decision, decide
 from torchcal.discovery.windows import refit_local
 from torchcal.errors import ConvergenceWarning, DomainError, RecordingError
 from torchcal.simulators import Parameter, Simulator, Trajectories
+from torchcal.simulators.executor import check_executor
 from torchcal.terms import Term, extend
 
 __all__ = ["diagnose"]
@@ -49,6 +51,7 @@ def diagnose(
     max_terms: int = 3,
     num_starts: int = 12,
     seed: int = 0,
+    executor: Executor | None = None,
     progress: bool = True,
 ) -> Diagnosis:
     """Find the physics that was left out of a simulation, or say that nothing is missing, or that it is unknown.
@@ -70,6 +73,8 @@ def diagnose(
         max_terms: Terms that may be missing together.
         num_starts: Starting values of the base's calibration.
         seed: Of every random number.
+        executor: Any ``concurrent.futures.Executor``, on whose workers hypotheses are refitted; None refits them
+            here. It pays where one refit takes seconds. Terms of lambdas need cloudpickle to get there.
         progress: Whether to show a bar.
 
     Returns:
@@ -84,6 +89,7 @@ def diagnose(
     terms = _check(simulator, recording, candidates, confidence, max_terms, num_starts)
     if isinstance(seed, bool) or not isinstance(seed, int):
         raise DomainError(f"Expected seed as an integer. Got {seed!r}.")
+    check_executor(executor, diagnose)
     given = terms
     terms = [term for term in given if not _contains(simulator, term)]
     problem = Problem.of(simulator, recording)
@@ -105,7 +111,7 @@ def diagnose(
         bar.update()
 
     try:
-        search = Search(problem, terms, fixed or {}, seed, num_starts, max_terms, tick)
+        search = Search(problem, terms, fixed or {}, seed, num_starts, max_terms, tick, executor)
         tick("calibrate the base")
         search.calibrate_base()
         search.screen_all()

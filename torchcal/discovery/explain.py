@@ -10,7 +10,7 @@ from torchcal.discovery.channels import Channel
 from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.local import region_text
 from torchcal.discovery.records import Estimate, Fit, Limit, Location, MissingRate, NeededShift, Table
-from torchcal.discovery.search import Model, Search
+from torchcal.discovery.search import PRIOR, Model, Search
 from torchcal.discovery.structure import Place, Structure
 from torchcal.terms import Term
 
@@ -135,8 +135,7 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
     # Several families of statistics share the level: each may use as much of it as leaves alpha in all.
     level = float(search.least.quantile(alpha))
     critical = float(screening.null.quantile(1 - level)) if len(screening.null) else 3.5
-    if math.isfinite(search.noise.freedom):  # the noise's estimate wavers, and the score with it
-        from_power *= math.sqrt(1 + critical**2 / (2 * search.noise.freedom))
+    odds = math.log(PRIOR["base"] / (PRIOR["single"] / max(len(search.candidates), 1)))
     fitted = {m.numbers[0]: m for m in search.models if len(m.numbers) == 1 and m.window is None}
     rows = []
     for i, candidate in enumerate(search.candidates):
@@ -150,8 +149,13 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
             rows.append(Limit(candidate.name, q.name, math.inf, q.unit, power, estimate, note))
             continue
         norm = float(screening.norm[column])
+        # Seen is not enough: the evidence for the term must outweigh that for the base too.
+        wanted = max(critical, math.sqrt(max(2 * odds + len(candidate.own) * math.log(search.problem.n), 0.0)))
+        doubt = 1.0
+        if math.isfinite(search.noise.freedom):  # the noise's estimate wavers, and the score with it
+            doubt = math.sqrt(1 + wanted**2 / (2 * search.noise.freedom))
         note = f"also: {', '.join(search.aliases[i])}" if search.aliases.get(i) else ""
-        rows.append(Limit(candidate.name, q.name, (critical + from_power) / norm, q.unit, power, estimate, note))
+        rows.append(Limit(candidate.name, q.name, (wanted + doubt * from_power) / norm, q.unit, power, estimate, note))
     for term in contained:
         name = term.full(term.parameters[0].name) if term.parameters else term.frees[0]
         rows.append(Limit(term.name, name, math.inf, None, power, None, "already in the base model"))

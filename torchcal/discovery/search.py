@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 
 import torch
@@ -9,17 +10,18 @@ from torch import Tensor
 
 from torchcal.discovery.base import calibrate_base
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
-from torchcal.discovery.fitting import Fitted, fit, refit
+from torchcal.discovery.fitting import Fitted, refit
 from torchcal.discovery.local import region_text
 from torchcal.discovery.noise import Noise, estimate
 from torchcal.discovery.problem import Problem
+from torchcal.discovery.refits import Refit, refit_all
 from torchcal.discovery.screen import Screening, Window, screen, windows
 from torchcal.discovery.structure import Residual, Structure, analyse
 from torchcal.discovery.verify import HeldOut, held_out_fit
 from torchcal.simulators import Trajectories
 from torchcal.terms import Term
 
-__all__ = ["Model", "Search"]
+__all__ = ["Hypothetical", "Model", "Search"]
 
 #: Prior probabilities: of the base, of one library term, of a local one, of two, and of something else.
 PRIOR = {"base": 0.30, "single": 0.40, "local": 0.10, "several": 0.08, "none": 0.12}
@@ -73,6 +75,17 @@ class Model:
         return self.log_evidence + self.log_prior
 
 
+@dataclass(frozen=True, eq=False)
+class Hypothetical:
+    """A hypothesis to refit: see `Model`; ``begin`` holds its starting values ``(H, P)``."""
+
+    numbers: tuple[int, ...]
+    candidate: Candidate
+    begin: Tensor
+    prior: float
+    window: Window | None = None
+
+
 @dataclass(eq=False)
 class Search:
     """The state of a diagnosis: the base's fit, the noise, the candidates and the models refitted so far."""
@@ -84,6 +97,7 @@ class Search:
     num_starts: int
     max_terms: int
     tick: Callable[[str], None]
+    executor: Executor | None = None
     base: Fitted = field(init=False)
     noise: Noise = field(init=False)
     residual: Residual = field(init=False)
@@ -177,11 +191,8 @@ class Search:
         top = self.screening.score(order[0]) if order else 0.0
         promising = [i for k, i in enumerate(order) if k < FEW or self.screening.score(i) >= CHANCE * top]
         chosen = promising[:MOST] if detected else order[:FEW]
-        for i in [*chosen, *blind]:
-            self.tick(f"refit with {self.candidates[i].name}")
-            model = self._refit((i,), self.candidates[i], self._begin(i), prior)
-            if model is not None:
-                self.models.append(model)
+        wanted = [Hypothetical((i,), self.candidates[i], self._begin(i), prior) for i in [*chosen, *blind]]
+        self.models += [model for model in self.refit_together(wanted) if model is not None]
         self._reweigh()
         self.merge()
 
@@ -252,30 +263,27 @@ class Search:
     def _refit(
         self, numbers: tuple[int, ...], candidate: Candidate, begin: Tensor, prior: float, window: Window | None = None
     ) -> Model | None:
-        whitening = self.noise.whitening(candidate.problem)
-        warm = None
-        if isinstance(self.base.warm, Tensor) and isinstance(candidate.problem.simulator, Trajectories):
-            if len(candidate.problem.simulator.ode.states) == self.base.warm.shape[-1]:
-                warm = self.base.warm.expand(len(begin), *self.base.warm.shape[1:])
-        shape = [i for i in candidate.own if i not in candidate.amplitudes]
-        if shape:  # while the amplitude is small its shape means nothing
-            first = fit(
-                candidate.problem,
-                whitening,
-                begin,
-                [i for i in candidate.free if i not in shape],
-                warm=warm,
-                max_steps=12,
-            )
-            if first is None or first.ends is None or first.ends_chi2 is None:
-                return None
-            begin, warm = first.ends[first.ends_chi2.argsort()[:2]], None
-            if isinstance(first.warm, Tensor):
-                warm = first.warm.expand(len(begin), *first.warm.shape[1:])
-        found = fit(candidate.problem, whitening, begin, candidate.free, warm=warm, max_steps=60)
-        if found is None:
-            return None
-        return self._judge(Model(numbers, candidate, found, 0.0, prior, True, window=window))
+        return self.refit_together([Hypothetical(numbers, candidate, begin, prior, window)])[0]
+
+    def refit_together(self, wanted: Sequence["Hypothetical"]) -> list[Model | None]:
+        """Refit several hypotheses, on the executor where there is one."""
+        jobs = []
+        for one in wanted:
+            candidate, begin = one.candidate, one.begin
+            warm = None
+            if isinstance(self.base.warm, Tensor) and isinstance(candidate.problem.simulator, Trajectories):
+                if len(candidate.problem.simulator.ode.states) == self.base.warm.shape[-1]:
+                    warm = self.base.warm.expand(len(begin), *self.base.warm.shape[1:])
+            shape = [i for i in candidate.own if i not in candidate.amplitudes]
+            whitening = self.noise.whitening(candidate.problem)
+            jobs.append(Refit(candidate.problem, whitening, begin, candidate.free, shape, warm))
+        names = [" + ".join(term.name for term in one.candidate.terms) for one in wanted]
+        found = refit_all(jobs, self.executor, lambda index: self.tick(f"refit with {names[index]}"))
+        return [
+            None if fitted is None
+            else self._judge(Model(one.numbers, one.candidate, fitted, 0.0, one.prior, True, window=one.window))
+            for one, fitted in zip(wanted, found, strict=True)
+        ]  # fmt: skip
 
     def _judge(self, model: Model) -> Model:
         """Evidence, bounds and what speaks against it."""

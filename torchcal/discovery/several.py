@@ -1,13 +1,14 @@
 """Several terms together: effects hide each other, so pairs are searched as well as second and third terms."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
 from torchcal.discovery.screen import screen
-from torchcal.discovery.search import PRIOR, Model, Search
+from torchcal.discovery.search import PRIOR, Hypothetical, Model, Search
 from torchcal.discovery.structure import Residual
 from torchcal.errors import DomainError, SimulatorError
 
@@ -33,20 +34,15 @@ def refit_several(search: Search) -> None:
             wanted.setdefault(tuple(sorted((model.numbers[0], j))), None)
     pairs = [pair for pair in wanted if len(set(pair)) == 2][:MOST]
     prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))
-    tried = [_refit_terms(search, pair, prior, wanted[pair]) for pair in pairs]
-    fitted = [m for m in tried if m is not None]
+    fitted = _refit_sets(search, [(pair, wanted[pair]) for pair in pairs], prior)
     search.models += fitted
     if search.max_terms < 3 or not fitted:
         return
     best = max(fitted, key=lambda m: m.weight)
     if search.examine(best).p_value < 0.01 or search.exact:
         third = math.log(0.2 * PRIOR["several"] / (count * (count - 1) * max(count - 2, 1) / 6))
-        for j in _next_terms(search, best)[:4]:
-            if j in best.numbers:
-                continue
-            again = _refit_terms(search, tuple(sorted((*best.numbers, j))), third)
-            if again is not None:
-                search.models.append(again)
+        more = [tuple(sorted((*best.numbers, j))) for j in _next_terms(search, best)[:4] if j not in best.numbers]
+        search.models += _refit_sets(search, [(numbers, None) for numbers in more], third)
 
 
 def _linear_pairs(search: Search) -> list[tuple[int, int]]:
@@ -122,11 +118,19 @@ def _next_terms(search: Search, model: Model) -> list[int]:
     return [j for _, j in sorted(scores)]
 
 
-def _refit_terms(
-    search: Search, numbers: tuple[int, ...], prior: float, columns: tuple[int, int] | None = None
-) -> Model | None:
+def _refit_sets(
+    search: Search, sets: Sequence[tuple[tuple[int, ...], tuple[int, int] | None]], prior: float
+) -> list[Model]:
+    """Refit sets of candidates, each with the columns of the linear search that suggested it."""
+    wanted = [_hypothetical(search, numbers, prior, columns) for numbers, columns in sets]
+    found = search.refit_together([one for one in wanted if one is not None])
+    return [model for model in found if model is not None]
+
+
+def _hypothetical(
+    search: Search, numbers: tuple[int, ...], prior: float, columns: tuple[int, int] | None
+) -> Hypothetical | None:
     terms = [term for i in numbers for term in search.candidates[i].terms]
-    search.tick("refit with " + ", ".join(term.name for term in terms))
     try:
         candidate = prepare(
             search.base.problem, search.base, terms, search.fixed, drivers_scale(search.base.problem, search.base)
@@ -159,4 +163,4 @@ def _refit_terms(
         rows.append(row)
     if columns is not None:
         rows.append(_linear_row(search, candidate, columns))
-    return search._refit(numbers, candidate, torch.stack(rows), prior)
+    return Hypothetical(numbers, candidate, torch.stack(rows), prior)

@@ -19,6 +19,8 @@ __all__ = ["refit_local", "refit_window"]
 
 #: Refits at most; around one refitted term; and how many of those.
 MOST, MOST_AROUND, LEADING = 6, 2, 2
+#: Relative difference of χ² up to which two windows of one term and driver are one.
+SAME = 1e-4
 #: Data below which no window is sought; nor is any without noise, where a window bends to whatever is left.
 LEAST = 30
 
@@ -37,18 +39,23 @@ def refit_local(search: Search) -> None:
     promising.sort(key=lambda w: -w.z)
     prior = math.log(PRIOR["local"] / max(len(search.candidates), 1))
     for w in promising[:MOST]:
-        search.tick(f"refit with local {search.candidates[w.candidate].name}")
-        model = refit_window(search, w, prior)
-        if model is not None:
-            search.models.append(model)
+        _keep(search, refit_window(search, w, prior))
     for single in sorted((m for m in search.models if m.window is None), key=lambda m: -m.log_evidence)[:LEADING]:
         if search.examine(single).p_value >= PLAINLY_WHITE:
             continue
         for w in _around(search, single)[:MOST_AROUND]:
-            search.tick(f"refit with local {search.candidates[w.candidate].name}")
-            model = refit_window(search, w, prior, single)
-            if model is not None:
-                search.models.append(model)
+                _keep(search, refit_window(search, w, prior, single))
+
+
+def _keep(search: Search, model: Model | None) -> None:
+    """Add a model, unless the same one was found before from another start."""
+    if model is None or model.window is None:
+        return
+    for other in search.models:
+        if other.window is not None and other.numbers == model.numbers and other.window.driver == model.window.driver:
+            if abs(other.found.chi2 - model.found.chi2) < SAME * max(1.0, model.found.chi2):
+                return
+    search.models.append(model)
 
 
 def _around(search: Search, model: Model) -> list[Window]:

@@ -3,10 +3,11 @@
 Source: Vehtari, Gelman, Simpson, Carpenter & Bürkner (2021), Bayesian Analysis 16, 667-718.
 """
 
+import math
 from typing import NamedTuple
 
 import torch
-from pyro.ops.stats import effective_sample_size, split_gelman_rubin
+from pyro.ops.stats import split_gelman_rubin
 from torch import Tensor
 
 __all__ = ["Figures", "bulk_ess", "figures", "r_hat", "tail_ess"]
@@ -85,10 +86,25 @@ def _split_r_hat(values: Tensor) -> Tensor:
 def _ess(values: Tensor) -> Tensor:
     """Of ``(Q, C, n)``, chains split in halves, ``(Q,)``."""
     half = values.shape[2] // 2
-    split = torch.cat([values[:, :, :half], values[:, :, -half:]], dim=1).permute(1, 2, 0)
-    total = float(values.shape[1] * values.shape[2])
-    found = torch.nan_to_num(effective_sample_size(split), nan=total, posinf=total)
-    return found.clamp_min(1.0)  # the estimate from a few draws can be negative
+    return torch.stack([_effective(torch.cat([value[:, :half], value[:, -half:]])) for value in values])
+
+
+def _effective(chains: Tensor) -> Tensor:
+    """Of chains ``(C, n)``: sums of neighbouring autocorrelations while positive, made to fall (Geyer 1992)."""
+    count, n = chains.shape
+    total = float(count * n)
+    offset = chains - chains.mean(1, keepdim=True)
+    power = torch.fft.rfft(offset, 2 * n).abs().square()
+    covariance = torch.fft.irfft(power, 2 * n)[:, :n].mean(0) / n
+    within = covariance[0] * n / (n - 1)
+    across = chains.mean(1).var() if count > 1 else torch.zeros_like(within)
+    correlation = 1 - (within - covariance * n / (n - 1)) / (covariance[0] + across)
+    correlation[0] = 1.0
+    pairs = correlation[: n // 2 * 2].reshape(-1, 2).sum(1)
+    positive = (pairs >= 0).to(torch.int64).cumprod(0).to(torch.bool)
+    time = 2 * (torch.cummin(pairs, 0).values * positive).sum() - 1
+    # Antithetic draws may count for more than one, but not without limit (Vehtari et al. 2021, app. A).
+    return total / torch.nan_to_num(time, nan=1.0).clamp_min(1 / math.log10(max(total, 11.0)))
 
 
 def _normal_scores(order: Tensor) -> Tensor:
