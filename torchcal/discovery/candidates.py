@@ -20,6 +20,8 @@ __all__ = ["Candidate", "base_columns", "drivers_scale", "prepare", "spread_valu
 
 #: Points of a grid of shape parameters: along one, two, three and more of them.
 GRID_POINTS = (1, 9, 5, 4)
+#: Of a shape measured on a driver's scale, how many more lie at the driver's own values: thresholds do.
+DRIVER_POINTS = (0, 7, 3, 2)
 #: Range of a shape parameter measured on a driver's scale.
 SCALE_RANGE = (0.02, 1.0)
 
@@ -195,7 +197,7 @@ def prepare(
     if not amplitudes:  # a product of parameters, or a threshold: try each with the others away from neutral
         amplitudes = _hidden_amplitudes(problem, own, certain, begin, linear)
     shape = [place for place in own if place not in amplitudes]
-    grid = _grid(problem, shape)
+    grid = _grid(problem, shape, _driver_values(base, found, terms))
     rows = begin.expand(len(grid), -1).clone()
     if shape:
         rows[:, shape] = grid
@@ -233,8 +235,32 @@ def _hidden_amplitudes(
     return [own[0]]
 
 
-def _grid(problem: Problem, shape: list[int]) -> Tensor:
-    count = GRID_POINTS[min(len(shape), len(GRID_POINTS) - 1)]
-    points = [_shape_points(problem.parameters[place], count) for place in shape]
+def _driver_values(base: Problem, found: Fitted, terms: Sequence[Term]) -> dict[str, Tensor]:
+    """Sorted magnitudes on the calibrated trajectory of the driver that each shape is measured on, by its name."""
+    if not any(term.scales for term in terms):
+        return {}
+    drivers = base.drivers(found.values[None], found.warm)
+    for number, name in enumerate(base.recording.outputs):
+        drivers.setdefault(name, found.y[base.output_of == number])
+    return {
+        term.full(own): drivers[driver].abs().flatten().sort().values
+        for term in terms for own, driver in (term.scales or {}).items()
+        if driver in drivers and driver != "t"
+    }  # fmt: skip
+
+
+def _grid(problem: Problem, shape: list[int], drivers: Mapping[str, Tensor]) -> Tensor:
+    level = min(len(shape), len(GRID_POINTS) - 1)
+    count, more = GRID_POINTS[level], DRIVER_POINTS[level]
+    points = []
+    for place in shape:
+        q = problem.parameters[place]
+        values = drivers.get(q.name)
+        if values is None or not len(values):
+            points.append(_shape_points(q, count))
+            continue
+        at = ((torch.arange(more) + 0.5) / more * (len(values) - 1)).round().long()
+        low, high = q.low or 0.0, q.high if q.high is not None else math.inf
+        points.append(_shape_points(q, count - more // 2) + [min(max(v, low), high) for v in values[at].tolist()])
     rows = list(itertools.product(*points))[:256]
     return torch.tensor(rows, dtype=torch.float64).reshape(len(rows), len(shape))
