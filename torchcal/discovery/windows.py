@@ -104,7 +104,7 @@ def refit_window(search: Search, w: Window, prior: float, near: Model | None = N
     driver = search._drivers()[w.driver]
     span = (float(driver.min()), float(driver.max()))
     term = plain.terms[0]
-    if term.frees:
+    if term.frees or not span[1] > span[0]:
         return None
     local = localised(term, w.driver, w.low, w.high, span, static=not search.problem.in_time)
     try:

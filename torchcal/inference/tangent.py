@@ -49,7 +49,7 @@ class _Tangents(Simulator):
     def __init__(self, simulator: Simulator, columns: Sequence[int]) -> None:
         self.simulator = simulator
         self.parameters = simulator.parameters
-        self.degree = 1
+        self.degree = None  # no plane holds everywhere
         self.columns = list(columns)
         self.known: dict[int, tuple[Tensor, Tensor, Tensor]] = {}
 
