@@ -10,15 +10,17 @@ from torch import Tensor
 from torchcal.simulators import Parameter
 from torchcal.terms import Term
 
-__all__ = ["EDGE", "localised", "region_text"]
+__all__ = ["EDGE", "SHARP", "localised", "region_text"]
 
-#: Width of a window's edge, as a share of the driver's range.
-EDGE = 0.02
+#: Width of a window's edge, as a share of the driver's range: wide enough for a fit to move it, and nearly a step.
+EDGE, SHARP = 0.02, 0.004
 
 _ENDS = {"from": "window from", "to": "window to"}
 
 
-def localised(term: Term, driver: str, low: float, high: float, span: tuple[float, float], *, static: bool) -> Term:
+def localised(
+    term: Term, driver: str, low: float, high: float, span: tuple[float, float], *, static: bool, edge: float = EDGE
+) -> Term:
     """The term multiplied by a window of a driver with smooth edges that are fitted with it.
 
     Args:
@@ -28,12 +30,13 @@ def localised(term: Term, driver: str, low: float, high: float, span: tuple[floa
         high: Where it ends.
         span: Range of the driver in the recording.
         static: Whether the term's functions are those of a static simulator.
+        edge: Width of an edge, as a share of the driver's range.
     """
     ends = []
     for name, value in (("from", low), ("to", high)):
         if math.isfinite(value):
             ends.append(Parameter(_ENDS[name], low=span[0], high=span[1], initial=min(max(value, span[0]), span[1])))
-    width = EDGE * (span[1] - span[0])
+    width = edge * (span[1] - span[0])
 
     def inside(d: Tensor, p: Mapping[str, Tensor]) -> Any:
         w: Any = 1.0

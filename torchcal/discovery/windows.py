@@ -7,7 +7,7 @@ import torch
 
 from torchcal.discovery.candidates import prepare
 from torchcal.discovery.channels import responses
-from torchcal.discovery.local import localised
+from torchcal.discovery.local import EDGE, SHARP, localised
 from torchcal.discovery.screen import Window, windows_of
 from torchcal.discovery.search import PRIOR, Model, Search
 from torchcal.discovery.structure import Residual
@@ -45,6 +45,19 @@ def refit_local(search: Search) -> None:
             continue
         for w in _around(search, single)[:MOST_AROUND]:
                 _keep(search, refit_window(search, w, prior, single))
+    _sharpen(search, prior)
+
+
+def _sharpen(search: Search, prior: float) -> None:
+    """The best local models again with edges that are nearly steps, where smooth ones leave something behind."""
+    ranked = sorted((m for m in search.models if m.physical), key=lambda m: -m.weight)[:LEADING]
+    for model in ranked:
+        if model.window is None or search.examine(model).p_value >= PLAINLY_WHITE:
+            continue
+        w = dataclasses.replace(model.window, amplitude=0.0)
+        sharp = refit_window(search, w, prior, model, SHARP)
+        if sharp is not None and sharp.found.chi2 < model.found.chi2:
+            search.models[search.models.index(model)] = sharp
 
 
 def _keep(search: Search, model: Model | None) -> None:
@@ -98,7 +111,9 @@ def _around(search: Search, model: Model) -> list[Window]:
     return list(kept.values())
 
 
-def refit_window(search: Search, w: Window, prior: float, near: Model | None = None) -> Model | None:
+def refit_window(
+    search: Search, w: Window, prior: float, near: Model | None = None, edge: float = EDGE
+) -> Model | None:
     """Base and one local term, begun at the window that the screening found, from the base or near a model of it."""
     plain = search.candidates[w.candidate]
     driver = search._drivers()[w.driver]
@@ -106,7 +121,7 @@ def refit_window(search: Search, w: Window, prior: float, near: Model | None = N
     term = plain.terms[0]
     if term.frees or not span[1] > span[0]:
         return None
-    local = localised(term, w.driver, w.low, w.high, span, static=not search.problem.in_time)
+    local = localised(term, w.driver, w.low, w.high, span, static=not search.problem.in_time, edge=edge)
     try:
         candidate = prepare(search.base.problem, search.base, [local], search.fixed, {})
     except (SimulatorError, DomainError):
