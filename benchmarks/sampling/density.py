@@ -54,6 +54,7 @@ class Arrays:
         x: Conditions of the function.
         center: Of the parameters' scaling, ``(d,)``.
         scale: Likewise.
+        mirror: Signs of α that leave the posterior as it is, germs apart, ``(P,)``; None where there are none.
     """
 
     y: np.ndarray
@@ -79,6 +80,7 @@ class Arrays:
     x: np.ndarray | None = None
     center: np.ndarray | None = None
     scale: np.ndarray | None = None
+    mirror: np.ndarray | None = None
 
     def save(self, path: Path) -> None:
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}

@@ -45,9 +45,15 @@ class Quality:
 
 
 def fold(arrays: Arrays, draws: np.ndarray) -> np.ndarray:
-    """Reverse germs draw by draw so that each draw agrees best with the maximum: as torchcal does with its own."""
+    """Reverse germs draw by draw so that each draw agrees best with the maximum: as torchcal does with its own.
+
+    Where a posterior is its own mirror image, draws are brought to the maximum's side too: a sampler that visits one
+    half alone and one that visits both are then judged by the same figures.
+    """
     combinations = np.array(list(itertools.product((0, 1), repeat=arrays.odd.shape[1])))
     signs = 1.0 - 2.0 * (combinations @ arrays.odd.T % 2)
+    if arrays.mirror is not None:
+        signs = np.concatenate([signs, signs * arrays.mirror])
     score = (draws * arrays.map) @ signs.T
     return draws * signs[score.argmax(-1)]
 

@@ -206,9 +206,22 @@ def export(posterior: Posterior) -> tuple[Arrays, float]:
         function=posterior.function or "",
         check_points=points.numpy(),
         check_values=values.numpy(),
+        mirror=_mirror(posterior, problem, points),
         **model,
     )
     return arrays, seconds
+
+
+def _mirror(posterior: Posterior, problem: Problem, points: Tensor) -> np.ndarray | None:
+    """x → −x turns what the parabola misses of the cubic into its negative: even coefficients change their sign."""
+    if not posterior.name.startswith("cubic-quadratic"):
+        return None
+    signs = 1.0 - 2.0 * (problem.propagate.pattern.rows % 2 == 0).to(points)
+    with torch.no_grad():
+        here, there = problem.log_prob(points), problem.log_prob(points * signs)
+    if not torch.allclose(here, there, rtol=1e-6):
+        raise RuntimeError(f"Expected a posterior that is its own mirror image. Got {here} and {there}.")
+    return signs.numpy()
 
 
 def _polynomial(propagate: tc.NISP) -> dict[str, np.ndarray]:

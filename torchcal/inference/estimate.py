@@ -32,7 +32,7 @@ MODE_GAP = 15.0
 """Log-posterior below the best from which on a maximum is not worth a chain, unless it is a million times wider."""
 
 LEAST_WEIGHT = 1e-3
-"""Share of the posterior from which on a mode gets chains."""
+"""Share of the posterior from which on a mode is told."""
 
 MOST_MODES = 6
 """Maxima that are looked at."""

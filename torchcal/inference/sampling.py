@@ -24,6 +24,9 @@ __all__ = ["Plan", "draw"]
 _FEWEST_CHAINS, _MOST_CHAINS = 32, 256
 """Where there is a target: so few chains cost no more than one, and so many use all of a core."""
 
+_LEAST_STARTED = 0.05
+"""Weight from which on chains begin at a mode: one of a few dozen chains at a mode of 2 % would be too many."""
+
 MOST_DRAWS = 20_000
 """Draws of a chain at which a search for a wanted sample size gives up."""
 
@@ -120,7 +123,8 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
     modes = modes_of(problem, estimate)
     _warn_of_rounding(estimate, plan.dtype)
     cast = problem.cast(plan.dtype)
-    starts = [mode.to(plan.dtype) for mode in modes]
+    worth = [k == 0 or mode.weight >= _LEAST_STARTED for k, mode in enumerate(modes)]
+    starts = [mode.to(plan.dtype) for mode, chosen in zip(modes, worth, strict=True) if chosen]
     pattern = problem.propagate.pattern
 
     def folded(alpha: Tensor) -> Tensor:
@@ -158,14 +162,15 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
             ConvergenceWarning,
             stacklevel=3,
         )
-    return Draws(alpha, draws.divergences, tuple(_mode(problem, mode) for mode in modes), found)
+    told = tuple(_mode(problem, mode, chosen) for mode, chosen in zip(modes, worth, strict=True))
+    return Draws(alpha, draws.divergences, told, found)
 
 
-def _mode(problem: Problem, mode: Laplace) -> Mode:
+def _mode(problem: Problem, mode: Laplace, started: bool) -> Mode:
     with torch.no_grad():
         alpha = problem.prior.transform.bound(mode.loc)
         objective = -float(problem.log_prob(alpha))
-    return Mode(tuple(alpha.cpu().tolist()), objective, mode.weight)
+    return Mode(tuple(alpha.cpu().tolist()), objective, mode.weight, started)
 
 
 def _more(alpha: Tensor, groups: Tensor, target: float) -> float:

@@ -66,10 +66,11 @@ def diagnose(
         worst = min(few, key=lambda name: few[name])
         if not few[worst] >= wanted:
             problems.append(f"effective sample size of {worst} is {few[worst]:.0f} (threshold {wanted:.0f})")
-        if loud and len(draws.modes) > 1:
+        started = [mode for mode in draws.modes if mode.started]
+        if loud and len(started) > 1:
             problems.append(
-                f"chains began at {len(draws.modes)} separate maxima and have not mixed: how many draws each has rests "
-                "on normal approximations (" + ", ".join(f"{mode.weight:.2g}" for mode in draws.modes) + ")"
+                f"chains began at {len(started)} separate maxima and have not mixed: how many draws each has rests "
+                "on normal approximations (" + ", ".join(f"{mode.weight:.2g}" for mode in started) + ")"
             )
         if draws.divergences > MOST_DIVERGENCES * samples.shape[0] * samples.shape[1]:
             problems.append(f"{draws.divergences} divergent transitions")

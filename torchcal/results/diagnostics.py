@@ -34,17 +34,19 @@ class Quality:
 
 @dataclass(frozen=True)
 class Mode:
-    """A maximum of the posterior at which chains began.
+    """A maximum of the posterior.
 
     Attributes:
         alpha: Where it is.
         objective: Negative log-posterior there.
         weight: Its share of the posterior, by the normal approximations at all of them.
+        started: Whether chains began there. At one of little weight a single chain would be too many.
     """
 
     alpha: tuple[float, ...]
     objective: float
     weight: float
+    started: bool = True
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class Diagnostics:
         map_variance: σ² at the MAP, mean over the data.
         converged: Whether every figure is within its threshold; None without draws.
         problems: What is not, in words.
-        modes: Maxima at which chains began, the best first; empty without draws.
+        modes: Separate maxima that were found, the best first; empty without draws.
     """
 
     alpha: Mapping[str, Quality]
@@ -102,8 +104,11 @@ class Diagnostics:
         if self.ties > 1:
             lines.append(f"different maxima of the same objective: {self.ties}")
         if len(self.modes) > 1:
-            shares = ", ".join(f"{mode.objective:.6g} (weight {mode.weight:.2g})" for mode in self.modes)
-            lines.append(f"chains began at {len(self.modes)} separate maxima, objectives {shares}")
+            shares = ", ".join(
+                f"{mode.objective:.6g} (weight {mode.weight:.2g}{'' if mode.started else ', no chains'})"
+                for mode in self.modes
+            )
+            lines.append(f"separate maxima: {len(self.modes)}, objectives {shares}")
         if len(self.null_directions):
             lines.append(f"directions that the data do not see: {len(self.null_directions)}")
         if self.alpha:
