@@ -129,17 +129,24 @@ def definitions(bound: Trajectories, values: Tensor, states: Tensor) -> set[str]
         states: A trajectory, ``(1, R, nodes, S)``.
     """
     generator = torch.Generator().manual_seed(0)
-    nodes = torch.linspace(0, states.shape[2] - 1, 6).round().long()
-    here = states[0][:, nodes].transpose(0, 1)  # (H, R, S)
-    spread = here.abs().amax((0, 1)).clamp_min(1e-12)
-    here = here + 0.1 * spread * torch.randn(here.shape, generator=generator, dtype=here.dtype)
-    moved = values * (1 + 0.1 * torch.rand(len(nodes), len(values), generator=generator, dtype=values.dtype))
-    rates = bound.slopes(moved, here)
+
+    def moved(tensor: Tensor) -> Tensor:
+        size = tensor.abs().max().clamp_min(1e-3)
+        return tensor + 0.1 * size * torch.randn(tensor.shape, generator=generator, dtype=tensor.dtype)
+
+    rates, there = [], []
+    for node in torch.linspace(0, bound._t.shape[1] - 1, 4).round().long().tolist():
+        here = torch.stack([moved(column) for column in states[0, :, node].unbind(-1)], dim=-1)[None]  # (1, R, S)
+        others = torch.stack([moved(value[None])[0] for value in values])  # each by its own size, and none stays 0
+        u = {name: moved(table[0, :, node]) for name, table in bound._u.items()}
+        rates.append(bound._slope(bound._t[:, node], here, bound._p(others[None]), u))
+        there.append(here)
+    slopes, here = torch.cat(rates), torch.cat(there)
     names = list(bound.ode.states)
     same = [
         name
         for i, name in enumerate(names)
-        if any(j != i and torch.equal(rates[..., i], here[..., j]) for j in range(len(names)))
+        if any(j != i and torch.equal(slopes[..., i], here[..., j]) for j in range(len(names)))
     ]
     return set(same) if len(same) < len(names) else set()
 
