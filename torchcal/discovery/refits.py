@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchcal.discovery.fitting import Fitted, fit
 from torchcal.discovery.problem import Problem, Whitening
-from torchcal.errors import DomainError, MissingDependencyError
+from torchcal.errors import DomainError, MissingDependencyError, SimulatorError, TorchcalError
 from torchcal.simulators.executor import TaskError, check_executor, run_tasks
 
 __all__ = ["Refit", "refit_all"]
@@ -84,7 +84,14 @@ def refit_all(
     try:
         run_tasks(_run_packed, [_pack(job) for job in jobs], executor=executor, on_result=take)
     except TaskError as failure:
-        raise failure.error from failure
+        if isinstance(failure.error, TorchcalError):
+            raise failure.error from None
+        names = ", ".join(q.name for q in jobs[failure.index].problem.parameters)
+        raise SimulatorError(
+            f"Expected a worker to refit the hypothesis with the parameters {names}. Got "
+            f"{type(failure.error).__name__}: {failure.error}. Leave executor= away to refit here, or look at the "
+            "worker's memory and installation."
+        ) from failure.error
     return results
 
 

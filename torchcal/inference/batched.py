@@ -157,7 +157,8 @@ def run_batched(
         modes: Normal approximations that chains start from, the best first: its covariance is the first metric.
         num_samples: Draws a chain; the most of them where ``enough`` is given.
         num_chains: Chains.
-        num_warmup: Transitions of a chain that are thrown away.
+        num_warmup: Transitions of a chain that are thrown away in the three windows of the warm-up. Finding the length
+            of ``"hmc"`` takes about a hundred more, and smaller steps after divergences take a window each.
         seed: Of every random number.
         kernel: ``"nuts"`` or ``"hmc"``.
         cost: Numbers that one evaluation of one chain handles; dear densities warm up with fewer chains.
@@ -191,12 +192,14 @@ def run_batched(
             more = enough(_alpha(collector.draws(goal), space, transform), groups[:num_chains])
             if more <= 1:
                 break
-            if goal >= 2 * half:
+            if math.isinf(before):
+                before, half = more, goal
+            elif goal >= 2 * half:
                 stuck = stuck + 1 if more > _STUCK * before else 0
                 before, half = more, goal
             if stuck == 2:
                 break
-            goal = min(num_samples, math.ceil(goal * min(max(_ENOUGH * more, 1.15), 8.0)))
+            goal = min(num_samples, math.ceil(goal * min(max(_ENOUGH * more, 1.15), 4.0)))
         stored = collector.draws(goal)
     except KeyboardInterrupt:
         have = collector.least

@@ -78,7 +78,8 @@ def calibrate(
         num_samples: Posterior draws a chain; 0 for the MAP alone; by default 1000. With ``target_ess`` the most of
             them, by default 20,000.
         num_chains: Chains; by default 4, and with ``target_ess`` up to 256.
-        num_warmup: Draws thrown away a chain; by default 60, and half of ``num_samples`` but at least 300 for
+        num_warmup: Draws thrown away a chain, beside those that find the trajectory length of ``"hmc"`` and the smaller
+            steps that divergences call for; by default 60, and half of ``num_samples`` but at least 300 for
             ``sampler="pyro"``.
         target_ess: Draw until the effective sample size of every α, bulk and tail, is at least this and every R-hat
             below 1.01.

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchcal.errors import ConvergenceError
 
-__all__ = ["Laplace", "Whitened", "group_means", "starting_points"]
+__all__ = ["Laplace", "Whitened", "dealt_out", "group_means", "starting_points"]
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,22 @@ def group_means(values: Tensor, groups: Tensor) -> Tensor:
     return (member.T @ values) / member.sum(0).clamp_min(1)[:, None]
 
 
+def dealt_out(weights: Sequence[float], count: int) -> list[int]:
+    """Which mode each of ``count`` chains begins at: any first few have their share of each, as far as whole chains go.
+
+    >>> dealt_out([0.75, 0.25], 4)
+    [0, 0, 1, 0]
+    """
+    shares = torch.tensor(weights, dtype=torch.float64)
+    dealt = torch.zeros_like(shares)
+    chosen = []
+    for number in range(count):
+        which = int((shares / shares.sum() * (number + 1) - dealt).argmax())
+        dealt[which] += 1
+        chosen.append(which)
+    return chosen
+
+
 def starting_points(
     space: Whitened, modes: Sequence[Laplace], count: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
@@ -90,13 +106,7 @@ def starting_points(
     """
     size = len(space.loc)
     normal = torch.randn((count, size), dtype=space.loc.dtype, device=space.loc.device, generator=generator)
-    weights = torch.tensor([mode.weight for mode in modes], dtype=torch.float64)
-    dealt = torch.zeros_like(weights)
-    chosen = []
-    for number in range(count):
-        which = int((weights / weights.sum() * (number + 1) - dealt).argmax())
-        dealt[which] += 1
-        chosen.append(which)
+    chosen = dealt_out([mode.weight for mode in modes], count)
     center = space.inner(torch.stack([mode.loc for mode in modes]))[chosen]
     spread = torch.linalg.solve_triangular(space.scale_tril, torch.stack([m.scale_tril for m in modes]), upper=False)
     offset = (spread[chosen] @ normal[:, :, None])[:, :, 0]

@@ -47,19 +47,21 @@ def figures(draws: Tensor) -> Figures:
         nothing = torch.full(rest, torch.nan, dtype=torch.float64)
         return Figures(nothing, nothing, nothing)
     ordered, order = values.flatten(1).sort(dim=1)
-    scores = _normal_scores(order).reshape(values.shape)
+    scores = _normal_scores(ordered, order).reshape(values.shape)
     middle = ordered[:, (chains * count - 1) // 2, None, None]
-    folded = _normal_scores((values - middle).abs().flatten(1).argsort(dim=1)).reshape(values.shape)
+    folded = _normal_scores(*(values - middle).abs().flatten(1).sort(dim=1)).reshape(values.shape)
     spread = torch.maximum(_split_r_hat(scores), _split_r_hat(folded))
     ends = [_quantile(ordered, q) for q in (0.05, 0.95)]
     tail = torch.minimum(*(_ess((values <= end[:, None, None]).to(torch.float64)) for end in ends))
     constant = ordered[:, 0] == ordered[:, -1]
     total = torch.full_like(tail, float(chains * count))
-    return Figures(
-        torch.where(constant, torch.ones_like(total), spread).reshape(rest),
-        torch.where(constant, total, _ess(scores)).reshape(rest),
-        torch.where(constant, total, tail).reshape(rest),
-    )
+    undefined = ~torch.isfinite(values).all(-1).all(-1)
+
+    def told(figure: Tensor, otherwise: Tensor) -> Tensor:
+        figure = torch.where(constant, otherwise, figure)
+        return torch.where(undefined, torch.full_like(figure, torch.nan), figure).reshape(rest)
+
+    return Figures(told(spread, torch.ones_like(total)), told(_ess(scores), total), told(tail, total))
 
 
 def r_hat(draws: Tensor) -> Tensor:
@@ -107,12 +109,19 @@ def _effective(chains: Tensor) -> Tensor:
     return total / torch.nan_to_num(time, nan=1.0).clamp_min(1 / math.log10(max(total, 11.0)))
 
 
-def _normal_scores(order: Tensor) -> Tensor:
-    """Normal quantiles of the ranks, from the order of the draws ``(Q, S)``."""
+def _normal_scores(ordered: Tensor, order: Tensor) -> Tensor:
+    """Normal quantiles of the ranks, from sorted draws and their order ``(Q, S)``; draws that tie share their rank."""
     count = order.shape[1]
-    places = torch.arange(1, count + 1, dtype=torch.float64)
+    places = torch.arange(1, count + 1, dtype=torch.float64).expand(order.shape)
+    new = torch.ones_like(order, dtype=torch.bool)
+    new[:, 1:] = ordered[:, 1:] != ordered[:, :-1]
+    if not bool(new.all()):
+        group = new.to(torch.long).cumsum(1) - 1
+        total = torch.zeros_like(places).scatter_add(1, group, places)
+        size = torch.zeros_like(places).scatter_add(1, group, torch.ones_like(places))
+        places = (total / size.clamp_min(1)).gather(1, group)
     score = torch.special.ndtri((places - 0.375) / (count + 0.25))
-    return torch.empty(order.shape, dtype=torch.float64).scatter_(1, order, score.expand_as(order))
+    return torch.empty(order.shape, dtype=torch.float64).scatter_(1, order, score)
 
 
 def _quantile(ordered: Tensor, q: float) -> Tensor:

@@ -35,7 +35,7 @@ LEAST_WEIGHT = 1e-3
 """Share of the posterior from which on a mode is told."""
 
 MOST_MODES = 6
-"""Maxima that are looked at."""
+"""Ends of starts, away from the maxima that are known, that are looked at."""
 
 DEAR, MOST_KEPT = 1_000_000, 8
 """Numbers that one gradient of all starts handles from which on the worse starts are given up, and how many are not."""
@@ -294,10 +294,14 @@ def modes_of(problem: Problem, estimate: Estimate) -> list[Laplace]:
     def objective(u: Tensor) -> Tensor:
         return -problem.log_prob(problem.prior.transform.bound(u)) - problem.prior.transform.log_slope(u)
 
+    tried = 0
     for end in ends:
         start = problem.prior.transform.unbound(end)
-        if any(_apart(start, mode) < 1 for mode in found) or len(found) == MOST_MODES:
+        if any(_apart(start, mode) < 1 for mode in found):
             continue
+        tried += 1
+        if tried > MOST_MODES:
+            break
         mode, height = laplace(problem, end)
         slope = gradient(objective, mode.loc[None])[1][0]
         if any(_apart(mode.loc, other) < 1 for other in found) or float((mode.scale_tril.T @ slope).norm()) > 0.1:

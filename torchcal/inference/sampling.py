@@ -11,7 +11,7 @@ from torch import Tensor
 from torchcal import models
 from torchcal.errors import ConvergenceWarning, DomainError, ImproperPosteriorError
 from torchcal.inference.batched import MOST_ELEMENTS, run_batched
-from torchcal.inference.coordinates import Laplace
+from torchcal.inference.coordinates import Laplace, dealt_out
 from torchcal.inference.diagnostics import Figures, figures
 from torchcal.inference.draws import Draws
 from torchcal.inference.estimate import Estimate, modes_of
@@ -123,8 +123,10 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
     modes = modes_of(problem, estimate)
     _warn_of_rounding(estimate, plan.dtype)
     cast = problem.cast(plan.dtype)
-    worth = [k == 0 or mode.weight >= _LEAST_STARTED for k, mode in enumerate(modes)]
-    starts = [mode.to(plan.dtype) for mode, chosen in zip(modes, worth, strict=True) if chosen]
+    cost = cast.propagate.num_nodes * len(cast.y)
+    worth = [k for k, mode in enumerate(modes) if k == 0 or (mode.weight >= _LEAST_STARTED and plan.sampler != "pyro")]
+    starts = [modes[k].to(plan.dtype) for k in worth]
+    begun = {worth[k] for k in dealt_out([mode.weight for mode in starts], plan.chains(cost))}
     pattern = problem.propagate.pattern
 
     def folded(alpha: Tensor) -> Tensor:
@@ -137,7 +139,6 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
         draws = _draw_with_pyro(cast, starts[0], model, plan)
     else:
         transform = cast.prior.transform
-        cost = cast.propagate.num_nodes * len(cast.y)
         draws = run_batched(
             lambda u: cast.log_prob(transform.bound(u)) + transform.log_slope(u),
             transform,
@@ -162,7 +163,7 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
             ConvergenceWarning,
             stacklevel=3,
         )
-    told = tuple(_mode(problem, mode, chosen) for mode, chosen in zip(modes, worth, strict=True))
+    told = tuple(_mode(problem, mode, k in begun) for k, mode in enumerate(modes))
     return Draws(alpha, draws.divergences, told, found)
 
 
@@ -176,16 +177,13 @@ def _mode(problem: Problem, mode: Laplace, started: bool) -> Mode:
 def _more(alpha: Tensor, groups: Tensor, target: float) -> float:
     """By which factor draws ``(C, n, P)`` must grow to reach a sample size and an R-hat; at most 1 if they do.
 
-    Draws are judged about the mean of their group ``(C,)``: modes that chains never leave would otherwise keep R-hat up
-    however long they are.
+    Each group ``(C,)`` of chains, those that began at one mode, is judged by itself and must reach its share of the
+    target: modes that chains never leave would otherwise keep R-hat up however long they are.
     """
     if alpha.shape[1] < 4:
         return 2.0
-    if int(groups.max()):
-        alpha = alpha.clone()
-        for group in groups.unique():
-            alpha[groups == group] -= alpha[groups == group].mean((0, 1))
-    return _missing(figures(alpha), target)
+    shares = [(alpha[groups == group], float((groups == group).double().mean())) for group in groups.unique()]
+    return max(_missing(figures(chains), target * share) for chains, share in shares)
 
 
 def _missing(found: Figures, target: float) -> float:

@@ -30,6 +30,9 @@ __all__ = [
     "warn_of_tolerance",
 ]
 
+MOST_IDLE = 0.05
+"""Share of the posterior at a maximum without chains that passes."""
+
 MOST_DIVERGENCES = 1e-4
 """Share of transitions that may diverge: one of ten thousand or more is no region that chains cannot enter."""
 
@@ -66,6 +69,12 @@ def diagnose(
         worst = min(few, key=lambda name: few[name])
         if not few[worst] >= wanted:
             problems.append(f"effective sample size of {worst} is {few[worst]:.0f} (threshold {wanted:.0f})")
+        idle = [mode.weight for mode in draws.modes if not mode.started and mode.weight >= MOST_IDLE]
+        if idle:
+            problems.append(
+                f"no chain began at a separate maximum that holds about {max(idle):.0%} of the posterior (raise "
+                "num_chains)"
+            )
         started = [mode for mode in draws.modes if mode.started]
         if loud and len(started) > 1:
             problems.append(

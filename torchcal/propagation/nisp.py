@@ -416,9 +416,14 @@ class NISP(nn.Module):
         return shift[..., 0, :] + first, (second - first.square()).clamp_min(0)
 
     def _node_pieces(self, alpha: Tensor) -> list[slice]:
-        rows = alpha.numel() // self.num_alpha * self._n
+        rows = alpha.numel() // self.num_alpha * self._width
         size = max(1, self.max_elements // max(1, rows))
         return [slice(i, i + size) for i in range(0, self.num_nodes, size)]
+
+    @property
+    def _width(self) -> int:
+        """Numbers that one node of one α takes: its outputs, or the functions that they are linear in."""
+        return max(self._n, 0 if self._polynomial is None else len(self._polynomial))
 
     @property
     def _n(self) -> int:
@@ -428,8 +433,8 @@ class NISP(nn.Module):
         self, alpha: Tensor, function: Callable[[Tensor], tuple[Tensor, ...]]
     ) -> tuple[Tensor, ...]:
         """Apply a function of a batch of α in pieces of bounded size."""
-        size = max(1, self.max_elements // max(1, self.num_nodes * self._n))
-        return over_batch(function, alpha, size)
+        size = max(1, self.max_elements // max(1, self.num_nodes * self._width))
+        return over_batch(function, alpha, size, whole=self.num_nodes * self._width <= self.max_elements)
 
     # --- rules -------------------------------------------------------------------------------------------
 

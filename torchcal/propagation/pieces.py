@@ -19,16 +19,16 @@ def forgetful(function: Moments, alpha: Tensor) -> tuple[Tensor, ...]:
     return function(alpha)
 
 
-def over_batch(function: Moments, alpha: Tensor, size: int) -> tuple[Tensor, ...]:
+def over_batch(function: Moments, alpha: Tensor, size: int, *, whole: bool) -> tuple[Tensor, ...]:
     """Apply a function of a batch of α ``(*batch, P)`` to ``size`` of them at a time.
 
-    One α at a time is left to the function itself, which then has pieces of its own.
+    Where a single α is not one ``whole`` piece, the function cuts it further, and forgets by itself.
     """
     batch = alpha.shape[:-1]
     rows = math.prod(batch)
     if rows <= size:
         return function(alpha)
     flat = alpha.reshape(rows, -1)
-    apply = function if size == 1 else lambda block: forgetful(function, block)
+    apply = (lambda block: forgetful(function, block)) if whole else function
     parts = [apply(flat[start : start + size]) for start in range(0, rows, size)]
     return tuple(torch.cat(items).reshape(*batch, *items[0].shape[1:]) for items in zip(*parts, strict=True))

@@ -24,7 +24,7 @@ MOST_TERMS = 500
 """Terms beyond which nothing is gained."""
 
 TOLERANCE = 1e-9
-"""How well the polynomial must hold at points that it was not made from, relative to the largest output."""
+"""How well the polynomial must hold at points that it was not made from, relative to the largest value of an output."""
 
 _DEAR = (ExternalSimulator, PolynomialSurrogate)
 """Simulators that are not called again once their coefficients are known, or that take them anyway."""
@@ -48,13 +48,16 @@ def expansion(propagate: "NISP") -> tuple[Tensor, Tensor] | None:
     terms = polychaos.multi_indices(d, degree)
     generator = torch.Generator().manual_seed(0)
     points = 2 * torch.rand(2 * count + _SPARE, d, dtype=torch.float64, generator=generator) - 1
+    where = propagate._template
     with torch.no_grad():
-        values = propagate._simulate(propagate.scaling.physical(points))
+        values = propagate._simulate(propagate.scaling.physical(points.to(where)))
+    values = values.to(device="cpu", dtype=torch.float64)
     psi = polychaos.evaluate(polychaos.LEGENDRE, terms, points)
     if not bool(torch.isfinite(values).all()):
         return None
     table = torch.linalg.lstsq(psi[_SPARE:], values[_SPARE:], driver="gelsd").solution
-    error = (psi[:_SPARE] @ table - values[:_SPARE]).abs().max()
-    if not float(error) <= TOLERANCE * float(values.abs().max()):
+    error = (psi[:_SPARE] @ table - values[:_SPARE]).abs().amax(0)
+    tolerance = max(TOLERANCE, 1e3 * torch.finfo(where.dtype).eps)
+    if not bool((error <= tolerance * propagate.largest(values.abs().amax(0))).all()):
         return None
     return terms, table

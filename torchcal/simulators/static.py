@@ -1,5 +1,6 @@
 """Static simulators: outputs as a function of conditions and parameters."""
 
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,6 +14,9 @@ from torchcal.errors import DomainError, ShapeError, SimulatorError
 from torchcal.simulators.parameter import Parameter
 
 __all__ = ["Conditions", "Linearisation", "Simulator", "check_parameters"]
+
+_DUAL = threading.RLock()
+"""torch keeps one level of forward derivatives for the whole process, and refuses a second thread its own."""
 
 Conditions = Tensor | Mapping[str, Tensor]
 
@@ -161,7 +165,7 @@ class Simulator:
         tangent = values.new_zeros(len(columns), *values.shape)
         for j, column in enumerate(columns):
             tangent[j, ..., column] = 1.0
-        with torch.no_grad(), forward_ad.dual_level():
+        with _DUAL, torch.no_grad(), forward_ad.dual_level():
             dual = forward_ad.make_dual(values.expand(len(columns), *values.shape).contiguous(), tangent)
             fixed = {k: still(v) for k, v in x.items()} if isinstance(x, Mapping) else still(x)
             found = forward_ad.unpack_dual(self.at(fixed, outputs)(dual))

@@ -1,0 +1,201 @@
+"""`diagnose(executor=)`: the same diagnosis from workers, and what cannot be sent to them."""
+
+import math
+import multiprocessing
+import pickle
+import threading
+import time
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+
+import pytest
+import torch
+
+import torchcal as tc
+from torchcal.errors import DomainError
+from torchcal.simulators import Trajectories
+
+F64 = torch.float64
+T = torch.linspace(0, 9, 41, dtype=F64)
+FORCE = 0.8 * torch.sin(0.9 * T)
+
+
+def rates(t, s, p, u):
+    return {"x": s["v"], "v": -p["k"] * s["x"] - p["c"] * s["v"] + u["f"]}
+
+
+def oscillator(function=rates):
+    return tc.ODESimulator(
+        rates=function,
+        states={"x": "m", "v": "m/s"},
+        parameters=[tc.Parameter("k", unit="1/s^2", low=0.0, initial=4.0),
+                    tc.Parameter("c", unit="1/s", low=0.0, initial=0.1)],
+        observe=("x",),
+    )  # fmt: skip
+
+
+def run(x):
+    return tc.Run(time=T, outputs={"x": x}, inputs={"f": FORCE}, initial={"x": 1.0, "v": 0.0})
+
+
+def library():
+    """Terms of lambdas, which plain pickle does not send."""
+    wanted = ("cubic stiffness", "bias force")
+    return [term for term in tc.terms.mechanics() if term.name in wanted]
+
+
+@pytest.fixture(scope="module")
+def motion():
+    """An oscillator with a bias force that the base does not know."""
+    bias = [term for term in library() if term.name == "bias force"]
+    empty = tc.Recording(runs=[run(torch.zeros_like(T))])
+    whole = Trajectories(tc.terms.extend(oscillator(), bias), empty, subdivide=8)
+    values = {"k": 2.0, "c": 0.2, "bias force.b": 0.1}
+    row = torch.tensor([[values[q.name] for q in whole.parameters]], dtype=F64)
+    x = whole.linearise(empty.x, row, empty.outputs, []).y[0]
+    noise = torch.randn(len(T), generator=torch.Generator().manual_seed(5), dtype=F64)
+    return tc.Recording(runs=[run(x + 0.02 * noise)], noise=0.02)
+
+
+def diagnose(motion, candidates=None, **options):
+    options = {"seed": 0, "progress": False, "num_starts": 4, **options}
+    return tc.diagnose(oscillator(), motion, library() if candidates is None else candidates, **options)
+
+
+@pytest.fixture(scope="module")
+def here(motion):
+    return diagnose(motion)
+
+
+def check_same(d, here):
+    assert d.verdict == here.verdict == "named"
+    assert d.terms == here.terms == ["bias force"]
+    assert d.tied == here.tied
+    assert [row.terms for row in d.ranking] == [row.terms for row in here.ranking]
+    close = {"rel": 1e-9, "abs": 1e-12}
+    for one, other in zip(d.ranking, here.ranking, strict=True):
+        assert one.log_evidence == pytest.approx(other.log_evidence, **close)
+        assert one.probability == pytest.approx(other.probability, **close)
+    assert len(d.final.estimates) == 3
+    for one, other in zip(d.final.estimates, here.final.estimates, strict=True):
+        assert one.name == other.name
+        assert one.value == pytest.approx(other.value, **close)
+        assert one.sd == pytest.approx(other.sd, **close)
+    torch.testing.assert_close(d.final.prediction, here.final.prediction, rtol=1e-9, atol=1e-12)
+    assert d.equations == here.equations
+    assert d.after.held_out.rmse == pytest.approx(here.after.held_out.rmse, **close)
+    assert d.improved.names == here.improved.names
+
+
+class Recorder(Executor):
+    """Hands everything on, and remembers what came back."""
+
+    def __init__(self, inner):
+        self.inner, self.futures = inner, []
+
+    def submit(self, fn, /, *args, **kwargs):
+        self.futures.append(self.inner.submit(fn, *args, **kwargs))
+        return self.futures[-1]
+
+
+def test_the_diagnosis_without_an_executor(here):
+    bias = next(e for e in here.final.estimates if e.name == "bias force.b")
+    assert abs(bias.value - 0.1) < 5 * bias.sd
+
+
+def test_other_processes_give_the_same(motion, here):
+    pytest.importorskip("cloudpickle")
+    with pytest.raises((AttributeError, pickle.PicklingError, TypeError)):
+        pickle.dumps(library())
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(2, mp_context=context) as pool:
+        check_same(diagnose(motion, executor=pool), here)
+        assert pool.submit(math.sqrt, 4.0).result() == 2.0  # left open, and in order
+
+
+def test_threads_give_the_same(motion, here):
+    pytest.importorskip("cloudpickle")
+    threads = torch.get_num_threads()
+    with ThreadPoolExecutor(2) as pool:
+        recorder = Recorder(pool)
+        d = diagnose(motion, executor=recorder)
+        check_same(d, here)
+        assert len(recorder.futures) > 0
+        assert all(future.done() and future.exception() is None for future in recorder.futures)
+    assert torch.get_num_threads() == threads
+    assert d.improved is not None
+    assert isinstance(str(d), str)
+
+
+def test_a_base_without_mismatch_is_consistent_from_workers_too(motion):
+    pytest.importorskip("cloudpickle")
+    clean = tc.terms.extend(oscillator(), [term for term in library() if term.name == "bias force"])
+    with ThreadPoolExecutor(1) as pool:
+        d = tc.diagnose(clean, motion, library(), seed=0, progress=False, num_starts=4, executor=pool)
+    assert d.verdict == "consistent"
+    assert d.terms == []
+
+
+def parabola(x, p):
+    time.sleep(0.0003)  # lets another thread in
+    return p["a"] + p["n"] * x**2
+
+
+def fan(x, p):
+    return p["m"] * torch.log(x)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_simulators_without_time(workers):
+    """Their derivatives are forward ones, of which torch keeps one level for all threads."""
+    x = torch.linspace(0.5, 2, 30, dtype=F64)
+    noise = 0.02 * torch.randn(30, generator=torch.Generator().manual_seed(2), dtype=F64)
+    parameters = [tc.Parameter("a", low=-5.0, high=5.0), tc.Parameter("n", neutral=0.0, low=-2.0, high=2.0)]
+    simulator = tc.Simulator(parabola, parameters)
+    data = tc.Recording(x=x, y=1 + 0.5 * x**2 + noise, noise=0.02)
+    terms = [tc.Term("square", frees=("n",)), tc.Term("slope", shifts={"a": fan}, parameters=[tc.Parameter("m")])]
+    options = {"seed": 0, "progress": False, "num_starts": 4}
+    plain = tc.diagnose(simulator, data, terms, **options)
+    with ThreadPoolExecutor(workers) as pool:
+        d = tc.diagnose(simulator, data, terms, executor=pool, **options)
+    assert d.verdict == plain.verdict == "named"
+    assert d.terms == plain.terms == ["square"]
+    for one, other in zip(d.final.estimates, plain.final.estimates, strict=True):
+        assert one.name == other.name
+        assert (one.value, one.sd) == pytest.approx((other.value, other.sd), rel=1e-9)
+
+
+# --- what is refused -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bad", [2, "processes", ThreadPoolExecutor, Future(), [None], True])
+def test_what_is_no_executor_is_refused_before_any_work(motion, bad):
+    calls = []
+
+    def counted(t, s, p, u):
+        calls.append(1)
+        return rates(t, s, p, u)
+
+    with pytest.raises(DomainError, match=r"Expected executor as a concurrent\.futures\.Executor or None\. Got "):
+        tc.diagnose(oscillator(counted), motion, library(), executor=bad, progress=False)
+    assert calls == []
+
+
+@pytest.mark.parametrize("kind", ["lock", "file"])
+def test_what_cannot_be_sent_is_named(motion, kind, tmp_path):
+    pytest.importorskip("cloudpickle")
+    with (tmp_path / "log").open("w") as file:
+        held = {"lock": threading.Lock(), "file": file}[kind]
+
+        def push(t, s, p, u):
+            assert held is not None
+            return p["b"] + 0 * s["x"]
+
+        term = tc.Term("push", equation="v", rate=push, parameters=[tc.Parameter("b", unit="m/s^2")])
+        if kind == "lock":
+            assert diagnose(motion, [term]).verdict == "named"
+        with ThreadPoolExecutor(1) as pool, pytest.raises(DomainError) as caught:
+            diagnose(motion, [term], executor=pool)
+    text = str(caught.value)
+    assert text.startswith("Expected a simulator and terms that can be sent to another process. Got one that cannot: ")
+    assert text.endswith("Leave executor= away, or keep open files, locks and pools out of their functions.")
+    assert {"lock": "_thread.lock", "file": "cannot"}[kind] in text
