@@ -25,6 +25,9 @@ __all__ = [
     "symptoms",
 ]
 
+#: Share of an output's evidence that counts beside an equation's.
+OUTPUT_SHARE = 0.9
+
 #: A span begins where the estimated change exceeds this share of its largest magnitude.
 SPAN_LEVEL = 0.3
 #: A base parameter that moves by this many sd when a term is added was bent by it.
@@ -95,7 +98,8 @@ def locate(search: Search, best: Model | None) -> Table[Location]:
         kind, target = _acts_on(best)
         rows.append(Location(kind, target, w.driver, ((low, high),), removed(search, best), best.log_evidence))
     seen = set()
-    for place in search.structure.places:
+    sensor = best is not None and _acts_on(best)[0] == "output"  # then it has been shown to be the output
+    for place in search.structure.places if sensor else by_plausibility(search):
         key = (place.channel.kind, place.channel.target)
         if place.evidence < 2.0 or key in seen:
             continue
@@ -180,10 +184,21 @@ def needed_shifts(search: Search) -> list[NeededShift]:
     return result[:6]
 
 
+def by_plausibility(search: Search) -> list[Place]:
+    """Places by falling evidence; in time an output's must be clearly larger than an equation's.
+
+    A change of an output can copy whatever any equation does to that output, and instruments err in simple ways.
+    """
+    def weight(place: Place) -> float:
+        return place.evidence * (OUTPUT_SHARE if place.channel.kind == "output" and search.problem.in_time else 1.0)
+
+    return sorted(search.structure.places, key=lambda place: -weight(place))
+
+
 def missing_rate(search: Search) -> MissingRate | None:
     """The best smooth unknown change of one channel."""
     kinds = ("equation", "output") if search.problem.in_time else ("parameter", "output")
-    place = next((p for p in search.structure.places if p.channel.kind in kinds and p.evidence > 0), None)
+    place = next((p for p in by_plausibility(search) if p.channel.kind in kinds and p.evidence > 0), None)
     if place is None:
         return None
     values = place.channel.drivers[place.driver]

@@ -79,8 +79,8 @@ def calibrate(
             them, by default 20,000.
         num_chains: Chains; by default 4, and with ``target_ess`` up to 256.
         num_warmup: Draws thrown away a chain, beside those that find the trajectory length of ``"hmc"`` and the smaller
-            steps that divergences call for; by default 60, and half of ``num_samples`` but at least 300 for
-            ``sampler="pyro"``.
+            steps that divergences call for; by default 100 (60 with ``target_ess``), and half of ``num_samples`` but at
+            least 300 for ``sampler="pyro"``.
         target_ess: Draw until the effective sample size of every α, bulk and tail, is at least this and every R-hat
             below 1.01.
         order: Degree of the output expansion; None for the full variance, 1 as in the paper's case studies.

@@ -106,7 +106,9 @@ class Plan:
         """Draws thrown away a chain. Pooled over a crowd, adaptation needs fewer of each than chain by chain."""
         if self.num_warmup is not None:
             return self.num_warmup
-        return max(300, self.samples // 2) if self.sampler == "pyro" else 60
+        if self.sampler == "pyro":
+            return max(300, self.samples // 2)
+        return 100 if self.target_ess is None else 60  # a target is reached by many chains, which adapt together
 
 
 def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
