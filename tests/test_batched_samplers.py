@@ -36,7 +36,7 @@ def run(log_density, size, transform=None, **options):
 
 def independent(draws, column):
     """Draws of one coordinate far enough apart to count as independent: tests of fit assume that they are."""
-    ess = float(diagnostics.bulk_ess(draws)[column])
+    ess = float(diagnostics.figures(draws).ess_bulk[column])
     every = max(1, math.ceil(2 * draws.shape[0] * draws.shape[1] / ess))
     return draws[:, ::every, column].flatten().numpy()
 
@@ -80,11 +80,11 @@ def test_correlated_normal_in_the_wrong_coordinates(kernel):
     target = lambda u: -0.5 * ((u - mean) @ precision * (u - mean)).sum(-1)  # noqa: E731
     draws = run(target, size, num_warmup=150, kernel=kernel).alpha
     flat = draws.flatten(0, 1)
-    ess = diagnostics.bulk_ess(draws)
+    ess = diagnostics.figures(draws).ess_bulk
     sd = (factor @ factor.T).diagonal().sqrt()
     # Five standard errors for five coordinates.
     assert bool(((flat.mean(0) - mean).abs() < 5 * sd / ess.sqrt()).all())
-    assert float(diagnostics.r_hat(draws).max()) < 1.03
+    assert float(diagnostics.figures(draws).r_hat.max()) < 1.03
     for i in range(size):
         p = stats.kstest(independent(draws, i), "norm", args=(float(mean[i]), float(sd[i]))).pvalue
         assert p > 1e-3
@@ -184,7 +184,7 @@ def test_r_hat_sees_separate_modes(kernel):
 
     wide = 12 * torch.eye(1, dtype=torch.float64)
     draws = run(two, 1, scale_tril=wide, num_samples=100, num_chains=8, kernel=kernel).alpha
-    assert float(diagnostics.r_hat(draws)[0]) > 1.5
+    assert float(diagnostics.figures(draws).r_hat[0]) > 1.5
 
 
 def test_diagnostics_agree_with_arviz():
@@ -197,14 +197,14 @@ def test_diagnostics_agree_with_arviz():
     draws[0, :, 2] += 1.0
     for i in range(3):
         values = draws[:, :, i].numpy()
-        assert float(diagnostics.r_hat(draws)[i]) == pytest.approx(float(arviz.rhat(values)), abs=2e-3)
+        assert float(diagnostics.figures(draws).r_hat[i]) == pytest.approx(float(arviz.rhat(values)), abs=2e-3)
         if i == 2:  # chains that disagree have next to no effective draws by either estimator
-            assert float(diagnostics.bulk_ess(draws)[i]) < 150
+            assert float(diagnostics.figures(draws).ess_bulk[i]) < 150
             continue
         # The two estimators end the sum of autocorrelations by rules of their own.
-        assert float(diagnostics.bulk_ess(draws)[i]) == pytest.approx(float(arviz.ess(values)), rel=0.1)
+        assert float(diagnostics.figures(draws).ess_bulk[i]) == pytest.approx(float(arviz.ess(values)), rel=0.1)
         tail = float(arviz.ess(values, method="tail"))
-        assert float(diagnostics.tail_ess(draws)[i]) == pytest.approx(tail, rel=0.2)
+        assert float(diagnostics.figures(draws).ess_tail[i]) == pytest.approx(tail, rel=0.2)
 
 
 def normal_with_factor(factor):
@@ -229,7 +229,7 @@ def test_chains_start_from_every_mode_with_its_weight_and_keep_to_widths_within_
     assert bool((right.all(1) | ~right.any(1)).all())
     assert int(right[:, 0].sum()) == 4
     within = found[~right[:, 0]] + 50
-    ess = float(diagnostics.bulk_ess(within).min())
+    ess = float(diagnostics.figures(within).ess_bulk.min())
     assert ess > 300  # 1200 draws; coordinates that were as wide as the gap would leave next to none
     assert abs(float(within.std()) - 1) < 5 / math.sqrt(2 * ess)
 

@@ -322,7 +322,7 @@ def test_draws_have_the_gridded_marginals(name, sampler):
     assert target.low is None or float(m.min()) >= target.low
     assert target.high is None or float(m.max()) <= target.high
     assert float(result.samples[..., 1].abs().max()) <= target.wall
-    sizes = diagnostics.bulk_ess(draws)
+    sizes = diagnostics.figures(draws).ess_bulk
     assert float(sizes.min()) > 200
     for column, cdf in enumerate(target.marginals(scale)):
         every = math.ceil(2 * draws[..., column].numel() / float(sizes[column]))
@@ -337,8 +337,8 @@ def test_both_sides_of_the_kink_have_the_same_mass():
     m = result.propagate.scaling.physical(result.samples[..., :1])[..., 0]
     above = (m > target.y[0]).to(torch.float64)
     # Chains that stay on their side have an R-hat of 2. These have some ten effective draws each, which leaves 1.05.
-    assert float(diagnostics.r_hat(m[..., None])[0]) < 1.2
-    size = float(diagnostics.bulk_ess(above[..., None])[0])
+    assert float(diagnostics.figures(m[..., None]).r_hat[0]) < 1.2
+    size = float(diagnostics.figures(above[..., None]).ess_bulk[0])
     assert abs(float(above.mean()) - 0.5) < 4 * 0.5 / math.sqrt(size)
     # On the kink itself there is no hole: a stretch of a tenth around it has the mass that the grid says.
     near = float(((m - target.y[0]).abs() < 0.05).to(torch.float64).mean())

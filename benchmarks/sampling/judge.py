@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from benchmarks.sampling.density import Arrays
-from torchcal.inference.diagnostics import bulk_ess, r_hat, tail_ess
+from torchcal.inference.diagnostics import figures
 
 CONVERGED = 1.01
 """R-hat of every α below which chains count as converged."""
@@ -63,9 +63,10 @@ def judge(arrays: Arrays, draws: np.ndarray) -> Quality:
     thin = -(-draws.shape[0] * draws.shape[1] // MOST)
     folded = fold(arrays, draws[:, ::thin])
     tensor = torch.from_numpy(folded)
-    ess = torch.minimum(bulk_ess(tensor), tail_ess(tensor)).numpy()
+    found = figures(tensor)
+    ess = torch.minimum(found.ess_bulk, found.ess_tail).numpy()
     flat = folded.reshape(-1, folded.shape[-1])
-    return Quality(ess, r_hat(tensor).numpy(), flat.mean(0), flat.std(0))
+    return Quality(ess, found.r_hat.numpy(), flat.mean(0), flat.std(0))
 
 
 def errors(found: Quality, reference: Quality) -> dict[str, float]:

@@ -174,13 +174,9 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
             if kind == "equation" and target in given:
                 continue
             list_.append(Channel(kind, target, unit, drivers, time, response[:, :, m]))
-        at_data = {
-            name: values[problem.condition_of] for name, values in problem.drivers(found.values[None], states).items()
-        }
+        at_data = problem.drivers_at_data(found.values[None], states)
     else:
-        at_data = {
-            name: values[problem.condition_of] for name, values in problem.drivers(found.values[None], None).items()
-        }
+        at_data = problem.drivers_at_data(found.values[None], None)
         time = problem.order[problem.condition_of] if problem.order is not None else torch.arange(problem.n).double()
         for j, i in enumerate(found.free):
             list_.append(

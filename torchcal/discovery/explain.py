@@ -140,7 +140,7 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
     level = float(search.least.quantile(alpha))
     critical = float(screening.null.quantile(1 - level)) if len(screening.null) else 3.5
     odds = math.log(PRIOR["base"] / (PRIOR["single"] / max(len(search.candidates), 1)))
-    fitted = {m.numbers[0]: m for m in search.models if len(m.numbers) == 1 and m.window is None}
+    fitted = search.plain
     rows = []
     for i, candidate in enumerate(search.candidates):
         column = screening.best[i]
@@ -197,7 +197,7 @@ def by_plausibility(search: Search) -> list[Place]:
 
 def missing_rate(search: Search) -> MissingRate | None:
     """The best smooth unknown change of one channel."""
-    kinds = ("equation", "output") if search.problem.in_time else ("parameter", "output")
+    kinds = search.problem.kinds
     place = next((p for p in by_plausibility(search) if p.channel.kind in kinds and p.evidence > 0), None)
     if place is None:
         return None

@@ -187,3 +187,12 @@ class Problem:
             return {"t": self.recording.x["time"]}  # type: ignore[index]
         found = bound.along(values, warm)
         return {name: table[bound._run_of, bound._node_of] for name, table in found.items()}
+
+    def drivers_at_data(self, values: Tensor, warm: Any) -> dict[str, Tensor]:
+        """The same at the data in use, ``(n,)`` each."""
+        return {name: along[self.condition_of] for name, along in self.drivers(values, warm).items()}
+
+    @property
+    def kinds(self) -> tuple[str, str]:
+        """Kinds of channels that something unknown is sought in."""
+        return ("equation", "output") if self.in_time else ("parameter", "output")

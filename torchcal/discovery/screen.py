@@ -150,8 +150,7 @@ def contributions(
     if isinstance(bound, Trajectories):
         response, drivers, _ = responses(found.problem, found, torch.cat(parts, dim=-1))
         return {i: response[:, :, k] for k, i in enumerate(chosen)}, drivers
-    at = found.problem.drivers(found.values[None], None)
-    drivers = {name: v[found.problem.condition_of] for name, v in at.items()}
+    drivers = found.problem.drivers_at_data(found.values[None], None)
     return {i: torch.diag(tangent) for i, tangent in zip(chosen, parts, strict=True)}, drivers
 
 

@@ -138,10 +138,9 @@ class Search:
         self.structure = analyse(self.residual, every=True)
         self.local, local_null = windows(self.residual, self.candidates, self.screening)
         nulls = [self.screening.null, self.structure.null_best, local_null]
-        kinds = ("equation", "output") if self.problem.in_time else ("parameter", "output")
         seen = [
             max((self.screening.score(i) for i in range(len(self.candidates))), default=0.0),
-            max((p.evidence for p in self.structure.places if p.channel.kind in kinds), default=0.0),
+            max((p.evidence for p in self.structure.places if p.channel.kind in self.problem.kinds), default=0.0),
             max((w.z for w in self.local), default=0.0),
         ]
         self.p_detect, self.least = _joint(nulls, seen)
@@ -157,9 +156,14 @@ class Search:
                     self.twins[i] = k
                     break
 
+    @property
+    def plain(self) -> dict[int, Model]:
+        """Models of one term that acts everywhere, by its number."""
+        return {m.numbers[0]: m for m in self.models if len(m.numbers) == 1 and m.window is None}
+
     def merge(self) -> None:
         """Candidates whose tangents and refits cannot be told apart become one, under the first name."""
-        plain = {m.numbers[0]: m for m in self.models if len(m.numbers) == 1 and m.window is None}
+        plain = self.plain
         self.aliases = {}
         gone: set[int] = set()
         for i, k in self.twins.items():

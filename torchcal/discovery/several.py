@@ -138,9 +138,9 @@ def _hypothetical(
     except (SimulatorError, DomainError):
         return None
     names = [q.name for q in candidate.problem.parameters]
-    rows = []
+    rows, plain = [], search.plain
     for lead in numbers:
-        single = next((m for m in search.models if m.numbers == (lead,) and m.window is None), None)
+        single = plain.get(lead)
         row = candidate.begin.clone()
         if single is not None:
             known = dict(
@@ -152,7 +152,7 @@ def _hypothetical(
         for other in numbers:
             if other == lead:
                 continue
-            fitted = next((m for m in search.models if m.numbers == (other,) and m.window is None), None)
+            fitted = plain.get(other)
             source = search.candidates[other]
             for place in source.own:
                 name = source.problem.parameters[place].name

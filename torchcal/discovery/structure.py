@@ -151,18 +151,16 @@ def _evidence(u: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
     return best.values.clamp_min(0.0), SIZES[best.indices]
 
 
-def analyse(residual: Residual, *, kinds: tuple[str, ...] = ("equation", "output"), every: bool = False) -> Structure:
+def analyse(residual: Residual, *, every: bool = False) -> Structure:
     """Look for smooth changes of every channel against every driver.
 
     Args:
         residual: The fit's.
-        kinds: Kinds of channels that count for the test; a static simulator's parameters always do.
-        every: Also look at the other kinds, for the report.
+        every: Also look at channels of kinds that do not count for the test, for the report.
     """
     found = residual.found
     available = channels(found.problem, found)
-    if not found.problem.in_time:
-        kinds = ("parameter", "output")
+    kinds = found.problem.kinds
     chosen = [c for c in available if every or c.kind in kinds]
     places: list[Place] = []
     nulls: list[Tensor] = []

@@ -63,8 +63,7 @@ def _unknown(search: Search, structure: Structure, *, calibrated: bool) -> float
     Calibrated, it is held against what noise alone gives: at most −1/(e p ln p) for a probability p (Sellke, Bayarri &
     Berger 2001), and beyond the largest simulated value the surplus.
     """
-    kinds = ("equation", "output") if search.problem.in_time else ("parameter", "output")
-    places = [p.evidence for p in structure.places if p.channel.kind in kinds]
+    places = [p.evidence for p in structure.places if p.channel.kind in search.problem.kinds]
     if not places:
         return -math.inf
     seen = max(places)

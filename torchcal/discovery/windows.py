@@ -44,7 +44,7 @@ def refit_local(search: Search) -> None:
         if search.examine(single).p_value >= PLAINLY_WHITE:
             continue
         for w in _around(search, single)[:MOST_AROUND]:
-                _keep(search, refit_window(search, w, prior, single))
+            _keep(search, refit_window(search, w, prior, single))
     _sharpen(search, prior)
 
 
@@ -93,8 +93,7 @@ def _around(search: Search, model: Model) -> list[Window]:
         response = response[:, :, 0]
     elif place in found.free:
         response = torch.diag(found.jacobian[:, found.free.index(place)])
-        at = found.problem.drivers(found.values[None], None)
-        drivers = {name: values[found.problem.condition_of] for name, values in at.items()}
+        drivers = found.problem.drivers_at_data(found.values[None], None)
     else:
         return []
     value = float(found.values[place] - model.candidate.neutral[model.candidate.own.index(place)])

@@ -10,7 +10,7 @@ import torch
 from pyro.ops.stats import split_gelman_rubin
 from torch import Tensor
 
-__all__ = ["Figures", "bulk_ess", "figures", "r_hat", "tail_ess"]
+__all__ = ["Figures", "figures"]
 
 
 class Figures(NamedTuple):
@@ -62,21 +62,6 @@ def figures(draws: Tensor) -> Figures:
         return torch.where(undefined, torch.full_like(figure, torch.nan), figure).reshape(rest)
 
     return Figures(told(spread, torch.ones_like(total)), told(_ess(scores), total), told(tail, total))
-
-
-def r_hat(draws: Tensor) -> Tensor:
-    """See `Figures`."""
-    return figures(draws).r_hat
-
-
-def bulk_ess(draws: Tensor) -> Tensor:
-    """See `Figures`."""
-    return figures(draws).ess_bulk
-
-
-def tail_ess(draws: Tensor) -> Tensor:
-    """See `Figures`."""
-    return figures(draws).ess_tail
 
 
 def _split_r_hat(values: Tensor) -> Tensor:

@@ -7,7 +7,10 @@ from torch import Tensor
 from torchcal.inference.diagnostics import Figures
 from torchcal.results.diagnostics import Mode
 
-__all__ = ["Draws"]
+__all__ = ["WORTH_CHAINS", "Draws"]
+
+WORTH_CHAINS = 0.05
+"""Weight from which on chains begin at a mode: one of a few dozen chains at a mode of 2 % would be too many."""
 
 
 @dataclass(frozen=True)

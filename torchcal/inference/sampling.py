@@ -13,7 +13,7 @@ from torchcal.errors import ConvergenceWarning, DomainError, ImproperPosteriorEr
 from torchcal.inference.batched import MOST_ELEMENTS, run_batched
 from torchcal.inference.coordinates import Laplace, dealt_out
 from torchcal.inference.diagnostics import Figures, figures
-from torchcal.inference.draws import Draws
+from torchcal.inference.draws import WORTH_CHAINS, Draws
 from torchcal.inference.estimate import Estimate, modes_of
 from torchcal.inference.nuts import run_nuts
 from torchcal.models import Problem
@@ -23,9 +23,6 @@ __all__ = ["Plan", "draw"]
 
 _FEWEST_CHAINS, _MOST_CHAINS = 32, 256
 """Where there is a target: so few chains cost no more than one, and so many use all of a core."""
-
-_LEAST_STARTED = 0.05
-"""Weight from which on chains begin at a mode: one of a few dozen chains at a mode of 2 % would be too many."""
 
 MOST_DRAWS = 20_000
 """Draws of a chain at which a search for a wanted sample size gives up."""
@@ -126,7 +123,7 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
     _warn_of_rounding(estimate, plan.dtype)
     cast = problem.cast(plan.dtype)
     cost = cast.propagate.num_nodes * len(cast.y)
-    worth = [k for k, mode in enumerate(modes) if k == 0 or (mode.weight >= _LEAST_STARTED and plan.sampler != "pyro")]
+    worth = [k for k, mode in enumerate(modes) if k == 0 or (mode.weight >= WORTH_CHAINS and plan.sampler != "pyro")]
     starts = [modes[k].to(plan.dtype) for k in worth]
     begun = {worth[k] for k in dealt_out([mode.weight for mode in starts], plan.chains(cost))}
     pattern = problem.propagate.pattern

@@ -11,7 +11,7 @@ from torchcal import likelihoods
 from torchcal.data import Recording
 from torchcal.errors import ConvergenceWarning, ExtrapolationWarning, ToleranceWarning
 from torchcal.inference import diagnostics as measure
-from torchcal.inference.draws import Draws
+from torchcal.inference.draws import WORTH_CHAINS, Draws
 from torchcal.inference.estimate import Estimate
 from torchcal.inference.fitting import LeastSquares
 from torchcal.models import Problem
@@ -29,9 +29,6 @@ __all__ = [
     "warn_of_chains",
     "warn_of_tolerance",
 ]
-
-MOST_IDLE = 0.05
-"""Share of the posterior at a maximum without chains that passes."""
 
 MOST_DIVERGENCES = 1e-4
 """Share of transitions that may diverge: one of ten thousand or more is no region that chains cannot enter."""
@@ -69,7 +66,7 @@ def diagnose(
         worst = min(few, key=lambda name: few[name])
         if not few[worst] >= wanted:
             problems.append(f"effective sample size of {worst} is {few[worst]:.0f} (threshold {wanted:.0f})")
-        idle = [mode.weight for mode in draws.modes if not mode.started and mode.weight >= MOST_IDLE]
+        idle = [mode.weight for mode in draws.modes if not mode.started and mode.weight >= WORTH_CHAINS]
         if idle:
             problems.append(
                 f"no chain began at a separate maximum that holds about {max(idle):.0%} of the posterior (raise "
