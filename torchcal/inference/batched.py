@@ -13,7 +13,7 @@ from tqdm.auto import tqdm
 from torchcal.errors import ConvergenceError, ConvergenceWarning
 from torchcal.inference import hmc_step, nuts_step
 from torchcal.inference.coordinates import Laplace, Whitened, starting_points
-from torchcal.inference.draws import Draws
+from torchcal.inference.draws import Draws, most_divergences
 from torchcal.inference.nuts_step import Outcome
 from torchcal.priors import Bounds
 
@@ -30,6 +30,12 @@ _WARM_UP_CHAINS = 64
 
 MOST_ELEMENTS = 2**22
 """Numbers that one evaluation of all chains may handle where the number of chains is ours to choose."""
+
+_STRICTEST = 0.98
+"""Mean acceptance from which on divergences are no matter of the step size."""
+
+_REPEATS = 2
+"""How often draws with divergences are drawn anew with smaller steps."""
 
 _ENOUGH = 1.05
 """Draws that are taken over those that a wanted sample size seems to need."""
@@ -62,7 +68,17 @@ class _DualAveraging:
 
     @property
     def step_size(self) -> float:
+        """To try next."""
         return math.exp(min(self.log_step, 3.0))
+
+    @property
+    def settled(self) -> float:
+        """To sample with."""
+        return math.exp(self.averaged)
+
+    def stricter(self) -> "_DualAveraging":
+        """From here, for half the rejections."""
+        return _DualAveraging(self.averaged, 0.5 * (1 + self.target))
 
 
 class _Kernel(Protocol):
@@ -163,7 +179,8 @@ def run_batched(
         kernel: ``"nuts"`` or ``"hmc"``.
         cost: Numbers that one evaluation of one chain handles; dear densities warm up with fewer chains.
         target_accept: Mean acceptance that the step size aims at; by default 0.8, and more where trajectories
-            diverge at the end of the warm-up: a curved ridge needs smaller steps than its width suggests.
+            diverge at the end of the warm-up, or later (then draws are drawn anew, up to twice): a curved ridge needs
+            smaller steps than its width suggests.
         max_tree_depth: Largest depth of a No-U-Turn tree, 2**depth steps.
         enough: From the draws so far, α ``(C, n, P)``, and the mode that each chain began at ``(C,)``, to the factor
             by which there must be more; at most 1 when there are enough.
@@ -177,43 +194,67 @@ def run_batched(
     moves: _Kernel = _HMC(generator) if kernel == "hmc" else _NUTS(max_tree_depth, loc.device, generator)
     crowd = max(num_chains, min(_WARM_UP_CHAINS, max(4, MOST_ELEMENTS // max(1, cost))))
     bar = tqdm(total=num_warmup + num_samples, desc=kernel.upper(), disable=not progress, leave=False)
-    collector = _Collector(num_chains, len(loc), loc)
+    drawn = _Collector(num_chains, len(loc), loc)
     try:
         space = Whitened(log_density, loc, modes[0].scale_tril)
         z, groups = starting_points(space, modes, crowd, generator)
-        space, z, step_size = _warm_up(moves, space, z, groups, num_warmup, target_accept, bar)
-        state = moves.init(z[:num_chains], space, step_size)
-        goal = num_samples if enough is None else min(num_samples, 100)
-        before, half, stuck = math.inf, goal, 0
-        while True:
-            state = collector.collect(moves, state, space, step_size, goal, bar)
-            if enough is None or goal == num_samples:
+        space, z, averaging = _warm_up(moves, space, z, groups, num_warmup, target_accept, bar)
+        owners = groups[:num_chains]
+        for repeat in range(_REPEATS + 1):
+            collector = _Collector(num_chains, len(loc), loc) if repeat else drawn
+            state = moves.init(z[:num_chains], space, averaging.settled)
+            judge = None if enough is None else lambda draws: enough(_alpha(draws, space, transform), owners)
+            _sample(moves, state, space, averaging.settled, collector, num_samples, judge, bar)
+            drawn = collector
+            few = collector.divergences <= most_divergences(collector.least * num_chains)
+            if few or target_accept is not None or averaging.target >= _STRICTEST or repeat == _REPEATS:
                 break
-            more = enough(_alpha(collector.draws(goal), space, transform), groups[:num_chains])
-            if more <= 1:
-                break
-            if math.isinf(before):
-                before, half = more, goal
-            elif goal >= 2 * half:
-                stuck = stuck + 1 if more > _STUCK * before else 0
-                before, half = more, goal
-            if stuck == 2:
-                break
-            goal = min(num_samples, math.ceil(goal * min(max(_ENOUGH * more, 1.15), 4.0)))
-        stored = collector.draws(goal)
+            # A lone divergence among thousands escapes the warm-up, which is shorter.
+            bar.total += collector.least
+            averaging = averaging.stricter()
+            _, _, z, _ = _adapt(moves, space, z, averaging, max(4, round(_WINDOWS[-1] * num_warmup)), bar)
     except KeyboardInterrupt:
-        have = collector.least
-        if have < 4:
+        if drawn.least < 4:
             raise ConvergenceError("The sampler was interrupted before it had drawn anything.") from None
-        stored = collector.draws(have)
         warnings.warn(
-            f"The sampler was interrupted. It keeps {have} of {num_samples} draws of each of {num_chains} chains.",
+            f"The sampler was interrupted. It keeps {drawn.least} of {num_samples} draws of each of {num_chains} "
+            "chains.",
             ConvergenceWarning,
             stacklevel=2,
         )
     finally:
         bar.close()
-    return Draws(_alpha(stored, space, transform), collector.divergences(len(stored)))
+    return Draws(_alpha(drawn.draws, space, transform), drawn.divergences)
+
+
+def _sample(
+    moves: _Kernel,
+    state: Any,
+    space: Whitened,
+    step_size: float,
+    collector: "_Collector",
+    num_samples: int,
+    enough: Callable[[Tensor], float] | None,
+    bar: tqdm,
+) -> None:
+    """Draw until there are enough, or as many as asked for."""
+    goal = num_samples if enough is None else min(num_samples, 100)
+    before, half, stuck = math.inf, goal, 0
+    while True:
+        state = collector.collect(moves, state, space, step_size, goal, bar)
+        if enough is None or goal == num_samples:
+            return
+        more = enough(collector.draws)
+        if more <= 1:
+            return
+        if math.isinf(before):
+            before, half = more, goal
+        elif goal >= 2 * half:
+            stuck = stuck + 1 if more > _STUCK * before else 0
+            before, half = more, goal
+        if stuck == 2:
+            return
+        goal = min(num_samples, math.ceil(goal * min(max(_ENOUGH * more, 1.15), 4.0)))
 
 
 def _alpha(z: Tensor, space: Whitened, transform: Bounds) -> Tensor:
@@ -229,10 +270,9 @@ def _warm_up(
     num_warmup: int,
     target_accept: float | None,
     bar: tqdm,
-) -> tuple[Whitened, Tensor, float]:
+) -> tuple[Whitened, Tensor, _DualAveraging]:
     """Coordinates, positions in them, and the step size."""
-    accept = 0.8 if target_accept is None else target_accept
-    averaging = _DualAveraging(math.log(0.5), accept)
+    averaging = _DualAveraging(math.log(0.5), 0.8 if target_accept is None else target_accept)
     diverging, length = 0.0, 0
     for number, share in enumerate(_WINDOWS):
         length = max(4, round(share * num_warmup))
@@ -241,13 +281,12 @@ def _warm_up(
             other = space.refined(pooled, groups[owners])
             z = other.inner(space.outer(z))
             space = other
-            z = moves.tune(z, groups, space, math.exp(averaging.averaged))
-            averaging = _DualAveraging(averaging.averaged, accept)
-    while target_accept is None and diverging > DIVERGING and accept < 0.98:
-        accept = 0.5 * (1 + accept)
-        averaging = _DualAveraging(averaging.averaged, accept)
+            z = moves.tune(z, groups, space, averaging.settled)
+            averaging = _DualAveraging(averaging.averaged, averaging.target)
+    while target_accept is None and diverging > DIVERGING and averaging.target < _STRICTEST:
+        averaging = averaging.stricter()
         _, _, z, diverging = _adapt(moves, space, z, averaging, length, bar)
-    return space, z, math.exp(averaging.averaged)
+    return space, z, averaging
 
 
 def _adapt(
@@ -319,10 +358,12 @@ class _Collector:
             self.least = least
         return state
 
-    def draws(self, count: int) -> Tensor:
-        """The first draws of every chain."""
-        return self.stored[:count]
+    @property
+    def draws(self) -> Tensor:
+        """Those that every chain has, ``(n, C, P)``."""
+        return self.stored[: self.least]
 
-    def divergences(self, count: int) -> int:
+    @property
+    def divergences(self) -> int:
         """How many of them ended a divergent trajectory."""
-        return int(self.diverged[:count].sum())
+        return int(self.diverged[: self.least].sum())

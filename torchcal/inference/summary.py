@@ -11,7 +11,7 @@ from torchcal import likelihoods
 from torchcal.data import Recording
 from torchcal.errors import ConvergenceWarning, ExtrapolationWarning, ToleranceWarning
 from torchcal.inference import diagnostics as measure
-from torchcal.inference.draws import WORTH_CHAINS, Draws
+from torchcal.inference.draws import WORTH_CHAINS, Draws, most_divergences
 from torchcal.inference.estimate import Estimate
 from torchcal.inference.fitting import LeastSquares
 from torchcal.models import Problem
@@ -29,9 +29,6 @@ __all__ = [
     "warn_of_chains",
     "warn_of_tolerance",
 ]
-
-MOST_DIVERGENCES = 1e-4
-"""Share of transitions that may diverge: one of ten thousand or more is no region that chains cannot enter."""
 
 
 def diagnose(
@@ -78,7 +75,7 @@ def diagnose(
                 f"chains began at {len(started)} separate maxima and have not mixed: how many draws each has rests "
                 "on normal approximations (" + ", ".join(f"{mode.weight:.2g}" for mode in started) + ")"
             )
-        if draws.divergences > MOST_DIVERGENCES * samples.shape[0] * samples.shape[1]:
+        if draws.divergences > most_divergences(samples.shape[0] * samples.shape[1]):
             problems.append(f"{draws.divergences} divergent transitions")
         converged = not problems
     return Diagnostics(
