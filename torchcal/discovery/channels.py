@@ -5,7 +5,7 @@ trajectory, say what any rate, known or unknown, in any window of time or state,
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -32,6 +32,7 @@ class Channel:
         time: Time, or condition, of the points ``(K,)``.
         matrix: Response of the n used data to a unit change at each point, ``(n, K)``; or its diagonal ``(n,)`` where
             each point is a datum.
+        rates: Of a parameter of differential equations, by equation what a unit change does to its rate, ``(K,)``.
     """
 
     kind: str
@@ -40,6 +41,7 @@ class Channel:
     drivers: dict[str, Tensor]
     time: Tensor
     matrix: Tensor
+    rates: dict[str, Tensor] = field(default_factory=dict)
 
     def response(self, profile: Tensor) -> Tensor:
         """Change of the data by a change ``profile`` (K, m) along the points, ``(n, m)``."""
@@ -104,16 +106,17 @@ def responses(problem: Problem, found: Fitted, forcing: Tensor) -> tuple[Tensor,
             adjoint[:filled] = active @ flow[r, k]
         result[mine] = block
     along = bound.along(values, states)
-    flat = bins.reshape(-1)
-    real = flat >= 0
-    weight = torch.zeros(count, dtype=torch.float64).index_add_(
-        0, flat[real], torch.ones(int(real.sum()), dtype=torch.float64)
-    )
-    drivers = {}
-    for name, table in along.items():
-        middle = (0.5 * (table[:, :-1] + table[:, 1:])).reshape(-1)[real]
-        drivers[name] = torch.zeros(count, dtype=torch.float64).index_add_(0, flat[real], middle) / weight
+    drivers = {name: _bin_means(bins, count, 0.5 * (table[:, :-1] + table[:, 1:])) for name, table in along.items()}
     return result, drivers, drivers["t"]
+
+
+def _bin_means(bins: Tensor, count: int, steps: Tensor) -> Tensor:
+    """Means over the steps ``(R, K, ...)`` of each bin, ``(bins, ...)``."""
+    real = bins >= 0
+    ones = torch.ones(int(real.sum()), dtype=torch.float64)
+    weight = torch.zeros(count, dtype=torch.float64).index_add_(0, bins[real], ones)
+    total = torch.zeros(count, *steps.shape[2:], dtype=torch.float64).index_add_(0, bins[real], steps[real])
+    return total / weight.reshape(-1, *(1 for _ in steps.shape[2:]))
 
 
 def _rate_unit(unit: str | None, time: str) -> str | None:
@@ -170,10 +173,15 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
         ]
         labels += [("parameter", names[i], problem.parameters[i].unit) for i in own]
         given = definitions(bound, found.values, states)
+        rates = _bin_means(*_binning(bound), by_parameter[0] / bound._h.clamp_min(1e-300)[..., None, None])
         for m, (kind, target, unit) in enumerate(labels):
             if kind == "equation" and target in given:
                 continue
-            list_.append(Channel(kind, target, unit, drivers, time, response[:, :, m]))
+            moved: dict[str, Tensor] = {}
+            if kind == "parameter":
+                changes = zip(bound.ode.states, rates[:, :, m - size].unbind(-1), strict=True)
+                moved = {name: rate for name, rate in changes if name not in given and bool((rate != 0).any())}
+            list_.append(Channel(kind, target, unit, drivers, time, response[:, :, m], moved))
         at_data = problem.drivers_at_data(found.values[None], states)
     else:
         at_data = problem.drivers_at_data(found.values[None], None)

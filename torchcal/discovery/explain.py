@@ -196,17 +196,28 @@ def by_plausibility(search: Search) -> list[Place]:
 
 
 def missing_rate(search: Search) -> MissingRate | None:
-    """The best smooth unknown change of one channel."""
+    """The best smooth unknown change of one equation or output, or of one parameter of a static simulator.
+
+    A parameter that changes in time and acts in one equation is a missing rate of that equation.
+    """
     kinds = search.problem.kinds
-    place = next((p for p in by_plausibility(search) if p.channel.kind in kinds and p.evidence > 0), None)
-    if place is None:
-        return None
-    values = place.channel.drivers[place.driver]
-    order = values.argsort(stable=True)
-    return MissingRate(
-        place.channel.kind, place.channel.target, place.driver, values[order], place.profile[order], place.sd[order],
-        place.channel.unit, place.channel.time, place.profile,
-    )  # fmt: skip
+    for place in by_plausibility(search):
+        channel = place.channel
+        if place.evidence <= 0:
+            return None
+        kind, target, unit, size = channel.kind, channel.target, channel.unit, torch.ones_like(place.profile)
+        if kind not in kinds:
+            if place.driver != "t" or len(channel.rates) != 1:
+                continue
+            kind = "equation"
+            target, size = next(iter(channel.rates.items()))
+            unit = next((c.unit for c in search.structure.channels if (c.kind, c.target) == (kind, target)), None)
+        values, rate, sd = channel.drivers[place.driver], place.profile * size, place.sd * size.abs()
+        order = values.argsort(stable=True)
+        return MissingRate(
+            kind, target, place.driver, values[order], rate[order], sd[order], unit, channel.time, rate
+        )
+    return None
 
 
 def symptoms(search: Search, best: Model | None) -> list[str]:

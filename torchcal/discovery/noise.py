@@ -242,8 +242,8 @@ def _quantisation(problem: Problem) -> dict[str, float]:
 def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
     """Used data that stick out alone from their neighbours, bool ``(n,)``.
 
-    Along one order the second difference of the residual has no smooth part left, and its centre is the spike. Among
-    several conditions the residual of a robust smooth fit takes its place.
+    Along one order they are compared with the median of two neighbours on either side. Among several conditions the
+    residual of a robust smooth fit takes its place.
     """
     found = torch.zeros(problem.n, dtype=torch.bool)
     for places in problem.sequences:
@@ -258,17 +258,44 @@ def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
             high = left.abs() > SPIKE * size if size > 0 else torch.zeros_like(left, dtype=torch.bool)
             found[places] = high if not _clustered(problem, places, high) else False
             continue
-        bend = torch.cat([r.new_zeros(1), r[1:-1] - 0.5 * (r[:-2] + r[2:]), r.new_zeros(1)])
-        robust = 1.4826 * float(bend[1:-1].abs().median())
+        off = _off_neighbours(r)
+        robust = 1.4826 * float(off[1:-1].abs().median())
         if sd is not None:
-            robust = max(robust, math.sqrt(1.5))
+            robust = max(robust, math.sqrt(1.3))  # what white noise gives
         if robust <= 0:
             continue
-        # The neighbours of a spike bend the other way by half as much; those of a curve bend the same way.
-        around = torch.stack([bend.roll(1), bend.roll(-1)]) / torch.where(bend == 0, torch.ones_like(bend), bend)
-        around[0, 1] = around[1, -2] = -0.5
-        alone = (around < -0.2).all(0) & (around > -1.0).all(0)
-        found[places] = (bend.abs() > SPIKE * robust) & alone
+        found[places] = _alone(r, off, SPIKE * robust)
+    return found
+
+
+def _off_neighbours(r: Tensor) -> Tensor:
+    """Differences ``(m,)`` from the median of two neighbours on either side; 0 at both ends."""
+    padded = torch.cat([r.new_full((2,), math.nan), r, r.new_full((2,), math.nan)])
+    around = torch.stack([padded[k : k + len(r)] for k in (0, 1, 3, 4)])
+    off = r - around.nanquantile(0.5, dim=0, interpolation="midpoint")
+    off[0] = off[-1] = 0.0
+    return off
+
+
+def _alone(r: Tensor, off: Tensor, least: float) -> Tensor:
+    """Which differences from neighbours are at least so large, singly or two together, bool ``(m,)``.
+
+    Those beside the top of a curve are nearly as large as at its top; those beside a spike are not. Before and behind a
+    step the values differ; before and behind a spike they do not.
+    """
+    high = (off.abs() > least).tolist()
+    size = [*off.abs().tolist(), 0.0]
+    found = torch.zeros(len(off), dtype=torch.bool)
+    k = 0
+    while k < len(high):
+        end = k
+        while end < len(high) and high[end]:
+            end += 1
+        if 0 < end - k <= 2:
+            top = max(size[k:end])
+            step = abs(float(r[max(k - 2, 0) : k].mean() - r[end : end + 2].mean()))
+            found[k:end] = max(size[k - 1], size[end], step) < 0.5 * top
+        k = end + 1
     return found
 
 

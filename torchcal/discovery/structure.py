@@ -16,8 +16,12 @@ from torchcal.discovery.noise import GRID, Noise
 
 __all__ = ["Place", "Residual", "Structure", "analyse"]
 
-#: Radial functions along a driver.
-FEATURES = 12
+#: Radial functions along time, and along any other driver: the evidence chooses how many.
+IN_TIME, ALONG = (12, 24, 48), (12, 24)
+#: Of more functions than the fewest, how many data there must be for each.
+DATA_EACH = 4
+#: Singular values below this share of the largest are none.
+SMALL = 1e-6
 #: Sizes of an unknown change that are tried, in noise sd.
 SIZES = torch.logspace(-0.3, 3.0, 14, dtype=torch.float64)
 
@@ -130,15 +134,11 @@ class Structure:
     null_best: Tensor
 
 
-def _features(driver: Tensor) -> Tensor:
-    """Radial functions ``(K, m)`` that sum to smooth curves along a driver."""
+def _features(driver: Tensor, count: int) -> Tensor:
+    """Radial functions ``(K, count)`` that sum to smooth curves along a driver."""
     low, high = float(driver.min()), float(driver.max())
-    if not high > low:
-        return driver.new_zeros(len(driver), 0)
-    distinct = len(driver.unique())
-    count = min(FEATURES, distinct)
     centres = torch.linspace(low, high, count, dtype=torch.float64)
-    width = 1.2 * (high - low) / max(count - 1, 1)
+    width = 1.2 * (high - low) / (count - 1)
     return torch.exp(-0.5 * ((driver[:, None] - centres) / width).square())
 
 
@@ -149,6 +149,58 @@ def _evidence(u: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
     logs = 0.5 * shrink @ u.square() - 0.5 * torch.log1p(gain).sum(-1, keepdim=True)
     best = logs.max(0)
     return best.values.clamp_min(0.0), SIZES[best.indices]
+
+
+@dataclass(frozen=True, eq=False)
+class _Change:
+    """Smooth changes of a channel along a driver, in principal directions.
+
+    Attributes:
+        features: Radial functions at the channel's points, ``(K, m)``.
+        scale: Of their responses, which are divided by it.
+        s: Singular values of the responses, ``(m,)``.
+        v: Right singular vectors, ``(m, m)``.
+        along: The residual along the left ones, ``(m,)``.
+        null: The simulated residuals along them, ``(m, draws)``.
+    """
+
+    features: Tensor
+    scale: float
+    s: Tensor
+    v: Tensor
+    along: Tensor
+    null: Tensor
+
+    @classmethod
+    def of(cls, features: Tensor, columns: Tensor, least: float, residuals: Tensor) -> "_Change | None":
+        """From the responses, projected; None where there are none beyond rounding, ``least``."""
+        scale = float(columns.norm()) / math.sqrt(columns.shape[1])
+        if scale <= least:
+            return None
+        columns = columns / scale
+        values, v = torch.linalg.eigh(columns.T @ columns)
+        s = values.clamp_min(0.0).sqrt()
+        there = s > SMALL * s[-1]
+        along = (v[:, there].T @ (columns.T @ residuals)) / s[there, None]
+        return cls(features, scale, s[there], v[:, there], along[:, 0], along[:, 1:])
+
+    def place(self, channel: Channel, driver: str, residual: "Residual", excess: float) -> "Place":
+        """The estimate."""
+        evidence, size = _evidence(self.along[:, None], self.s)
+        gain = (float(size[0]) * self.s).square()
+        shrink = gain / (1 + gain)
+        weights = (self.v * (shrink / self.s)) @ self.along / self.scale
+        removed = float(((1 - (1 - shrink).square()) * self.along.square()).sum())
+        left = float(residual.e.square().sum()) - removed
+        rest = max(left - residual.freedom + float(shrink.sum()), 0.0)
+        within = (self.features @ self.v) / (1 + gain).sqrt()
+        # What the data say nothing about keeps its prior sd.
+        beyond = (self.features.square().sum(1) - (self.features @ self.v).square().sum(1)).clamp_min(0.0)
+        sd = (within.square().sum(1) + beyond).sqrt() * float(size[0]) / self.scale
+        return Place(
+            channel, driver, float(evidence[0]), 1.0 - min(rest / excess, 1.0), self.features @ weights, sd,
+            float(size[0]),
+        )  # fmt: skip
 
 
 def analyse(residual: Residual, *, every: bool = False) -> Structure:
@@ -165,32 +217,37 @@ def analyse(residual: Residual, *, every: bool = False) -> Structure:
     places: list[Place] = []
     nulls: list[Tensor] = []
     excess = max(residual.excess, 1e-300)
+    both = torch.cat([residual.e[:, None], residual.null], dim=1)
     for channel in chosen:
         for name, driver in channel.drivers.items():
-            features = _features(driver)
-            if features.shape[1] < 2:
+            distinct = len(driver.unique())
+            most = max(ALONG[0], found.problem.n // DATA_EACH)
+            tried = IN_TIME if name == "t" else ALONG
+            counts = dict.fromkeys(min(count, distinct) for count in tried if count <= most)
+            if distinct < 2:
                 continue
-            columns = residual.tangent(channel.response(features))
+            parts = [_features(driver, count) for count in counts]
+            responses = found.whitening(channel.response(torch.cat(parts, dim=1)))
+            columns = residual.project(responses)
             if not bool(torch.isfinite(columns).all()):
                 continue
-            scale = float(columns.norm()) / math.sqrt(columns.shape[1])
-            if scale <= 1e-9 * float(found.whitening(channel.response(features)).norm() + 1e-300):
-                continue
-            u, s, v = torch.linalg.svd(columns / scale, full_matrices=False)
-            along = u.T @ residual.e[:, None]
-            evidence, size = _evidence(along, s)
-            if channel.kind in kinds:
-                nulls.append(_evidence(u.T @ residual.null, s)[0])
-            gain = (float(size[0]) * s).square()
-            shrink = gain / (1 + gain)
-            weights = (v.T * (shrink / s.clamp_min(1e-12))) @ along[:, 0] / scale
-            left = residual.e - u @ (shrink * along[:, 0])
-            rest = max(float(left.square().sum()) - residual.freedom + float(shrink.sum()), 0.0)
-            spread = (features @ v.T) * (float(size[0]) / (1 + gain).sqrt()) / scale
-            places.append(
-                Place(channel, name, float(evidence[0]), 1.0 - min(rest / excess, 1.0), features @ weights,
-                      spread.norm(dim=1), float(size[0]))
-            )  # fmt: skip
+            sizes = [part.shape[1] for part in parts]
+            best: Place | None = None
+            null: Tensor | None = None
+            for features, block, whole in zip(parts, columns.split(sizes, 1), responses.split(sizes, 1), strict=True):
+                change = _Change.of(features, block, 1e-9 * float(whole.norm()), both)
+                if change is None:
+                    continue
+                place = change.place(channel, name, residual, excess)
+                if best is None or place.evidence > best.evidence:
+                    best = place
+                if channel.kind in kinds:
+                    simulated = _evidence(change.null, change.s)[0]
+                    null = simulated if null is None else torch.maximum(null, simulated)
+            if best is not None:
+                places.append(best)
+            if null is not None:
+                nulls.append(null)
     places.sort(key=lambda place: -place.evidence)
     if not nulls:
         return Structure(places, 1.0, available, torch.zeros(1, dtype=torch.float64))
