@@ -17,6 +17,7 @@ from torchcal.discovery.candidates import base_columns
 from torchcal.discovery.embedded import embed_each, model_error_sd
 from torchcal.discovery.experiment import propose
 from torchcal.discovery.fitting import Fitted
+from torchcal.discovery.limits import limits
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.records import Estimate, Hypothesis, Scores, Table
 from torchcal.discovery.result import Diagnosis
@@ -256,7 +257,7 @@ def _result(
         tied=decision.tied,
         where=explain.locate(search, shown) if decision.verdict != "consistent" else Table([], ("kind", "target")),
         ranking=_ranking(search, decision, mask),
-        detection_limit=explain.limits(
+        detection_limit=limits(
             search, 1.0 - confidence, POWER, [term for term in terms if _contains(simulator, term)]
         ),
         remaining=remaining,

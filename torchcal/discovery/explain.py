@@ -9,16 +9,14 @@ from torch import Tensor
 from torchcal.discovery.channels import Channel
 from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.local import region_text
-from torchcal.discovery.records import Estimate, Fit, Limit, Location, MissingRate, NeededShift, Table
-from torchcal.discovery.search import PRIOR, Model, Search
+from torchcal.discovery.records import Estimate, Fit, Location, MissingRate, NeededShift, Table
+from torchcal.discovery.search import Model, Search
 from torchcal.discovery.structure import Place, Structure
-from torchcal.terms import Term
 
 __all__ = [
     "estimates",
     "fit_record",
     "identifiability",
-    "limits",
     "locate",
     "missing_rate",
     "needed_shifts",
@@ -130,40 +128,6 @@ def removed(search: Search, model: Model) -> float:
     if excess <= 0:
         return 0.0
     return min(max(1.0 - max(left, 0.0) / excess, 0.0), 1.0)
-
-
-def limits(search: Search, alpha: float, power: float, contained: Sequence[Term] = ()) -> Table[Limit]:
-    """Smallest detectable effects; ``contained`` terms are part of the simulator already."""
-    screening = search.screening
-    from_power = math.sqrt(2) * float(torch.special.erfinv(torch.tensor(2 * power - 1, dtype=torch.float64)))
-    # Several families of statistics share the level: each may use as much of it as leaves alpha in all.
-    level = float(search.least.quantile(alpha))
-    critical = float(screening.null.quantile(1 - level)) if len(screening.null) else 3.5
-    odds = math.log(PRIOR["base"] / (PRIOR["single"] / max(len(search.candidates), 1)))
-    fitted = search.plain
-    rows = []
-    for i, candidate in enumerate(search.candidates):
-        column = screening.best[i]
-        place = candidate.amplitudes[int(screening.amplitude[column]) if column >= 0 else 0]
-        q = candidate.problem.parameters[place]
-        model = fitted.get(i)
-        estimate = float(model.found.values[place]) if model else None
-        if column < 0:
-            note = "tangent vanishes: only large effects can tell" if candidate.blind else "already in the base model"
-            rows.append(Limit(candidate.name, q.name, math.inf, q.unit, power, estimate, note))
-            continue
-        norm = float(screening.norm[column])
-        # Seen is not enough: the evidence for the term must outweigh that for the base too.
-        wanted = max(critical, math.sqrt(max(2 * odds + len(candidate.own) * math.log(search.problem.n), 0.0)))
-        doubt = 1.0
-        if math.isfinite(search.noise.freedom):  # the noise's estimate wavers, and the score with it
-            doubt = math.sqrt(1 + wanted**2 / (2 * search.noise.freedom))
-        note = f"also: {', '.join(search.aliases[i])}" if search.aliases.get(i) else ""
-        rows.append(Limit(candidate.name, q.name, (wanted + doubt * from_power) / norm, q.unit, power, estimate, note))
-    for term in contained:
-        name = term.full(term.parameters[0].name) if term.parameters else term.frees[0]
-        rows.append(Limit(term.name, name, math.inf, None, power, None, "already in the base model"))
-    return Table(rows, ("term", "parameter", "smallest", "unit", "power", "estimate", "note"))
 
 
 def needed_shifts(search: Search) -> list[NeededShift]:

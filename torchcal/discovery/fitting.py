@@ -157,17 +157,19 @@ def fit(
     free: list[int],
     *,
     warm: Any = None,
+    data: Tensor | None = None,
     max_steps: int = MAX_STEPS,
 ) -> Fitted | None:
     """Minimise χ² over the free parameters from every row of ``begin`` (H, P); None where no start works.
 
     Marquardt's scaling makes it independent of units. A parameter on a bound that the gradient pushes outward is held
-    for the step. Parameters with ``transform="log"`` are stepped in their logarithm.
+    for the step. Parameters with ``transform="log"`` are stepped in their logarithm. With ``data`` (H, n) every start
+    is fitted to data of its own, and ``ends_chi2`` tells how well.
     """
     low, high = problem.limits()
     low, high = low[free], high[free]
     log = torch.tensor([problem.parameters[i].transform == "log" for i in free])
-    target = whitening.vector(problem.y)
+    target = whitening.vector(problem.y if data is None else data)
     values = begin.clone()
     values[:, free] = values[:, free].clamp(low, high)
 
@@ -185,6 +187,7 @@ def fit(
     if not bool(alive.all()):  # infinite trajectories would poison the batch
         values, y, jacobian, residual, chi2 = (t[alive] for t in (values, y, jacobian, residual, chi2))
         warm = warm[alive] if isinstance(warm, Tensor) else None
+        target = target[alive] if data is not None else target
     damping = torch.full_like(chi2, 1e-3)
     size = torch.zeros(len(values), len(free), dtype=torch.float64)
     done = torch.zeros(len(values), dtype=torch.bool)
@@ -255,7 +258,7 @@ def fit(
         if bool(done.all()):
             break
     best = int(chi2.argmin())
-    gradient = (whitening(jacobian[best]).T @ residual[best]) if free else target[:0]
+    gradient = (whitening(jacobian[best]).T @ residual[best]) if free else residual[best, :0]
     now = values[best, free]
     width = torch.where(torch.isfinite(high - low), high - low, now.abs().clamp_min(1e-300))
     near = 1e-6 * width

@@ -1,0 +1,129 @@
+"""Detection limits: the smallest effect of each candidate that these data could have shown."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.fitting import fit
+from torchcal.discovery.records import Limit, Table
+from torchcal.discovery.search import PRIOR, Search
+from torchcal.terms import Term
+
+__all__ = ["limits"]
+
+#: Times that a limit is corrected by what calibration makes of an effect of its size, and by how much at most.
+ROUNDS, MOST = 2, 4.0
+
+
+def limits(search: Search, alpha: float, power: float, contained: Sequence[Term] = ()) -> Table[Limit]:
+    """Smallest detectable effects.
+
+    The linear limit, from the norm of the projected tangent, is checked: an effect of its size is simulated without
+    noise, the base is calibrated to that, and the size is scaled until what calibration cannot hide is large enough.
+
+    Args:
+        search: With its screening.
+        alpha: Probability of calling noise a mismatch.
+        power: Probability of detection at the limit.
+        contained: Terms that are part of the simulator already.
+    """
+    screening = search.screening
+    from_power = math.sqrt(2) * float(torch.special.erfinv(torch.tensor(2 * power - 1, dtype=torch.float64)))
+    # Several families of statistics share the level: each may use as much of it as leaves alpha in all.
+    level = float(search.least.quantile(alpha))
+    critical = float(screening.null.quantile(1 - level)) if len(screening.null) else 3.5
+    odds = math.log(PRIOR["base"] / (PRIOR["single"] / max(len(search.candidates), 1)))
+    fitted = search.plain
+    effects: dict[int, _Effect] = {}
+    for i, candidate in enumerate(search.candidates):
+        column = screening.best[i]
+        if column < 0:
+            continue
+        # Seen is not enough: the evidence for the term must outweigh that for the base too.
+        wanted = max(critical, math.sqrt(max(2 * odds + len(candidate.own) * math.log(search.problem.n), 0.0)))
+        doubt = 1.0
+        if math.isfinite(search.noise.freedom):  # the noise's estimate wavers, and the score with it
+            doubt = math.sqrt(1 + wanted**2 / (2 * search.noise.freedom))
+        effects[i] = _Effect(column, wanted + doubt * from_power, float(screening.norm[column]))
+    sizes = {i: effect.distance / effect.norm for i, effect in effects.items()}
+    if not search.exact:
+        sizes = _corrected(search, effects, sizes)
+    rows = []
+    for i, candidate in enumerate(search.candidates):
+        column = screening.best[i]
+        place = candidate.amplitudes[int(screening.amplitude[column]) if column >= 0 else 0]
+        q = candidate.problem.parameters[place]
+        model = fitted.get(i)
+        estimate = float(model.found.values[place]) if model else None
+        if i not in effects:
+            note = "tangent vanishes: only large effects can tell" if candidate.blind else "already in the base model"
+            rows.append(Limit(candidate.name, q.name, math.inf, q.unit, power, estimate, note))
+            continue
+        note = f"also: {', '.join(search.aliases[i])}" if search.aliases.get(i) else ""
+        rows.append(Limit(candidate.name, q.name, sizes[i], q.unit, power, estimate, note))
+    for term in contained:
+        name = term.full(term.parameters[0].name) if term.parameters else term.frees[0]
+        rows.append(Limit(term.name, name, math.inf, None, power, None, "already in the base model"))
+    return Table(rows, ("term", "parameter", "smallest", "unit", "power", "estimate", "note"))
+
+
+@dataclass(frozen=True)
+class _Effect:
+    """What a candidate must do to the data to be seen.
+
+    Attributes:
+        column: Of the screening: shapes and amplitude.
+        distance: How far the data must be, in noise sd, from what the base can be calibrated to.
+        norm: How far a unit of the amplitude takes them, to first order.
+    """
+
+    column: int
+    distance: float
+    norm: float
+
+
+def _corrected(search: Search, effects: dict[int, _Effect], sizes: dict[int, float]) -> dict[int, float]:
+    """Sizes whose effects remain large enough when the base is calibrated to them; of two signs the worse."""
+    base = search.base
+    trials: list[tuple[int, int]] = []
+    for i, effect in effects.items():
+        candidate = search.candidates[i]
+        sided = candidate.one_sided(candidate.amplitudes[int(search.screening.amplitude[effect.column])])
+        trials += [(i, sign) for sign in ((sided,) if sided else (1, -1))]
+    now = {trial: sizes[trial[0]] for trial in trials}
+    for _ in range(ROUNDS):
+        data, known = [], []
+        for trial in trials:
+            y = _simulated(search, trial[0], effects[trial[0]].column, trial[1] * now[trial])
+            if y is not None:
+                data.append(y)
+                known.append(trial)
+        if not known:
+            break
+        warm: Any = base.warm.expand(len(known), *base.warm.shape[1:]) if isinstance(base.warm, Tensor) else None
+        begin = base.values.expand(len(known), -1)
+        found = fit(base.problem, base.whitening, begin, base.free, warm=warm, data=torch.stack(data), max_steps=20)
+        if found is None or found.ends_chi2 is None or len(found.ends_chi2) != len(known):
+            break
+        for trial, chi2 in zip(known, found.ends_chi2.tolist(), strict=True):
+            ratio = effects[trial[0]].distance / max(math.sqrt(chi2), 1e-300)
+            now[trial] *= min(max(ratio, 1 / MOST), MOST)
+    return {i: max(now[trial] for trial in trials if trial[0] == i) for i in effects}
+
+
+def _simulated(search: Search, i: int, column: int, size: float) -> Tensor | None:
+    """Noise-free data ``(n,)`` of the base with a candidate of some size; None where they are not finite."""
+    candidate, screening = search.candidates[i], search.screening
+    row = candidate.begin.clone()
+    row[candidate.own] = candidate.shapes[int(screening.shape[column])]
+    row[candidate.amplitudes[int(screening.amplitude[column])]] += size
+    warm = search.base.warm
+    if isinstance(warm, Tensor):
+        ode = getattr(candidate.problem.simulator, "ode", None)
+        warm = warm if ode is not None and len(ode.states) == warm.shape[-1] else None
+    y = candidate.problem.evaluate(row[None], [], warm)[0][0]
+    return y if bool(torch.isfinite(y).all()) else None
