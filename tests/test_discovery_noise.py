@@ -160,6 +160,21 @@ def test_lonely_spikes_are_found(sd):
     assert spikes_in(y, sd) == [20, 51]
 
 
+@pytest.mark.parametrize("places", [[0], [79], [20, 21], [1], [40, 42]])
+def test_spikes_at_the_ends_and_side_by_side(places):
+    x = torch.linspace(0, 1, 80, dtype=F64)
+    y = torch.sin(6 * x) + draw(80, 0.1, 2)
+    y[places] += torch.tensor([2.0, -1.4], dtype=F64)[: len(places)]
+    assert spikes_in(y, 0.1) == places
+
+
+def test_what_begins_or_ends_steeply_is_no_outlier():
+    x = torch.linspace(0, 1, 80, dtype=F64)
+    assert spikes_in(3.0 * torch.exp(-x / 0.05) + draw(80, 0.1, 2), 0.1) == []
+    assert spikes_in(5.0 * x + draw(80, 0.1, 2), 0.1) == []
+    assert spikes_in(3.0 * torch.cos(9 * x) + draw(80, 0.1, 2), 0.1) == []
+
+
 def test_steps_and_pulses_are_no_outliers():
     x = torch.linspace(0, 1, 80, dtype=F64)
     step = torch.where(x > 0.5, 3.0, 0.0).to(F64) + draw(80, 0.1, 2)
@@ -169,7 +184,7 @@ def test_steps_and_pulses_are_no_outliers():
 
 
 def test_good_data_are_rarely_set_aside():
-    # The second difference of white noise exceeds 4.5 robust sd with a probability of 7e-6 a sample.
+    # White noise is 4.5 robust sd off its neighbours with a probability of 7e-6 a sample.
     count = sum(len(spikes_in(draw(100, 1.0, seed))) for seed in range(60))
     assert count <= most(6000, 1e-4)
 
@@ -297,7 +312,7 @@ def test_limits_fall_with_the_noise_and_with_the_data():
     x = torch.linspace(0, 3, 60, dtype=F64)
     recordings = [tc.Recording(x=x, y=1.1 * torch.exp(-0.9 * x) + draw(60, sd, 1), noise=sd) for sd in (0.02, 0.04)]
     small, large = (diagnosed(recording).detection_limit[0].smallest for recording in recordings)
-    assert large / small == pytest.approx(2.0, rel=0.2)
+    assert 1.8 <= large / small <= 3.0  # more than in proportion: calibration hides more of a large offset
     many = diagnosed(decay(240, 1, known=True)).detection_limit[0].smallest
     assert small / many == pytest.approx(2.0, rel=0.3)
 

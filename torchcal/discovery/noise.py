@@ -258,22 +258,27 @@ def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
             high = left.abs() > SPIKE * size if size > 0 else torch.zeros_like(left, dtype=torch.bool)
             found[places] = high if not _clustered(problem, places, high) else False
             continue
-        off = _off_neighbours(r)
-        robust = 1.4826 * float(off[1:-1].abs().median())
+        around = torch.stack([r[:-4], r[1:-3], r[3:-1], r[4:]]).quantile(0.5, dim=0, interpolation="midpoint")
+        robust = 1.4826 * float((r[2:-2] - around).abs().median())
         if sd is not None:
             robust = max(robust, math.sqrt(1.3))  # what white noise gives
-        if robust <= 0:
-            continue
-        found[places] = _alone(r, off, SPIKE * robust)
+        if robust > 0:
+            found[places] = _alone(r, _off_neighbours(r, SPIKE * robust), SPIKE * robust)
     return found
 
 
-def _off_neighbours(r: Tensor) -> Tensor:
-    """Differences ``(m,)`` from the median of two neighbours on either side; 0 at both ends."""
+def _off_neighbours(r: Tensor, least: float) -> Tensor:
+    """Differences ``(m,)`` from the median of two neighbours on either side.
+
+    At both ends from a line through the next four, scaled to vary as much as the others do by noise alone, or 0 where
+    one of those is off itself by more than ``least``.
+    """
     padded = torch.cat([r.new_full((2,), math.nan), r, r.new_full((2,), math.nan)])
     around = torch.stack([padded[k : k + len(r)] for k in (0, 1, 3, 4)])
     off = r - around.nanquantile(0.5, dim=0, interpolation="midpoint")
-    off[0] = off[-1] = 0.0
+    for end, near, far, beside in ((0, r[1:3], r[3:5], off[1:5]), (-1, r[-3:-1], r[-5:-3], off[-5:-1])):
+        line = near.mean() + 0.75 * (near.mean() - far.mean())
+        off[end] = 0.0 if bool((beside.abs() > least).any()) else (r[end] - line) * math.sqrt(1.3 / 2.8)
     return off
 
 
@@ -292,9 +297,9 @@ def _alone(r: Tensor, off: Tensor, least: float) -> Tensor:
         while end < len(high) and high[end]:
             end += 1
         if 0 < end - k <= 2:
-            top = max(size[k:end])
-            step = abs(float(r[max(k - 2, 0) : k].mean() - r[end : end + 2].mean()))
-            found[k:end] = max(size[k - 1], size[end], step) < 0.5 * top
+            inside = 0 < k and end < len(high)
+            step = abs(float(r[max(k - 3, 0) : k].median() - r[end : end + 3].median())) if inside else 0.0
+            found[k:end] = max(size[k - 1] if k else 0.0, size[end], step) < 0.5 * max(size[k:end])
         k = end + 1
     return found
 
