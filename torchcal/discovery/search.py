@@ -24,7 +24,7 @@ from torchcal.terms import Term
 __all__ = ["Hypothetical", "Model", "Search"]
 
 #: Prior probabilities: of the base, of one library term, of a local one, of two, and of something else.
-PRIOR = {"base": 0.30, "single": 0.40, "local": 0.10, "several": 0.08, "none": 0.12}
+PRIOR = {"base": 0.30, "single": 0.35, "local": 0.13, "several": 0.11, "none": 0.11}
 #: Prior odds against an estimate on a physical bound that it wants to cross.
 UNPHYSICAL = math.log(1e-3)
 #: Single terms that are refitted at most.

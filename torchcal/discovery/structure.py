@@ -143,12 +143,11 @@ def _features(driver: Tensor, count: int) -> Tensor:
 
 
 def _evidence(u: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
-    """Largest log evidence over `SIZES`, and its size; u ``(r, B)``, s ``(r,)``."""
+    """Log evidence with every one of `SIZES` as likely, ``(B,)``, and the likeliest size; u ``(r, B)``, s ``(r,)``."""
     gain = (SIZES[:, None] * s).square()  # (G, r)
     shrink = gain / (1 + gain)
     logs = 0.5 * shrink @ u.square() - 0.5 * torch.log1p(gain).sum(-1, keepdim=True)
-    best = logs.max(0)
-    return best.values.clamp_min(0.0), SIZES[best.indices]
+    return logs.logsumexp(0) - math.log(len(SIZES)), SIZES[logs.argmax(0)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -269,7 +269,7 @@ def _prove(search: Search, decision: Decision, mask: Tensor | None) -> None:
     seen = mask & search.problem.keep
     if not bool(seen.any()):
         return
-    gain, error = verify.compare(search.problem.recording, before.prediction, after.prediction, search.noise, seen)
+    gain, error = verify.compare(search.problem.recording, before, after, search.noise, seen)
     if gain < -error:
         decision.withdrawn = (
             f"{' and '.join(decision.best.names)} explained the fitted data but predicted held-out data worse than the "
