@@ -176,6 +176,28 @@ def test_the_design_in_time(windy, tmp_path):
     assert 'src="http' not in page
 
 
+def test_an_end_that_nothing_before_it_foretells_is_not_held_out():
+    """A diode's knee: three quarters of the characteristic say nothing about the last."""
+    x = torch.linspace(0, 1, 100, dtype=torch.float64)
+    diode = tc.Simulator(
+        lambda x, p: p["a"] - 1e-7 * p["b"] * torch.exp(x / p["c"]),
+        [tc.Parameter("a", initial=1.0), tc.Parameter("b", low=0.0, initial=1.0),
+         tc.Parameter("c", low=0.04, high=0.1, initial=0.06)],
+    )  # fmt: skip
+    noise = 0.02 * torch.randn(100, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    y = 1 - 1e-7 * torch.exp(x / 0.06) - 0.4 * x.square() + noise
+    shunt = tc.Term("shunt", outputs={"y": lambda x, p, y: y - p["g"] * x.square()}, parameters=[tc.Parameter("g")])
+    recording = tc.Recording(x=x, y=y, noise=0.02)
+    d = quiet(diode, recording, [shunt])
+    assert d.terms == ["shunt"]
+    assert d.held_out.sum() in range(20, 30)
+    assert not bool(d.held_out[0])
+    assert not bool(d.held_out[-1])
+    assert d.after.held_out.rmse < 0.03 < d.before.held_out.rmse
+    # Asked for, it is held out all the same.
+    assert bool(quiet(diode, recording, [shunt], holdout=0.25).held_out[-1])
+
+
 def test_improved_is_a_simulator_like_any_other(windy):
     _, motion, candidates, d = windy
     fit = tc.calibrate(

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import torchcal as tc
+from torchcal.discovery.base import calibrate_base
 from torchcal.discovery.fitting import fit, refit, starts
 from torchcal.discovery.noise import GRID, Noise
 from torchcal.discovery.problem import Problem
@@ -407,3 +408,28 @@ def test_a_bound_beside_a_nearly_parallel_tangent(low, high, start):
     )
     assert found.chi2 == pytest.approx(2 * wanted.cost, rel=1e-6)
     assert found.at_bound.tolist() == [False, True]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_unknown_velocities_under_much_noise(seed):
+    """One and a half orbits: the slope of the first few positions is noise, and a wrong one leads to another orbit."""
+    star = tc.ODESimulator(
+        lambda t, s, p, u: {
+            "x": s["vx"],
+            "y": s["vy"],
+            "vx": -p["mu"] * s["x"] * (s["x"] ** 2 + s["y"] ** 2) ** -1.5,
+            "vy": -p["mu"] * s["y"] * (s["x"] ** 2 + s["y"] ** 2) ** -1.5,
+        },
+        {"x": None, "y": None, "vx": None, "vy": None},
+        [tc.Parameter("mu", low=0.0, initial=1.0)],
+        observe=("x", "y"),
+    )
+    t = torch.linspace(0, 6.6, 154, dtype=F64)
+    blank = torch.zeros(154, dtype=F64)
+    known = {"x": 0.17, "y": -0.79, "vx": 1.19, "vy": 0.26}
+    orbit = star.bind(tc.Recording(runs=[tc.Run(time=t, outputs={"x": blank, "y": blank}, initial=known)]))
+    clean = orbit.at(orbit.x)(torch.tensor([0.9], dtype=F64)).reshape(2, -1)
+    noisy = clean + 0.07 * draws(2, 154, seed=seed)
+    recording = tc.Recording(runs=[tc.Run(time=t, outputs={"x": noisy[0], "y": noisy[1]})], noise=0.07)
+    base, _ = calibrate_base(Problem.of(star, recording), {}, 12, 0)
+    assert base.chi2 < 308 + 5 * math.sqrt(2 * 308)

@@ -12,6 +12,7 @@ from torch import Tensor
 import torchcal as tc
 from torchcal.errors import DomainError, RecordingError, SimulatorError
 from torchcal.simulators import Trajectories
+from torchcal.terms import extend
 
 F64 = torch.float64
 
@@ -149,6 +150,49 @@ def test_steps_are_halved_until_the_solution_settles() -> None:
     assert errors[0] > 1e-4
     assert errors[1] < 1.1e-4
     assert oscillator(max_step=0.3).bind(recording).settled(point, 1e-12 * allowed).num_steps < 200
+
+
+def test_shorter_steps_where_they_err() -> None:
+    """Two eccentric orbits: nearly all of the error comes from the passages close to the star."""
+    e = 0.9
+    orbit = tc.ODESimulator(
+        lambda t, s, p, u: {
+            "x": s["vx"],
+            "y": s["vy"],
+            "vx": -p["mu"] * s["x"] * (s["x"] ** 2 + s["y"] ** 2) ** -1.5,
+            "vy": -p["mu"] * s["y"] * (s["x"] ** 2 + s["y"] ** 2) ** -1.5,
+        },
+        {"x": None, "y": None, "vx": None, "vy": None},
+        [tc.Parameter("mu", initial=1.0)],
+        observe=("x", "y"),
+    )
+    t = np.linspace(0, 4 * np.pi, 201)
+    anomaly = t.copy()
+    for _ in range(100):  # Kepler's equation
+        anomaly = anomaly - (anomaly - e * np.sin(anomaly) - t) / (1 - e * np.cos(anomaly))
+    exact = np.concatenate([np.cos(anomaly) - e, math.sqrt(1 - e * e) * np.sin(anomaly)])
+    start = {"x": 1 - e, "y": 0.0, "vx": 0.0, "vy": math.sqrt((1 + e) / (1 - e))}
+    run = run_of(t, start, x=exact[:201], y=exact[201:])
+    bound = orbit.bind(tc.Recording(runs=[run]))
+    values = tensor(1.0)
+    steps = bound.refined(8)
+    for _ in range(4):
+        states = steps.solve(values[None])
+        error = float((steps.outputs_of(values[None], states)[0] - torch.as_tensor(exact)).abs().max())
+        if error < 1e-4:
+            break
+        steps = steps.focused(values, states, 2 * error / 1e-4)
+    assert error < 1e-4
+    even = bound.refined(math.ceil(2 * steps.num_steps / bound.num_steps))
+    assert even.num_steps > 1.9 * steps.num_steps
+    worse = (even.outputs_of(values[None], even.solve(values[None]))[0] - torch.as_tensor(exact)).abs().max()
+    assert float(worse) > error
+    # A term added keeps them, another recording has its own.
+    nothing = tc.Term("push", equation="vx", rate=lambda t, s, p, u: p["a"], parameters=[tc.Parameter("a")])
+    assert extend(steps, [nothing]).num_steps == steps.num_steps
+    assert steps.refined(2).num_steps == 2 * steps.num_steps
+    assert steps.bind(tc.Recording(runs=[run])).num_steps == bound.num_steps * steps.subdivide
+    assert float(steps.elsewhere(tc.Recording(runs=[run]))._h.max()) <= float(steps._h.min()) * (1 + 1e-9)
 
 
 def test_a_stiff_model_is_refined_or_told_apart_clearly() -> None:

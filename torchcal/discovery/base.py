@@ -1,6 +1,7 @@
 """The base, calibrated: from many starts, without outliers, with the noise estimated and time steps short enough."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 
 import torch
@@ -91,7 +92,7 @@ def _again(found: Fitted, keep: Tensor) -> Fitted:
 
 
 def _sharpen(found: Fitted) -> Fitted:
-    """Halve the time steps until the solver's error is small against the noise."""
+    """Shorten time steps, where they err, until the solver's error is small against the noise."""
     recording = found.problem.recording
     for _ in range(7):
         simulator = found.problem.simulator
@@ -107,6 +108,9 @@ def _sharpen(found: Fitted) -> Fitted:
         error = (y - found.y).abs()
         if bool((error <= allowed).all()):
             return found
+        if isinstance(found.warm, Tensor):
+            excess = 2.0 * float((error / allowed).max())
+            finer = simulator.focused(found.values, found.warm, excess) if math.isfinite(excess) else finer
         problem = dataclasses.replace(found.problem, simulator=finer)
         whitening = found.whitening
         again = fit(problem, whitening, found.values[None], found.free)

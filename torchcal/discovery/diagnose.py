@@ -67,8 +67,9 @@ def diagnose(
             a candidate frees them.
         recording: The data; of a `Recording(runs=...)` for an `ODESimulator`.
         candidates: Terms that might have been left out. A later term replaces an earlier one of the same name.
-        holdout: None to hold out the last quarter (see `torchcal.discovery.verify.choose`), False for nothing, a share,
-            or a bool array, True where held out.
+        holdout: None to hold out the last quarter (see `torchcal.discovery.verify.choose`), or blocks within where the
+            rest leaves the base too open to predict it; False for nothing, a share, or a bool array, True where held
+            out.
         fixed: Values of parameters that are not calibrated.
         confidence: 1 minus the probability of calling noise a mismatch.
         max_terms: Terms that may be missing together.
@@ -115,6 +116,8 @@ def diagnose(
         search = Search(problem, terms, fixed or {}, seed, num_starts, max_terms, tick, executor)
         tick("calibrate the base")
         search.calibrate_base()
+        if holdout is None and mask is not None and _beyond_prediction(search, mask):
+            mask = verify.within(recording)
         search.screen_all()
         detected = search.exact or search.p_detect < 1.0 - confidence
         if terms:
@@ -183,6 +186,16 @@ def _contains(simulator: Simulator, term: Term) -> bool:
     if term.parameters:
         return all(term.full(q.name) in simulator.names for q in term.parameters)
     return set(term.frees) <= freed
+
+
+def _beyond_prediction(search: Search, mask: Tensor) -> bool:
+    """Whether the rest of the data leaves the base so open that its predictions of the held-out ones mean nothing."""
+    apart = search.held_out(search.base, mask)
+    seen = mask & search.problem.keep
+    if apart is None or not bool(seen.any()):
+        return False
+    own = (apart.sd.square() - search.noise.sd.square()).clamp_min(0).sqrt()[seen]
+    return bool((own > search.problem.recording.spread[seen]).any())
 
 
 def _wants_more(search: Search) -> bool:

@@ -15,6 +15,8 @@ __all__ = ["Fitted", "fit", "starts"]
 #: Relative change of χ² below which a fit has converged.
 TOLERANCE = 1e-7
 MAX_STEPS = 60
+#: Samples that the slope at the beginning is taken from.
+SLOPES = (12, 24, 48)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,25 +106,32 @@ def starts(problem: Problem, count: int, seed: int, fixed: dict[int, float] | No
 def follow_slopes(problem: Problem, begin: Tensor) -> Tensor:
     """Unknown initial states moved so that observed states begin with the slope that was recorded.
 
-    An unobserved velocity, say, is then the recorded position's slope, whatever the other parameters are.
+    An unobserved velocity, say, is then the recorded position's slope, whatever the other parameters are. The slope is
+    that of a parabola through the first samples, more of them in every next start.
     """
     bound = problem.simulator
     if not isinstance(bound, Trajectories) or not bound.initial_names:
         return begin
     names = list(bound.ode.states)
-    targets: list[tuple[int, int, float, float]] = []
+    targets: list[tuple[int, int, Tensor, float]] = []
     for r, run in enumerate(bound.runs):
         for name, y in run.outputs.items():
             if name not in names or name not in problem.recording.outputs:
                 continue
-            seen = (~torch.isnan(y)).nonzero()[:12, 0]
-            if len(seen) < 4:
+            every = (~torch.isnan(y)).nonzero()[:, 0]
+            if len(every) < 4:
                 continue
-            t = run.time[seen] - run.time[seen[0]]
-            design = torch.stack([torch.ones_like(t), t, t.square()], dim=-1)
-            slope = float(torch.linalg.lstsq(design, y[seen][:, None]).solution[1, 0])
-            scale = float((y[seen] - y[seen].mean()).abs().max() / t[-1].clamp_min(1e-300))
-            targets.append((r, names.index(name), slope, max(scale, 1e-12)))
+            slopes = []
+            for count in SLOPES:  # few samples are noisy, many are bent
+                seen = every[:count]
+                t = run.time[seen] - run.time[seen[0]]
+                design = torch.stack([torch.ones_like(t), t, t.square()], dim=-1)
+                slopes.append(torch.linalg.lstsq(design, y[seen][:, None]).solution[1, 0])
+            seen = every[: SLOPES[0]]
+            length = float(run.time[seen[-1]] - run.time[seen[0]])
+            scale = float((y[seen] - y[seen].mean()).abs().max()) / max(length, 1e-300)
+            each = torch.stack(slopes)[torch.arange(len(begin)) % len(SLOPES)]
+            targets.append((r, names.index(name), each, max(scale, 1e-12)))
     if not targets:
         return begin
     places = [i for i, q in enumerate(problem.parameters) if q.name in bound.initial_names and q.initial is None]

@@ -14,10 +14,12 @@ from torchcal.discovery.noise import Noise
 from torchcal.discovery.records import Score
 from torchcal.errors import DomainError
 
-__all__ = ["HeldOut", "choose", "compare", "held_out_fit", "score"]
+__all__ = ["HeldOut", "choose", "compare", "held_out_fit", "score", "within"]
 
 #: Share of the data that is held out.
 SHARE = 0.25
+#: Where the end cannot be predicted at all, blocks of a run of which every fourth is held out.
+BLOCKS = 12
 #: Fewer data than this a free parameter are too few to hold any out.
 LEAST_PER_PARAMETER = 4
 
@@ -85,6 +87,21 @@ def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None
         count = max(1, int(share * int(seen.sum())))
         mask = torch.zeros(recording.n, dtype=torch.bool)
         mask[distance.argsort(descending=True, stable=True)[:count]] = True
+    return mask.repeat(len(recording.outputs))
+
+
+def within(recording: Recording) -> Tensor:
+    """Blocks inside every run, or inside the range of the first condition, instead of its end; a quarter in all."""
+    x = recording.x
+    columns = x if isinstance(x, dict) else {"x": x}
+    along = columns["time"] if recording.runs is not None else next(iter(columns.values()))
+    runs = columns["run"] if recording.runs is not None else torch.zeros(recording.n)
+    mask = torch.zeros(recording.n, dtype=torch.bool)
+    for r in runs.unique():
+        mine = (runs == r).nonzero()[:, 0]
+        mine = mine[along[mine].argsort(stable=True)]
+        for block in mine.tensor_split(BLOCKS)[1::4]:
+            mask[block] = True
     return mask.repeat(len(recording.outputs))
 
 

@@ -37,6 +37,9 @@ POINTS = 2**15
 #: Numbers of trajectories kept at once, 64 MiB.
 NUMBERS = 2**23
 #: How often steps are halved at most.
+MOST_DENSER = 16
+"""How much shorter steps become at once where they err."""
+
 HALVINGS = 7
 
 
@@ -49,7 +52,14 @@ class Trajectories(Simulator):
         subdivide: Steps are this many times shorter than the coarsest that the samples allow.
     """
 
-    def __init__(self, ode: "ODESimulator", recording: Recording, *, subdivide: int = 1) -> None:
+    def __init__(
+        self,
+        ode: "ODESimulator",
+        recording: Recording,
+        *,
+        subdivide: int = 1,
+        denser: tuple[Tensor, ...] | None = None,
+    ) -> None:
         if not isinstance(recording, Recording) or recording.runs is None:
             raise RecordingError(
                 "Expected a recording in time, Recording(runs=[Run(...)]). Got "
@@ -63,6 +73,7 @@ class Trajectories(Simulator):
         self.ode = ode
         self.recording = recording
         self.subdivide = subdivide
+        self.denser = denser
         self.degree = None
         self.runs = recording.runs
         self._states = tuple(ode.states)
@@ -74,12 +85,14 @@ class Trajectories(Simulator):
     def _lay_grid(self) -> None:
         """Steps of every run, padded to one number with steps of length zero."""
         grids, picks = [], []
-        for run in self.runs:
+        for r, run in enumerate(self.runs):
             gaps = run.time.diff()
             longest = float(run.time[-1] - run.time[0]) / MIN_STEPS
             if self.ode.max_step is not None:
                 longest = min(longest, self.ode.max_step)
             counts = (gaps / (longest * (1 + 1e-9))).ceil().clamp_min(1).long() * self.subdivide
+            if self.denser is not None:
+                counts = counts * self.denser[r]
             if int(counts.sum()) > 2_000_000:
                 raise DomainError(
                     f"Expected at most 2 000 000 steps a run. Got {int(counts.sum())} (give a longer max_step)."
@@ -175,14 +188,59 @@ class Trajectories(Simulator):
         return Trajectories(self.ode, recording, subdivide=self.subdivide)
 
     def elsewhere(self, recording: Recording) -> "Trajectories":
-        """The same simulator for other runs, with steps no longer than these."""
+        """The same simulator for other runs, with steps no longer than the shortest of these."""
         other = Trajectories(self.ode, recording)
-        share = float(other._h.max() / self._h.max())
+        share = float(other._h.max() / self._h[self._h > 0].min()) if self.denser is not None else (
+            float(other._h.max() / self._h.max())
+        )
         return other.refined(math.ceil(share * (1 - 1e-9))) if share > 1 + 1e-9 else other
 
     def refined(self, factor: int = 2) -> "Trajectories":
         """The same with shorter steps."""
-        return Trajectories(self.ode, self.recording, subdivide=self.subdivide * factor)
+        return Trajectories(self.ode, self.recording, subdivide=self.subdivide * factor, denser=self.denser)
+
+    def focused(self, values: Tensor, states: Tensor, excess: float) -> "Trajectories":
+        """The same with shorter steps where they err, for an error that is smaller by some factor.
+
+        The error of a step of order 5, from two of half its length, is spread such that the fewest steps have the
+        wanted sum of errors.
+
+        Args:
+            values: Parameter values, ``(d,)``.
+            states: Their trajectory, ``(1, R, nodes, S)``.
+            excess: By what the error must fall.
+        """
+        runs, size = len(self.runs), states.shape[-1]
+        run_of = torch.arange(runs).repeat_interleave(self.num_steps)
+        t, h = self._t.reshape(-1), self._h.reshape(-1)
+        first, middle, last = ({name: table[i].reshape(-1) for name, table in self._u.items()} for i in range(3))
+
+        def inputs(a: dict[str, Tensor], b: dict[str, Tensor]) -> dict[str, Tensor]:
+            return {name: torch.stack([a[name], 0.5 * (a[name] + b[name]), b[name]]) for name in a}
+
+        p = self._p(values[None], run_of)
+        begin = states[:, :, :-1].reshape(1, -1, size)
+        half = self._step(begin, t, 0.5 * h, p, inputs(first, middle))
+        twice = self._step(half, t + 0.5 * h, 0.5 * h, p, inputs(middle, last))
+        once = self._step(begin, t, h, p, {name: table.reshape(3, -1) for name, table in self._u.items()})
+        scale = states[0].abs().amax(dim=(0, 1)).clamp_min(1e-300)
+        error = ((twice - once)[0].abs() / scale).amax(-1).reshape(runs, -1)
+        gaps = []
+        for r, run in enumerate(self.runs):
+            counts = self._node_of[self._run_of == r].diff()
+            place = torch.arange(len(counts)).repeat_interleave(counts)
+            gaps.append(torch.zeros(len(counts), dtype=error.dtype).index_add_(0, place, error[r, : len(place)]))
+            assert len(counts) == len(run.time) - 1
+        every = torch.cat(gaps)
+        if not bool(torch.isfinite(every).all()) or not float(every.sum()) > 0:
+            return self.refined(2)
+        level = (every.sum() / excess / every.pow(0.2).sum()).pow(1.25)
+        factors = [(gap / level).pow(0.2).ceil().clamp(1, MOST_DENSER).long() for gap in gaps]
+        if all(bool((factor == 1).all()) for factor in factors):
+            return self.refined(2)
+        old = self.denser or tuple(torch.ones_like(factor) for factor in factors)
+        denser = tuple(a * b for a, b in zip(old, factors, strict=True))
+        return Trajectories(self.ode, self.recording, subdivide=self.subdivide, denser=denser)
 
     def settled(self, values: Tensor, allowed: Tensor) -> "Trajectories":
         """These trajectories, with steps so short that halving them changes no output by more than ``allowed``.

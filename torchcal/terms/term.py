@@ -146,7 +146,8 @@ def extend(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
         DomainError: If a term names an equation, output or parameter that the simulator does not have.
     """
     if isinstance(simulator, Trajectories):
-        return Trajectories(_extend_ode(simulator.ode, terms), simulator.recording, subdivide=simulator.subdivide)
+        ode = _extend_ode(simulator.ode, terms)
+        return Trajectories(ode, simulator.recording, subdivide=simulator.subdivide, denser=simulator.denser)
     if not terms:
         return simulator
     if isinstance(simulator, ODESimulator):
