@@ -136,11 +136,13 @@ def test_plan_of_the_published_run():
 
 
 def test_families_of_development_and_test():
-    late = [name for name, family in FAMILIES.items() if family.late]
-    assert len(FAMILIES) - len(late) >= 10
-    assert len(late) >= 3
-    with pytest.raises(ValueError, match="late families"):
-        generate.generate(Path("nowhere"), 1, 7, late=True)
+    development, test, newest = (set(generate.families_of(seed)) for seed in (999, 1000, 2000))
+    assert len(development) >= 10
+    assert development < test
+    assert len(test - development) >= 3
+    assert len(newest) >= 3
+    assert not newest & test
+    assert newest | test == set(FAMILIES)
 
 
 @pytest.mark.parametrize("family", FAMILIES.values(), ids=list(FAMILIES))

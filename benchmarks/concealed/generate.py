@@ -55,6 +55,9 @@ HIDDEN_SECOND = 0.15
 FIRST_TEST_SEED = 1000
 """Seeds below are for development and never hold a late family."""
 
+NEWEST_SEED = 2000
+"""Seeds from here on hold the newest families alone."""
+
 
 @dataclass(frozen=True)
 class Draft:
@@ -582,23 +585,23 @@ def write_case(
     return case, answer
 
 
-def generate(out: Path, cases: int, seed: int, *, late: bool | None = None, progress: bool = True) -> Path:
+def families_of(seed: int) -> list[str]:
+    """Names of the families that a set of this seed holds."""
+    if seed >= NEWEST_SEED:
+        return [name for name, family in FAMILIES.items() if family.late == 2]
+    return [name for name, family in FAMILIES.items() if family.late <= int(seed >= FIRST_TEST_SEED)]
+
+
+def generate(out: Path, cases: int, seed: int, *, progress: bool = True) -> Path:
     """Write ``out/cases/*.json``, ``out/answers.sha256`` and ``out/answers.json``.
 
     Args:
         out: Folder, made if need be.
         cases: Number of cases.
-        seed: Below `FIRST_TEST_SEED` for development.
-        late: Whether the late families take part; by default with test seeds alone.
+        seed: Below `FIRST_TEST_SEED` for development; from `NEWEST_SEED` on for the newest families alone.
         progress: Whether to say how far it is.
-
-    Raises:
-        ValueError: If late families are asked for with a development seed.
     """
-    late = seed >= FIRST_TEST_SEED if late is None else late
-    if late and seed < FIRST_TEST_SEED:
-        raise ValueError(f"Expected a seed of at least {FIRST_TEST_SEED} with the late families. Got {seed}.")
-    families = [name for name, family in FAMILIES.items() if late or not family.late]
+    families = families_of(seed)
     (out / "cases").mkdir(parents=True, exist_ok=True)
     answers = {}
     for index, row in enumerate(plan(cases, seed, families)):

@@ -1,11 +1,21 @@
 """The families of cases, by name."""
 
-from benchmarks.concealed.families import chemical, electrical, hydraulic, late, mechanical, orbital, still, thermal
+from benchmarks.concealed.families import (
+    chemical,
+    electrical,
+    hydraulic,
+    late,
+    mechanical,
+    newest,
+    orbital,
+    still,
+    thermal,
+)
 from benchmarks.concealed.families.base import Family
 
 FAMILIES: dict[str, Family] = {
     family.name: family
-    for module in (mechanical, thermal, hydraulic, chemical, electrical, orbital, still, late)
+    for module in (mechanical, thermal, hydraulic, chemical, electrical, orbital, still, late, newest)
     for family in module.FAMILIES
 }
 

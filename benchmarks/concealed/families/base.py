@@ -132,7 +132,7 @@ class Family:
         draw: ``f(rng) -> Setting``.
         effects: Every effect, in the library and not.
         tied: A pair of candidates that such data can hardly tell apart.
-        late: Added after the tool was frozen.
+        late: 0: in every set; 1: in test sets alone; 2: alone in sets from the newest seed on.
         positive: States that must stay positive on the truth's trajectory.
         scales: Typical sizes of the states, for the integrator's absolute tolerance.
     """
@@ -147,7 +147,7 @@ class Family:
     states: Mapping[str, str] = field(default_factory=dict)
     rates: Function | None = None
     units: Mapping[str, str] = field(default_factory=dict)
-    late: bool = False
+    late: int = 0
     positive: tuple[str, ...] = ()
     scales: Mapping[str, float] = field(default_factory=dict)
 

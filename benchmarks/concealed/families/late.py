@@ -53,7 +53,7 @@ motor = Family(
         "w": p["K"] * s["i"] - p["b"] * s["w"],
     },
     {"e": "V"},
-    late=True,
+    late=1,
 )  # fmt: skip
 
 
@@ -103,7 +103,7 @@ growth = Family(
         "S": 0.2 * (u["Sf"] - s["S"]) - _monod(s, p) / p["Y"],
     },
     {"Sf": "g/l"},
-    late=True,
+    late=1,
     positive=("X", "S"),
 )  # fmt: skip
 
@@ -146,7 +146,7 @@ thermistor = Family(
     ),
     ("self-heating", "power coefficient"),
     units={"T": "K", "power": "mW"},
-    late=True,
+    late=1,
 )  # fmt: skip
 
 FAMILIES = (motor, growth, thermistor)
