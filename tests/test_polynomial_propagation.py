@@ -1,5 +1,6 @@
 """Simulators of known degree: their coefficients give what the nodes give, and no more calls."""
 
+import functools
 import itertools
 import math
 import pickle
@@ -180,6 +181,24 @@ def test_second_derivatives():
         torch.autograd.functional.hessian(lambda a, p=p: p.moments(a)[1].log().sum(), alpha) for p in (one, other)
     )
     torch.testing.assert_close(left, right, rtol=1e-9, atol=1e-9 * float(right.abs().max()))
+
+
+@pytest.mark.parametrize("embedding", [PolynomialChaos(), Gaussian(), PolynomialChaos(order=2, parameters=("a", "c"))])
+def test_outputs_that_are_linear_in_the_parameters_are_linear_in_alpha(embedding):
+    """A matrix product in place of nodes: moments and gradients are those of the nodes."""
+    simulator = Simulator(functools.partial(cubic, 1), PARAMETERS, degree=1)
+    fast = NISP(simulator, embedding, X)
+    nodes = NISP(Simulator(functools.partial(cubic, 1), PARAMETERS), embedding, X)
+    assert fast._affine is not None
+    assert NISP(Simulator(functools.partial(cubic, 2), PARAMETERS, degree=2), embedding, X)._affine is None
+    alpha = torch.randn(5, 2, fast.num_alpha, generator=torch.Generator().manual_seed(0), dtype=F64)
+    for part in range(2):
+        one, other = alpha.clone().requires_grad_(True), alpha.clone().requires_grad_(True)
+        a, b = fast(one)[part], nodes(other)[part]
+        torch.testing.assert_close(a, b, **CLOSE)
+        a.square().sum().backward()
+        b.square().sum().backward()
+        torch.testing.assert_close(one.grad, other.grad, **CLOSE)
 
 
 def test_other_conditions_and_other_functions():

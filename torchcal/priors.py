@@ -205,9 +205,8 @@ class CoefficientPrior(pyro.distributions.TorchDistribution):
 
     def log_prob(self, value: Tensor) -> Tensor:
         """Log-density, ``(*batch,)``; zero inside and −inf outside where the prior is improper."""
-        inside = self.support.check(value)
         zero = torch.zeros_like(value[..., 0])
-        return torch.where(inside, zero, zero - math.inf)
+        return zero if self.transform.free else torch.where(self.support.check(value), zero, zero - math.inf)
 
 
 def _layout(propagate: NISP) -> tuple[Tensor, Tensor, Tensor, Tensor]:

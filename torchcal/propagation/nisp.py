@@ -71,6 +71,7 @@ class NISP(nn.Module):
     _template: Tensor
     _places: Tensor
     _table: Tensor | None
+    _affine: Tensor | None
     _x0: Tensor
 
     def __init__(
@@ -392,9 +393,18 @@ class NISP(nn.Module):
             )
         )
 
+    def _linear(self, alpha: Tensor, affine: Tensor) -> Tensor:
+        """Expansion coefficients ``(*batch, k, n)`` of outputs that are linear in the parameters."""
+        rows = alpha.reshape(-1, self.num_alpha)
+        features = torch.addmm(affine[0], rows, affine[1:])
+        return self._finished(features.reshape(*alpha.shape[:-1], -1, len(self.free) + 1))
+
     def _moments(self, alpha: Tensor) -> tuple[Tensor, Tensor]:
         if self._projection is not None:
-            terms = self._weighted(alpha, self._projection)
+            if self._affine is None:
+                terms = self._weighted(alpha, self._projection)
+            else:
+                terms = self._linear(alpha, self._affine)
             return terms[..., 0, :], terms[..., 1:, :].square().sum(-2)
         pieces = self._node_pieces(alpha)
         if len(pieces) == 1:
@@ -447,6 +457,20 @@ class NISP(nn.Module):
             return None
         return degree * max(1, self.pattern.order)
 
+    def _affine_map(self, psi: Tensor, projection: Tensor | None) -> Tensor | None:
+        """Projected Legendre products of degree 1 from (1, α), ``(1 + P, k M)``; None where there are higher ones."""
+        if projection is None or self._polynomial is None or int(self._polynomial.sum(-1).max()) > 1:
+            return None
+        along = projection.T @ psi  # (k, K)
+        found = psi.new_zeros(1 + self.num_alpha, len(along), len(self._polynomial))
+        for m, powers in enumerate(self._polynomial.tolist()):
+            if not any(powers):
+                found[0, :, m] = projection.sum(0)
+                continue
+            own = (self.pattern.rows == powers.index(1)).nonzero()[:, 0]
+            found[1 + own, :, m] = along[:, self.pattern.columns[own]].T
+        return found.flatten(1)
+
     def set_rule(self, rule_choice: RuleChoice) -> None:
         """Use another quadrature rule."""
         basis, indices = self.pattern.basis, self.pattern.indices
@@ -465,6 +489,7 @@ class NISP(nn.Module):
             ("weights", rule.weights),
             ("_psi", psi),
             ("_projection", projection),
+            ("_affine", self._affine_map(psi, projection)),
         ):
             # Built in float64 and only then cast, so that the rule is as good as the dtype allows.
             cast = None if value is None else value.to(device=device, dtype=dtype)
