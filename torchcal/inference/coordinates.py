@@ -38,12 +38,12 @@ class Whitened:
 
     def potential(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Negative log-density ``(C,)`` and its gradient ``(C, P)``; +inf and 0 where they are not finite."""
-        leaf = z.detach().requires_grad_(True)
+        u = self.outer(z.detach()).requires_grad_(True)
         with torch.enable_grad():
-            energy = -self.log_density(self.outer(leaf))
-            (slope,) = torch.autograd.grad(energy.sum(), leaf)
-        energy = energy.detach()
-        good = torch.isfinite(energy) & torch.isfinite(slope).all(-1)
+            value = self.log_density(u)
+            (slope,) = torch.autograd.grad(value, u, grad_outputs=-torch.ones_like(value))
+        energy, slope = -value.detach(), slope @ self.scale_tril
+        good = torch.isfinite(energy + slope.sum(-1))  # which is not finite where any of them is not
         return torch.where(good, energy, torch.inf), torch.where(good[:, None], slope, 0.0)
 
     def outer(self, z: Tensor) -> Tensor:
