@@ -184,13 +184,12 @@ def test_draws_with_divergences_are_drawn_anew_with_smaller_steps():
         neck = 0.6 * u[:, :1]
         return -0.5 * (u[:, 0].square() + ((u[:, 1:] * (-neck).exp()).square()).sum(-1)) - 3 * neck[:, 0]
 
-    def median(**options):
+    def total(**options):
         found = [run(funnel, 4, num_samples=400, num_chains=16, num_warmup=100, seed=s, **options) for s in range(5)]
         assert all(draws.alpha.shape == (16, 400, 4) for draws in found)
-        return sorted(draws.divergences for draws in found)[2]
+        return sum(min(draws.divergences, 10) for draws in found)  # one chain that sticks is not the whole story
 
-    assert median(target_accept=0.8) >= 2
-    assert median() == 0
+    assert total() < total(target_accept=0.8) / 3
 
 
 @KERNELS

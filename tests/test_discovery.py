@@ -5,6 +5,7 @@ import math
 import warnings
 
 import matplotlib.figure
+import numpy as np
 import pytest
 import torch
 
@@ -23,7 +24,9 @@ from torchcal.discovery.records import (
     Scores,
     Table,
 )
+from torchcal.discovery.verify import within
 from torchcal.simulators import Trajectories
+from torchcal.terms import extend
 
 F64 = torch.float64
 
@@ -178,6 +181,7 @@ def test_the_design_in_time(windy, tmp_path):
 
 def test_an_end_that_nothing_before_it_foretells_is_not_held_out():
     """A diode's knee: three quarters of the characteristic say nothing about the last."""
+    optimize = pytest.importorskip("scipy.optimize")
     x = torch.linspace(0, 1, 100, dtype=torch.float64)
     diode = tc.Simulator(
         lambda x, p: p["a"] - 1e-7 * p["b"] * torch.exp(x / p["c"]),
@@ -190,12 +194,51 @@ def test_an_end_that_nothing_before_it_foretells_is_not_held_out():
     recording = tc.Recording(x=x, y=y, noise=0.02)
     d = quiet(diode, recording, [shunt])
     assert d.terms == ["shunt"]
-    assert d.held_out.sum() in range(20, 30)
-    assert not bool(d.held_out[0])
-    assert not bool(d.held_out[-1])
+    blocks = torch.arange(100).tensor_split(12)
+    assert d.held_out.nonzero()[:, 0].tolist() == [i for k in (1, 5, 9) for i in blocks[k].tolist()]
+    apart = optimize.least_squares(
+        lambda p: (p[0] - 1e-7 * p[1] * torch.exp(x / p[2]) - y)[~d.held_out].numpy(),
+        [1.0, 1.0, 0.06], x_scale=[1.0, 1.0, 0.01], bounds=([-10, 0, 0.04], [10, 1e6, 0.1]),
+    ).x  # fmt: skip
+    left = (apart[0] - 1e-7 * apart[1] * torch.exp(x / apart[2]) - y)[d.held_out]
+    assert d.before.held_out.rmse == pytest.approx(float(left.square().mean().sqrt()), rel=0.05)
     assert d.after.held_out.rmse < 0.03 < d.before.held_out.rmse
     # Asked for, it is held out all the same.
     assert bool(quiet(diode, recording, [shunt], holdout=0.25).held_out[-1])
+
+
+def test_blocks_within_short_and_gappy_runs():
+    t = torch.arange(48, dtype=torch.float64)
+    y = torch.full((48,), math.nan, dtype=torch.float64)
+    y[::4] = 1.0
+    short = tc.Run(time=t[:6], outputs={"z": t[:6]})
+    gappy = tc.Run(time=t, outputs={"z": y})
+    mask = within(tc.Recording(runs=[short, gappy], missing=True))
+    assert mask[:6].nonzero()[:, 0].tolist() == [1]
+    assert (mask[6:].nonzero()[:, 0] // 4).tolist() == [1, 5, 9]
+
+
+def test_a_parameter_that_changes_in_time_is_a_missing_rate_of_its_equation():
+    """A spring whose stiffness swings faster than a dozen curves in time could follow."""
+    t = torch.linspace(0, 20, 300, dtype=torch.float64)
+    body = tc.ODESimulator(
+        lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"] - p["c"] * s["v"]},
+        {"x": "m", "v": "m/s"},
+        [tc.Parameter("k", low=0.0, initial=4.0), tc.Parameter("c", low=0.0, initial=0.1)],
+        observe=("x",),
+    )
+    swing = tc.Term("swing", shifts={"k": lambda t, s, p, u: p["a"] * torch.sin(1.3 * t)},
+                    parameters=[tc.Parameter("a")])  # fmt: skip
+    start = {"x": 1.0, "v": 0.0}
+    blank = [tc.Run(time=t, outputs={"x": 0 * t}, initial=start)]
+    x = simulate(extend(body, [swing]), blank, k=4.0, c=0.05, swing__a=0.3)["x"]
+    motion = tc.Recording(runs=[tc.Run(time=t, outputs={"x": x + draw(300, 0.01, 0)}, initial=start)], noise=0.01)
+    d = quiet(body, motion, [])
+    assert d.verdict == "unexplained"
+    assert (d.missing.kind, d.missing.target, d.missing.unit) == ("equation", "v", "m/s/s")
+    there = np.interp(d.missing.time, t, x)
+    wanted = torch.as_tensor(-0.3 * np.sin(1.3 * d.missing.time.numpy()) * there)
+    assert float((d.missing.along - wanted).norm() / wanted.norm()) < 0.5
 
 
 def test_improved_is_a_simulator_like_any_other(windy):

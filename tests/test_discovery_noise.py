@@ -164,8 +164,12 @@ def test_lonely_spikes_are_found(sd):
 def test_spikes_at_the_ends_and_side_by_side(places):
     x = torch.linspace(0, 1, 80, dtype=F64)
     y = torch.sin(6 * x) + draw(80, 0.1, 2)
-    y[places] += torch.tensor([2.0, -1.4], dtype=F64)[: len(places)]
-    assert spikes_in(y, 0.1) == places
+    for sizes in ([2.0, -1.4], [1.5, 1.5], [20.0, 20.0], [-20.0, 3.0]):
+        spiked = y.clone()
+        spiked[places] += torch.tensor(sizes, dtype=F64)[: len(places)]
+        assert spikes_in(spiked, 0.1) == places
+        if 0 < places[0] and places[-1] < 79:  # at the ends less is known of what is usual
+            assert spikes_in(spiked) == places
 
 
 def test_what_begins_or_ends_steeply_is_no_outlier():
@@ -315,6 +319,23 @@ def test_limits_fall_with_the_noise_and_with_the_data():
     assert 1.8 <= large / small <= 3.0  # more than in proportion: calibration hides more of a large offset
     many = diagnosed(decay(240, 1, known=True)).detection_limit[0].smallest
     assert 1.6 <= small / many <= 3.0
+
+
+@pytest.mark.parametrize("sd", [0.02, 0.05])
+def test_calibration_cannot_hide_an_effect_at_the_limit(sd):
+    """Linear or not: fitted to it without noise, the base stays as far from it as a 99 % test with power 0.95 needs."""
+    optimize = pytest.importorskip("scipy.optimize")
+    x = torch.linspace(0, 3, 60, dtype=F64)
+    recording = tc.Recording(x=x, y=1.1 * torch.exp(-0.9 * x) + draw(60, sd, 1), noise=sd)
+    d = diagnosed(recording)
+    limit = d.detection_limit[0]
+    a, k = (d.base.estimates[i].value for i in range(2))
+    distances = []
+    for sign in (1, -1):
+        y = a * np.exp(-k * x.numpy()) + sign * limit.smallest
+        found = optimize.least_squares(lambda p, y=y: (p[0] * np.exp(-p[1] * x.numpy()) - y) / sd, [a, k])
+        distances.append(math.sqrt(2 * found.cost))
+    assert 4.0 < min(distances) < 7.0
 
 
 def test_a_stricter_confidence_raises_the_limit():

@@ -191,8 +191,9 @@ def test_shorter_steps_where_they_err() -> None:
     nothing = tc.Term("push", equation="vx", rate=lambda t, s, p, u: p["a"], parameters=[tc.Parameter("a")])
     assert extend(steps, [nothing]).num_steps == steps.num_steps
     assert steps.refined(2).num_steps == 2 * steps.num_steps
-    assert steps.bind(tc.Recording(runs=[run])).num_steps == bound.num_steps * steps.subdivide
-    assert float(steps.elsewhere(tc.Recording(runs=[run]))._h.max()) <= float(steps._h.min()) * (1 + 1e-9)
+    other = steps.bind(tc.Recording(runs=[run]))
+    error = (other.outputs_of(values[None], other.solve(values[None]))[0] - torch.as_tensor(exact)).abs().max()
+    assert float(error) < 0.01
 
 
 def test_a_stiff_model_is_refined_or_told_apart_clearly() -> None:

@@ -191,6 +191,10 @@ def test_outputs_that_are_linear_in_the_parameters_are_linear_in_alpha(embedding
     nodes = NISP(Simulator(functools.partial(cubic, 1), PARAMETERS), embedding, X)
     assert fast._affine is not None
     assert NISP(Simulator(functools.partial(cubic, 2), PARAMETERS, degree=2), embedding, X)._affine is None
+    assert fast.moments(torch.zeros(0, fast.num_alpha, dtype=F64))[0].shape == (0, 25)
+    constant = NISP(Simulator(lambda x, p: torch.cos(x) + 0 * p["a"], PARAMETERS, degree=0), embedding, X, order=1)
+    torch.testing.assert_close(constant.mean(torch.zeros(constant.num_alpha, dtype=F64)), torch.cos(X), **CLOSE)
+    constant.moments(torch.zeros(3, constant.num_alpha, dtype=F64))
     alpha = torch.randn(5, 2, fast.num_alpha, generator=torch.Generator().manual_seed(0), dtype=F64)
     for part in range(2):
         one, other = alpha.clone().requires_grad_(True), alpha.clone().requires_grad_(True)

@@ -564,7 +564,7 @@ def write_case(
         })  # fmt: skip
     answer = {
         "family": family.name,
-        "late": family.late,
+        "late": bool(family.late),
         "kind": row[0],
         "kappa": kappa,
         "noise": facts,

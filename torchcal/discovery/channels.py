@@ -173,7 +173,7 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
         ]
         labels += [("parameter", names[i], problem.parameters[i].unit) for i in own]
         given = definitions(bound, found.values, states)
-        rates = _bin_means(*_binning(bound), by_parameter[0] / bound._h.clamp_min(1e-300)[..., None, None])
+        rates = _bin_means(*_binning(bound), bound.rates_by(found.values[None], states, own)[0])
         for m, (kind, target, unit) in enumerate(labels):
             if kind == "equation" and target in given:
                 continue

@@ -162,7 +162,8 @@ def by_plausibility(search: Search) -> list[Place]:
 def missing_rate(search: Search) -> MissingRate | None:
     """The best smooth unknown change of one equation or output, or of one parameter of a static simulator.
 
-    A parameter that changes in time and acts in one equation is a missing rate of that equation.
+    A parameter that changes in time and acts in one equation is a missing rate of that equation, in one run: what it
+    does to the rate depends on the states too, which differ between runs at the same time.
     """
     kinds = search.problem.kinds
     for place in by_plausibility(search):
@@ -171,7 +172,7 @@ def missing_rate(search: Search) -> MissingRate | None:
             return None
         kind, target, unit, size = channel.kind, channel.target, channel.unit, torch.ones_like(place.profile)
         if kind not in kinds:
-            if place.driver != "t" or len(channel.rates) != 1:
+            if place.driver != "t" or len(channel.rates) != 1 or len(search.problem.recording.runs or ()) > 1:
                 continue
             kind = "equation"
             target, size = next(iter(channel.rates.items()))

@@ -15,15 +15,18 @@ from torchcal.terms import Term
 
 __all__ = ["limits"]
 
-#: Times that a limit is corrected by what calibration makes of an effect of its size, and by how much at most.
-ROUNDS, MOST = 2, 4.0
+#: Times that a limit is corrected by what calibration makes of an effect of its size, and by how much at most each.
+ROUNDS, MOST = 4, 4.0
+#: Where it is close enough, as a logarithm; and by how much it may be too small in the end.
+CLOSE, SHORT = 0.05, 1.2
 
 
 def limits(search: Search, alpha: float, power: float, contained: Sequence[Term] = ()) -> Table[Limit]:
     """Smallest detectable effects.
 
     The linear limit, from the norm of the projected tangent, is checked: an effect of its size is simulated without
-    noise, the base is calibrated to that, and the size is scaled until what calibration cannot hide is large enough.
+    noise, the base is calibrated to that, and the size is scaled until what calibration cannot hide is just large
+    enough. Infinite where calibration hides ever larger effects.
 
     Args:
         search: With its screening.
@@ -64,6 +67,8 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
             rows.append(Limit(candidate.name, q.name, math.inf, q.unit, power, estimate, note))
             continue
         note = f"also: {', '.join(search.aliases[i])}" if search.aliases.get(i) else ""
+        if math.isinf(sizes[i]):
+            note = "calibration hides effects of any size"
         rows.append(Limit(candidate.name, q.name, sizes[i], q.unit, power, estimate, note))
     for term in contained:
         name = term.full(term.parameters[0].name) if term.parameters else term.frees[0]
@@ -95,24 +100,36 @@ def _corrected(search: Search, effects: dict[int, _Effect], sizes: dict[int, flo
         sided = candidate.one_sided(candidate.amplitudes[int(search.screening.amplitude[effect.column])])
         trials += [(i, sign) for sign in ((sided,) if sided else (1, -1))]
     now = {trial: sizes[trial[0]] for trial in trials}
+    good = dict(now)
+    short = dict.fromkeys(trials, 1.0)
     for _ in range(ROUNDS):
         data, known = [], []
         for trial in trials:
             y = _simulated(search, trial[0], effects[trial[0]].column, trial[1] * now[trial])
-            if y is not None:
-                data.append(y)
-                known.append(trial)
+            if y is None:  # what blows up is seen: somewhere between
+                now[trial], short[trial] = math.sqrt(good[trial] * now[trial]), 1.0
+                continue
+            data.append(y)
+            known.append(trial)
+            good[trial] = now[trial]
         if not known:
             break
         warm: Any = base.warm.expand(len(known), *base.warm.shape[1:]) if isinstance(base.warm, Tensor) else None
         begin = base.values.expand(len(known), -1)
-        found = fit(base.problem, base.whitening, begin, base.free, warm=warm, data=torch.stack(data), max_steps=20)
+        found = fit(base.problem, base.whitening, begin, base.free, warm=warm, data=torch.stack(data), max_steps=30)
         if found is None or found.ends_chi2 is None or len(found.ends_chi2) != len(known):
             break
         for trial, chi2 in zip(known, found.ends_chi2.tolist(), strict=True):
-            ratio = effects[trial[0]].distance / max(math.sqrt(chi2), 1e-300)
-            now[trial] *= min(max(ratio, 1 / MOST), MOST)
-    return {i: max(now[trial] for trial in trials if trial[0] == i) for i in effects}
+            short[trial] = effects[trial[0]].distance / max(math.sqrt(chi2), 1e-300)
+        trials = [trial for trial in known if abs(math.log(short[trial])) > CLOSE]
+        if not trials:
+            break
+        for trial in trials:
+            now[trial] *= min(max(short[trial], 1 / MOST), MOST)
+    return {
+        i: max(size if short[i, sign] < SHORT else math.inf for (j, sign), size in now.items() if j == i)
+        for i in effects
+    }
 
 
 def _simulated(search: Search, i: int, column: int, size: float) -> Tensor | None:

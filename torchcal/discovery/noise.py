@@ -21,7 +21,7 @@ __all__ = ["Noise", "estimate", "smooth_columns", "spikes"]
 GRID = torch.linspace(0.0, 0.95, 39, dtype=torch.float64)
 #: Share of a sequence's degrees of freedom that smooth curves may take.
 SMOOTH_SHARE = 1.0 / 6.0
-#: A sample that differs from its neighbours' mean by more than this many robust sd, alone, is an outlier.
+#: A sample that leaves its neighbours' range by more than this many robust sd, alone or with one beside it, is one.
 SPIKE = 4.5
 #: Weight against correlation: log prior density of φ is −SHRINK·φ.
 SHRINK = 1.0
@@ -242,7 +242,7 @@ def _quantisation(problem: Problem) -> dict[str, float]:
 def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
     """Used data that stick out alone from their neighbours, bool ``(n,)``.
 
-    Along one order they are compared with the median of two neighbours on either side. Among several conditions the
+    Along one order they are compared with two neighbours on either side. Among several conditions the
     residual of a robust smooth fit takes its place.
     """
     found = torch.zeros(problem.n, dtype=torch.bool)
@@ -258,24 +258,34 @@ def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
             high = left.abs() > SPIKE * size if size > 0 else torch.zeros_like(left, dtype=torch.bool)
             found[places] = high if not _clustered(problem, places, high) else False
             continue
-        around = torch.stack([r[:-4], r[1:-3], r[3:-1], r[4:]]).quantile(0.5, dim=0, interpolation="midpoint")
-        robust = 1.4826 * float((r[2:-2] - around).abs().median())
+        off = _off_neighbours(r)
+        bend = r[1:-1] - 0.5 * (r[:-2] + r[2:])  # a curve leaves its neighbours' range nowhere, but bends everywhere
+        robust = math.sqrt(1.3 / 1.5) * 1.4826 * float(bend.abs().median())
         if sd is not None:
             robust = max(robust, math.sqrt(1.3))  # what white noise gives
         if robust > 0:
-            found[places] = _alone(r, _off_neighbours(r, SPIKE * robust), SPIKE * robust)
+            found[places] = _alone(r, _with_ends(r, off, SPIKE * robust), SPIKE * robust)
     return found
 
 
-def _off_neighbours(r: Tensor, least: float) -> Tensor:
-    """Differences ``(m,)`` from the median of two neighbours on either side.
+def _off_neighbours(r: Tensor) -> Tensor:
+    """By how much samples ``(m,)`` leave the range of the two middle ones of their four neighbours.
 
-    At both ends from a line through the next four, scaled to vary as much as the others do by noise alone, or 0 where
-    one of those is off itself by more than ``least``.
+    Beside two spikes that range reaches from the other samples to the spikes, so that these alone leave it.
     """
-    padded = torch.cat([r.new_full((2,), math.nan), r, r.new_full((2,), math.nan)])
-    around = torch.stack([padded[k : k + len(r)] for k in (0, 1, 3, 4)])
-    off = r - around.nanquantile(0.5, dim=0, interpolation="midpoint")
+    padded = torch.cat([r[:1].expand(2), r, r[-1:].expand(2)])
+    around = torch.stack([padded[k : k + len(r)] for k in (0, 1, 3, 4)]).sort(0).values
+    off: Tensor = r - torch.maximum(torch.minimum(r, around[2]), around[1])
+    return off
+
+
+def _with_ends(r: Tensor, off: Tensor, least: float) -> Tensor:
+    """The same with both ends measured from a line through the next four.
+
+    Scaled to vary as much as the others do by noise alone; 0 where one of the four is off itself, by more than
+    ``least``.
+    """
+    off = off.clone()
     for end, near, far, beside in ((0, r[1:3], r[3:5], off[1:5]), (-1, r[-3:-1], r[-5:-3], off[-5:-1])):
         line = near.mean() + 0.75 * (near.mean() - far.mean())
         off[end] = 0.0 if bool((beside.abs() > least).any()) else (r[end] - line) * math.sqrt(1.3 / 2.8)

@@ -111,7 +111,7 @@ class Search:
     gone: set[int] = field(init=False, default_factory=set)
     p_detect: float = field(init=False, default=1.0)
     least: Tensor = field(init=False)
-    _held_out: dict[int, tuple[Fitted, HeldOut | None]] = field(init=False, default_factory=dict)
+    _held_out: dict[tuple[int, bytes], tuple[Fitted, HeldOut | None]] = field(init=False, default_factory=dict)
 
     @property
     def exact(self) -> bool:
@@ -202,7 +202,7 @@ class Search:
 
     def held_out(self, found: Fitted, mask: Tensor) -> HeldOut | None:
         """A model of this search fitted without the data in ``mask``; computed once."""
-        key = id(found)
+        key = (id(found), mask.numpy().tobytes())
         if key not in self._held_out:  # the fit is kept beside it, so that its id stays its own
             self._held_out[key] = (found, held_out_fit(found, self.noise, mask))
         return self._held_out[key][1]

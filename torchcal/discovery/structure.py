@@ -218,9 +218,10 @@ def analyse(residual: Residual, *, every: bool = False) -> Structure:
     excess = max(residual.excess, 1e-300)
     both = torch.cat([residual.e[:, None], residual.null], dim=1)
     for channel in chosen:
+        data = found.problem.n if channel.kind != "output" else int((channel.matrix != 0).sum())
+        most = max(ALONG[0], data // DATA_EACH)
         for name, driver in channel.drivers.items():
             distinct = len(driver.unique())
-            most = max(ALONG[0], found.problem.n // DATA_EACH)
             tried = IN_TIME if name == "t" else ALONG
             counts = dict.fromkeys(min(count, distinct) for count in tried if count <= most)
             if distinct < 2:

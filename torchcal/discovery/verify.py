@@ -1,4 +1,4 @@
-"""Data that the fit never saw: chosen before the fit, outside the fitted range where the recording allows one."""
+"""Data that the fit never saw: chosen before any candidate, outside the fitted range where the data allow one."""
 
 import math
 from dataclasses import dataclass
@@ -96,11 +96,12 @@ def within(recording: Recording) -> Tensor:
     columns = x if isinstance(x, dict) else {"x": x}
     along = columns["time"] if recording.runs is not None else next(iter(columns.values()))
     runs = columns["run"] if recording.runs is not None else torch.zeros(recording.n)
+    seen = recording.observed.reshape(len(recording.outputs), recording.n).any(0)
     mask = torch.zeros(recording.n, dtype=torch.bool)
     for r in runs.unique():
-        mine = (runs == r).nonzero()[:, 0]
+        mine = ((runs == r) & seen).nonzero()[:, 0]
         mine = mine[along[mine].argsort(stable=True)]
-        for block in mine.tensor_split(BLOCKS)[1::4]:
+        for block in mine.tensor_split(min(BLOCKS, len(mine)))[1:-1:4]:
             mask[block] = True
     return mask.repeat(len(recording.outputs))
 

@@ -393,18 +393,18 @@ class NISP(nn.Module):
             )
         )
 
-    def _linear(self, alpha: Tensor, affine: Tensor) -> Tensor:
+    def _linear(self, alpha: Tensor, affine: Tensor, count: int) -> Tensor:
         """Expansion coefficients ``(*batch, k, n)`` of outputs that are linear in the parameters."""
         rows = alpha.reshape(-1, self.num_alpha)
         features = torch.addmm(affine[0], rows, affine[1:])
-        return self._finished(features.reshape(*alpha.shape[:-1], -1, len(self.free) + 1))
+        return self._finished(features.reshape(*alpha.shape[:-1], count, affine.shape[1] // count))
 
     def _moments(self, alpha: Tensor) -> tuple[Tensor, Tensor]:
         if self._projection is not None:
             if self._affine is None:
                 terms = self._weighted(alpha, self._projection)
             else:
-                terms = self._linear(alpha, self._affine)
+                terms = self._linear(alpha, self._affine, self._projection.shape[1])
             return terms[..., 0, :], terms[..., 1:, :].square().sum(-2)
         pieces = self._node_pieces(alpha)
         if len(pieces) == 1:

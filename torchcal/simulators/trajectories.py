@@ -36,11 +36,8 @@ MAX_PASSES = 8
 POINTS = 2**15
 #: Numbers of trajectories kept at once, 64 MiB.
 NUMBERS = 2**23
-#: How often steps are halved at most.
-MOST_DENSER = 16
-"""How much shorter steps become at once where they err."""
-
-HALVINGS = 7
+#: How often steps are halved at most, and how much shorter they become at once where they err.
+HALVINGS, MOST_DENSER = 7, 16
 
 
 class Trajectories(Simulator):
@@ -185,15 +182,21 @@ class Trajectories(Simulator):
         """These trajectories, if the recording is theirs; else those of the other recording."""
         if recording is self.recording:
             return self
+        if self.denser is not None:  # where steps must be short is another place there
+            return self.elsewhere(recording)
         return Trajectories(self.ode, recording, subdivide=self.subdivide)
 
     def elsewhere(self, recording: Recording) -> "Trajectories":
-        """The same simulator for other runs, with steps no longer than the shortest of these."""
+        """The same simulator for other runs, with steps no longer than these.
+
+        Where these differ, no longer than the shortest of them, but at most `MOST_DENSER` times shorter than usual.
+        """
         other = Trajectories(self.ode, recording)
-        share = float(other._h.max() / self._h[self._h > 0].min()) if self.denser is not None else (
-            float(other._h.max() / self._h.max())
-        )
-        return other.refined(math.ceil(share * (1 - 1e-9))) if share > 1 + 1e-9 else other
+        shortest = self._h.max() if self.denser is None else self._h[self._h > 0].min()
+        share = math.ceil(float(other._h.max() / shortest) * (1 - 1e-9))
+        if self.denser is not None:
+            share = min(share, MOST_DENSER * self.subdivide)
+        return other.refined(share) if share > 1 else other
 
     def refined(self, factor: int = 2) -> "Trajectories":
         """The same with shorter steps."""
@@ -226,16 +229,19 @@ class Trajectories(Simulator):
         scale = states[0].abs().amax(dim=(0, 1)).clamp_min(1e-300)
         error = ((twice - once)[0].abs() / scale).amax(-1).reshape(runs, -1)
         gaps = []
-        for r, run in enumerate(self.runs):
+        for r in range(runs):
             counts = self._node_of[self._run_of == r].diff()
             place = torch.arange(len(counts)).repeat_interleave(counts)
             gaps.append(torch.zeros(len(counts), dtype=error.dtype).index_add_(0, place, error[r, : len(place)]))
-            assert len(counts) == len(run.time) - 1
         every = torch.cat(gaps)
         if not bool(torch.isfinite(every).all()) or not float(every.sum()) > 0:
             return self.refined(2)
-        level = (every.sum() / excess / every.pow(0.2).sum()).pow(1.25)
-        factors = [(gap / level).pow(0.2).ceil().clamp(1, MOST_DENSER).long() for gap in gaps]
+        number = [self._node_of[self._run_of == r].diff().double() for r in range(runs)]
+        level = (every.sum() / excess / (every.pow(0.2) * torch.cat(number).pow(0.8)).sum()).pow(1.25)
+        factors = [
+            (gap / (count * level)).pow(0.2).ceil().clamp(1, MOST_DENSER).long()
+            for gap, count in zip(gaps, number, strict=True)
+        ]
         if all(bool((factor == 1).all()) for factor in factors):
             return self.refined(2)
         old = self.denser or tuple(torch.ones_like(factor) for factor in factors)
@@ -532,6 +538,18 @@ class Trajectories(Simulator):
             flow, forcing = self._backward(ends, begin, leaves, run_of, columns)
         shape = (hyper, runs, steps, size)
         return ends.detach().reshape(shape), flow.reshape(*shape, size), forcing.reshape(*shape, len(columns))
+
+    def rates_by(self, values: Tensor, states: Tensor, columns: Sequence[int]) -> Tensor:
+        """Derivatives of the rates by some parameters where steps begin, ``(H, R, K, S, len(columns))``."""
+        hyper, runs, _, size = states.shape
+        run_of = torch.arange(runs).repeat_interleave(self.num_steps)
+        u = {name: table[0].reshape(-1) for name, table in self._u.items()}
+        with torch.enable_grad():
+            begin = states[:, :, :-1].reshape(hyper, -1, size).detach().requires_grad_(True)
+            leaves = self._leaves(values, run_of, columns)
+            rates = self._slope(self._t.reshape(-1), begin, leaves, u)
+            _, found = self._backward(rates, begin, leaves, run_of, columns)
+        return found.reshape(hyper, runs, self.num_steps, size, len(columns))
 
     def _leaves(self, values: Tensor, run_of: Tensor, columns: Sequence[int]) -> dict[str, Tensor]:
         """Parameters spread over points ``(H, M)``; those that are derived by are leaves of a graph."""
