@@ -185,8 +185,10 @@ def prepare(
 
     y, jacobian = linear(begin[None], own)
     size = torch.maximum(found.whitening.sd, base.recording.spread[base.index])
-    change = float(((y[0] - found.y).abs() / torch.maximum(size, found.y.abs())).max())
-    if not change <= 1e-6:
+    moved = (y[0] - found.y).abs()
+    change = float((moved / torch.maximum(size, found.y.abs())).max())
+    # Far below the noise a long trajectory may differ by what its solver leaves.
+    if not (change <= 1e-6 or (change <= 1e-4 and bool((moved <= 0.01 * found.whitening.sd).all()))):
         raise SimulatorError(
             f"Expected the term {' + '.join(t.name for t in terms)!r} to leave the simulator unchanged at its neutral "
             f"values {dict(zip([problem.parameters[i].name for i in own], neutral, strict=True))}. Got a relative "
