@@ -23,6 +23,8 @@ GRID = torch.linspace(0.0, 0.95, 39, dtype=torch.float64)
 SMOOTH_SHARE = 1.0 / 6.0
 #: A sample that leaves its neighbours' range by more than this many robust sd, alone or with one beside it, is one.
 SPIKE = 4.5
+#: By how many times the bend behind it a first or last sample must be off to be an outlier.
+BENT = 10.0
 #: Weight against correlation: log prior density of φ is −SHRINK·φ.
 SHRINK = 1.0
 #: Quantile of its posterior at which a clear correlation is taken.
@@ -283,12 +285,16 @@ def _with_ends(r: Tensor, off: Tensor, least: float) -> Tensor:
     """The same with both ends measured from a line through the next four.
 
     Scaled to vary as much as the others do by noise alone; 0 where one of the four is off itself, by more than
-    ``least``.
+    ``least``, or where they bend: a parabola with their bend b would end 3.4 b off the line, and a decay more.
     """
     off = off.clone()
-    for end, near, far, beside in ((0, r[1:3], r[3:5], off[1:5]), (-1, r[-3:-1], r[-5:-3], off[-5:-1])):
-        line = near.mean() + 0.75 * (near.mean() - far.mean())
-        off[end] = 0.0 if bool((beside.abs() > least).any()) else (r[end] - line) * math.sqrt(1.3 / 2.8)
+    for end, next_ in ((0, r[1:5]), (-1, r[-5:-1].flip(0))):
+        beside = off[1:5] if end == 0 else off[-5:-1]
+        near, far = next_[:2].mean(), next_[2:].mean()
+        here = float((r[end] - near - 0.75 * (near - far)) * math.sqrt(1.3 / 2.8))
+        bend = float((next_[1] + next_[2] - next_[0] - next_[3]).abs()) / 4
+        plain = abs(here) > BENT * bend and not bool((beside.abs() > least).any())
+        off[end] = here if plain else 0.0
     return off
 
 
