@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+import torchcal as tc
+
 matplotlib.use("Agg")
 
 # The tensors of the tests are small: more threads only get in the way of the other workers.
@@ -31,3 +33,15 @@ def _isolated() -> Iterator[None]:
     dtype = torch.get_default_dtype()
     torch.set_default_dtype(torch.float32)
     assert dtype == torch.float32, f"the test changed the global default dtype to {dtype}"
+
+
+@pytest.fixture
+def star():
+    """A body in the plane around a star; μ is 1 unless it is calibrated."""
+
+    def rates(t, s, p, u):
+        pull = -p["mu"] * (s["x"] ** 2 + s["y"] ** 2) ** -1.5
+        return {"x": s["vx"], "y": s["vy"], "vx": pull * s["x"], "vy": pull * s["y"]}
+
+    states = {"x": None, "y": None, "vx": None, "vy": None}
+    return tc.ODESimulator(rates, states, [tc.Parameter("mu", low=0.0, initial=1.0)], observe=("x", "y"))

@@ -411,19 +411,8 @@ def test_a_bound_beside_a_nearly_parallel_tangent(low, high, start):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_unknown_velocities_under_much_noise(seed):
+def test_unknown_velocities_under_much_noise(star, seed):
     """One and a half orbits: the slope of the first few positions is noise, and a wrong one leads to another orbit."""
-    star = tc.ODESimulator(
-        lambda t, s, p, u: {
-            "x": s["vx"],
-            "y": s["vy"],
-            "vx": -p["mu"] * s["x"] * (s["x"] ** 2 + s["y"] ** 2) ** -1.5,
-            "vy": -p["mu"] * s["y"] * (s["x"] ** 2 + s["y"] ** 2) ** -1.5,
-        },
-        {"x": None, "y": None, "vx": None, "vy": None},
-        [tc.Parameter("mu", low=0.0, initial=1.0)],
-        observe=("x", "y"),
-    )
     t = torch.linspace(0, 6.6, 154, dtype=F64)
     blank = torch.zeros(154, dtype=F64)
     known = {"x": 0.17, "y": -0.79, "vx": 1.19, "vy": 0.26}

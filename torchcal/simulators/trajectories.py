@@ -228,16 +228,15 @@ class Trajectories(Simulator):
         once = self._step(begin, t, h, p, {name: table.reshape(3, -1) for name, table in self._u.items()})
         scale = states[0].abs().amax(dim=(0, 1)).clamp_min(1e-300)
         error = ((twice - once)[0].abs() / scale).amax(-1).reshape(runs, -1)
+        number = [self._node_of[self._run_of == r].diff() for r in range(runs)]  # steps in each gap between samples
         gaps = []
-        for r in range(runs):
-            counts = self._node_of[self._run_of == r].diff()
+        for r, counts in enumerate(number):
             place = torch.arange(len(counts)).repeat_interleave(counts)
             gaps.append(torch.zeros(len(counts), dtype=error.dtype).index_add_(0, place, error[r, : len(place)]))
         every = torch.cat(gaps)
         if not bool(torch.isfinite(every).all()) or not float(every.sum()) > 0:
             return self.refined(2)
-        number = [self._node_of[self._run_of == r].diff().double() for r in range(runs)]
-        level = (every.sum() / excess / (every.pow(0.2) * torch.cat(number).pow(0.8)).sum()).pow(1.25)
+        level = (every.sum() / excess / (every.pow(0.2) * torch.cat(number).double().pow(0.8)).sum()).pow(1.25)
         factors = [
             (gap / (count * level)).pow(0.2).ceil().clamp(1, MOST_DENSER).long()
             for gap, count in zip(gaps, number, strict=True)
