@@ -10,16 +10,18 @@ from torch import Tensor
 from torchcal.simulators import Parameter
 from torchcal.terms import Term
 
-__all__ = ["EDGE", "SHARP", "localised", "region_text"]
+__all__ = ["EDGE", "WIDTHS", "beyond", "is_window", "localised", "region_text"]
 
-#: Width of a window's edge, as a share of the driver's range: wide enough for a fit to move it, and nearly a step.
-EDGE, SHARP = 0.02, 0.004
+#: Width of a window's edges, as a share of the driver's range: wide enough for a fit to move them; and the limits
+#: between which it is fitted, from nearly a step.
+EDGE, WIDTHS = 0.02, (0.004, 0.1)
 
 _ENDS = {"from": "window from", "to": "window to"}
+_EDGE = "window edge"
 
 
 def localised(
-    term: Term, driver: str, low: float, high: float, span: tuple[float, float], *, static: bool, edge: float = EDGE
+    term: Term, driver: str, low: float, high: float, span: tuple[float, float], *, static: bool, edge: bool = False
 ) -> Term:
     """The term multiplied by a window of a driver with smooth edges that are fitted with it.
 
@@ -30,15 +32,19 @@ def localised(
         high: Where it ends.
         span: Range of the driver in the recording.
         static: Whether the term's functions are those of a static simulator.
-        edge: Width of an edge, as a share of the driver's range.
+        edge: Whether the width of the edges is fitted too.
     """
     ends = []
     for name, value in (("from", low), ("to", high)):
         if math.isfinite(value):
             ends.append(Parameter(_ENDS[name], low=span[0], high=span[1], initial=min(max(value, span[0]), span[1])))
-    width = edge * (span[1] - span[0])
+    size = span[1] - span[0]
+    if edge:
+        least, most = (share * size for share in WIDTHS)
+        ends.append(Parameter(_EDGE, low=least, high=most, initial=EDGE * size, transform="log"))
 
     def inside(d: Tensor, p: Mapping[str, Tensor]) -> Any:
+        width = p[_EDGE] if edge else EDGE * size
         w: Any = 1.0
         if math.isfinite(low):
             w = w * torch.sigmoid((d - p[_ENDS["from"]]) / width)
@@ -75,6 +81,18 @@ def localised(
         description=term.description,
         scales=term.scales,
     )
+
+
+def is_window(name: str) -> bool:
+    """Whether a parameter is an end or the edge of a window, by its qualified name."""
+    return name.rsplit(".", 1)[-1] in (*_ENDS.values(), _EDGE)
+
+
+def beyond(name: str, low: float, high: float) -> float:
+    """A value of such a parameter, within these bounds, for a window that leaves nothing out."""
+    if name.endswith(_EDGE):
+        return low
+    return low - (high - low) if name.endswith(_ENDS["from"]) else high + (high - low)
 
 
 def region_text(driver: str, low: float, high: float) -> str:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchcal.discovery.base import calibrate_base
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
-from torchcal.discovery.fitting import Fitted, refit
+from torchcal.discovery.fitting import Fitted, refit, weighed
 from torchcal.discovery.local import region_text
 from torchcal.discovery.noise import Noise, estimate
 from torchcal.discovery.problem import Problem
@@ -33,6 +33,8 @@ MOST = 40
 FEW, CHANCE = 6, 0.2
 #: Shares of the linear estimate from which refits begin.
 STEPS = (0.05, 1.0)
+#: Share of the best log evidence below which a model is not fitted again when the noise estimate has changed.
+HOPELESS = 0.5
 #: Correlation of projected tangents above which two candidates are one.
 SAME = 0.9999
 
@@ -146,13 +148,14 @@ class Search:
         self.p_detect, self.least = _joint(nulls, seen)
 
     def _alike(self) -> None:
-        """Which candidates have the same projected tangent as an earlier one."""
+        """Which candidates have the same projected tangent as an earlier one, and may have the same sign."""
         self.twins = {}
-        single = [c for c in range(len(self.candidates))
-                  if len(self.candidates[c].shapes) == 1 and len(self.candidates[c].amplitudes) == 1]  # fmt: skip
-        for i in single:
-            for k in single:
-                if k < i and k not in self.twins and abs(self.screening.correlation(i, k)) > SAME:
+        side = {i: c.one_sided(c.amplitudes[0]) for i, c in enumerate(self.candidates)
+                if len(c.shapes) == 1 and len(c.amplitudes) == 1}  # fmt: skip
+        for i in side:
+            for k in side:
+                alike = self.screening.correlation(i, k) * (side[i] * side[k] or 1)
+                if k < i and k not in self.twins and (alike > SAME or (alike < -SAME and not side[i] * side[k])):
                     self.twins[i] = k
                     break
 
@@ -197,7 +200,7 @@ class Search:
         chosen = promising[:MOST] if detected else order[:FEW]
         wanted = [Hypothetical((i,), self.candidates[i], self._begin(i), prior) for i in [*chosen, *blind]]
         self.models += [model for model in self.refit_together(wanted) if model is not None]
-        self._reweigh()
+        self.reweigh()
         self.merge()
 
     def held_out(self, found: Fitted, mask: Tensor) -> HeldOut | None:
@@ -324,7 +327,7 @@ class Search:
             return gain - 0.5 * parameters * math.log(n)
         return 0.5 * (self.base.chi2 - chi2) - 0.5 * parameters * math.log(n)
 
-    def _reweigh(self) -> None:
+    def reweigh(self) -> None:
         """Estimate the noise again with the best model, and fit everything again where that changes it."""
         if self.exact or not self.models:
             return
@@ -340,7 +343,10 @@ class Search:
         self.noise = fresh
         self.base = refit(self.base, fresh.whitening(self.base.problem))
         for model in self.models:
-            model.found = refit(model.found, fresh.whitening(model.found.problem))
+            if model.log_evidence > HOPELESS * best.log_evidence:
+                model.found = refit(model.found, fresh.whitening(model.found.problem))
+            else:
+                model.found = weighed(model.found, fresh.whitening(model.found.problem))
             self._judge(model)
         self.residual = Residual(self.base, self.noise, seed=self.seed)
         self.screening = screen(self.residual, self.candidates)

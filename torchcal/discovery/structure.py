@@ -5,6 +5,7 @@ every channel against every driver. Probabilities come from simulated noise that
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -34,13 +35,17 @@ class Residual:
         noise: The noise model.
         draws: Number of simulated residuals.
         seed: Of the draws.
+        without: Places of fitted parameters whose tangents are left in.
     """
 
-    def __init__(self, found: Fitted, noise: Noise, *, draws: int = 1000, seed: int = 0) -> None:
+    def __init__(
+        self, found: Fitted, noise: Noise, *, draws: int = 1000, seed: int = 0, without: Sequence[int] = ()
+    ) -> None:
         self.found = found
         self.noise = noise
         w = found.whitening
-        tangents = w(found.jacobian[:, ~found.at_bound])
+        mine = torch.tensor([i not in without for i in found.free], dtype=torch.bool)
+        tangents = w(found.jacobian[:, mine & ~found.at_bound])
         size = tangents.norm(dim=0)
         tangents = tangents[:, size > 0] / size[size > 0]
         if tangents.shape[1]:

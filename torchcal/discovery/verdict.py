@@ -183,7 +183,7 @@ def _gain(search: Search, model: Model, mask: Tensor | None, against: Model | No
 
 def _nearly(search: Search, ranked: list[Model], mask: Tensor | None, decision: Decision) -> None:
     """Real recordings are never quite white: name what removes nearly all, on held-out data too, far before rivals."""
-    clean = [m for m in ranked if not m.note]
+    clean = [m for m in ranked if not m.note and m.window is None]  # a window bends to whatever is left
     if search.problem.recording.noise is not None or not clean:
         return
     for size in sorted({len(m.numbers) for m in clean}):

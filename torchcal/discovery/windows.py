@@ -1,13 +1,14 @@
 """Local terms: candidates that act in a range of one driver only, refitted where they promise more than everywhere."""
 
 import dataclasses
+import itertools
 import math
 
 import torch
 
 from torchcal.discovery.candidates import prepare
 from torchcal.discovery.channels import responses
-from torchcal.discovery.local import EDGE, SHARP, localised
+from torchcal.discovery.local import EDGE, WIDTHS, beyond, is_window, localised
 from torchcal.discovery.screen import Window, windows_of
 from torchcal.discovery.search import PRIOR, Model, Search
 from torchcal.discovery.structure import Residual
@@ -17,10 +18,18 @@ from torchcal.simulators import Trajectories
 
 __all__ = ["refit_local", "refit_window"]
 
-#: Refits at most; around one refitted term; and how many of those.
-MOST, MOST_AROUND, LEADING = 6, 2, 2
+#: Refits at most; of one candidate; around one refitted term; and how many of those.
+MOST, MOST_EACH, MOST_AROUND, LEADING = 10, 2, 2, 3
+#: How often windows are sought anew around the leading terms.
+ROUNDS = 2
+#: Log evidence below the best up to which a local model's edges are made sharp.
+CLOSE = 10.0
 #: Relative difference of χ² up to which two windows of one term and driver are one.
 SAME = 1e-4
+#: How far ends are moved for other starts, as a share of the driver's range: where they are sought, and sharpened.
+SHIFT, FINE = 0.1, 0.03
+#: Share of the driver's range below which a window is none: a kick at one moment is another kind of physics.
+SHORT = 0.02
 #: Data below which no window is sought; nor is any without noise, where a window bends to whatever is left.
 LEAST = 30
 
@@ -30,34 +39,44 @@ def refit_local(search: Search) -> None:
     if search.exact or search.problem.n < LEAST:
         return
     gains = {model.numbers[0]: 2 * model.log_evidence + math.log(search.problem.n) for model in search.models}
-    leading = 2 * max((model.log_evidence for model in search.models if model.physical), default=0.0)
-    promising = []
-    for w in search.local:
+    highest = 2 * max((model.log_evidence for model in search.models if model.physical), default=0.0)
+    same = {i for i in search.gone if search.duplicate(search.twins[i], search.candidates[i].name)}
+    promising: dict[int, list[Window]] = {}
+    for w in sorted(search.local, key=lambda w: -w.z):
         plain = max(gains.get(w.candidate, 0.0), search.screening.score(w.candidate) ** 2)
-        if w.candidate not in search.gone and w.z > 3.5 and w.z**2 > max(plain + 6.0, leading - 10.0):
-            promising.append(w)
-    promising.sort(key=lambda w: -w.z)
+        if w.candidate not in same and w.z > 3.5 and w.z**2 > max(plain + 6.0, highest - 10.0):
+            promising.setdefault(w.candidate, []).append(w)
     prior = math.log(PRIOR["local"] / max(len(search.candidates), 1))
-    for w in promising[:MOST]:
+    chosen = sorted((w for each in promising.values() for w in each[:MOST_EACH]), key=lambda w: -w.z)
+    for w in chosen[:MOST]:
         _keep(search, refit_window(search, w, prior))
-    for single in sorted((m for m in search.models if m.window is None), key=lambda m: -m.log_evidence)[:LEADING]:
-        if search.examine(single).p_value >= PLAINLY_WHITE:
-            continue
-        for w in _around(search, single)[:MOST_AROUND]:
-            _keep(search, refit_window(search, w, prior, single))
-    _sharpen(search, prior)
+    search.reweigh()
+    seen: set[int] = set()
+    for _ in range(ROUNDS):
+        singles = sorted((m for m in search.models if len(m.numbers) == 1), key=lambda m: m.log_evidence)
+        leading = sorted({m.numbers: m for m in singles}.values(), key=lambda m: -m.log_evidence)[:LEADING]
+        fresh = [m for m in leading if id(m) not in seen and search.examine(m).p_value < PLAINLY_WHITE]
+        seen |= {id(m) for m in fresh}
+        for model in fresh:
+            for w in _around(search, model)[:MOST_AROUND]:
+                _keep(search, refit_window(search, w, prior, model))
+    search.reweigh()
+    _refine_edges(search, prior)
 
 
-def _sharpen(search: Search, prior: float) -> None:
-    """The best local models again with edges that are nearly steps, where smooth ones leave something behind."""
-    ranked = sorted((m for m in search.models if m.physical), key=lambda m: -m.weight)[:LEADING]
-    for model in ranked:
-        if model.window is None or search.examine(model).p_value >= PLAINLY_WHITE:
+def _refine_edges(search: Search, prior: float) -> None:
+    """The best local models again with edges as steep as the data want, where the usual ones leave something behind."""
+    ranked = sorted((m for m in search.models if m.physical), key=lambda m: -m.weight)
+    if not ranked:
+        return
+    least = ranked[0].log_evidence - max(CLOSE, 0.02 * ranked[0].log_evidence)
+    for model in ranked[:MOST]:
+        if model.window is None or model.log_evidence < least or search.examine(model).p_value >= PLAINLY_WHITE:
             continue
-        w = dataclasses.replace(model.window, amplitude=0.0)
-        sharp = refit_window(search, w, prior, model, SHARP)
-        if sharp is not None and sharp.found.chi2 < model.found.chi2:
-            search.models[search.models.index(model)] = sharp
+        w = dataclasses.replace(model.window, amplitude=_amplitude(search, model)[2])
+        other = refit_window(search, w, prior, model, edge=True)
+        if other is not None and other.weight > model.weight:
+            search.models[search.models.index(model)] = other
 
 
 def _keep(search: Search, model: Model | None) -> None:
@@ -72,46 +91,62 @@ def _keep(search: Search, model: Model | None) -> None:
 
 
 def _around(search: Search, model: Model) -> list[Window]:
-    """Where a refitted term acts more than elsewhere, or where it does not act at all: the best window a driver.
+    """Where a refitted term had better act, by what it does at its own fit: the best window of every driver.
 
     At the base a strong effect is far from linear; here only its range is still wrong.
     """
     found, term = model.found, model.candidate.terms[0]
     if term.states or term.frees or term.outputs:
         return []
-    residual = model.residual or Residual(found, search.noise, seed=search.seed, draws=10)
-    number = model.numbers[0]
-    column = search.screening.best[number]
+    column = search.screening.best[model.numbers[0]]
     if column < 0:
         return []
-    place = model.candidate.amplitudes[int(search.screening.amplitude[column])]
+    names = [q.name for q in found.problem.parameters]
+    plain = search.candidates[model.numbers[0]]
+    place, amplitude, value = _amplitude(search, model)
+    own = [i for i, name in enumerate(names) if name == amplitude or is_window(name)]
+    everywhere = found.values.clone()
+    for i, name in enumerate(names):
+        if is_window(name):
+            q = found.problem.parameters[i]
+            everywhere[i] = beyond(name, q.low or 0.0, q.high or 0.0)
+    residual = Residual(found, search.noise, seed=search.seed, draws=10, without=own)
     bound = found.problem.simulator
     if isinstance(bound, Trajectories):
         with torch.no_grad():
-            forcing = bound._step_derivatives(found.values[None], found.warm, [place])[2][0]
-        response, drivers, _ = responses(found.problem, found, forcing)
-        response = response[:, :, 0]
+            forcing, present = (
+                bound._step_derivatives(values[None], found.warm, [place])[2][0]
+                for values in (everywhere, found.values)
+            )
+        response, drivers, _ = responses(found.problem, found, torch.cat([forcing, present], dim=-1))
+        response, acting = response[:, :, 0], response[:, :, 1].sum(1)
     elif place in found.free:
-        response = torch.diag(found.jacobian[:, found.free.index(place)])
+        acting = found.jacobian[:, found.free.index(place)]
+        response = torch.diag(found.problem.evaluate(everywhere[None], [place])[1][0, :, 0])
         drivers = found.problem.drivers_at_data(found.values[None], None)
     else:
         return []
-    value = float(found.values[place] - model.candidate.neutral[model.candidate.own.index(place)])
+    residual.e = residual.e + residual.tangent(value * acting[:, None])[:, 0]
+    sign = plain.one_sided(plain.amplitudes[int(search.screening.amplitude[column])])
     kept: dict[str, Window] = {}
-    for w in sorted(windows_of(number, residual, response, drivers, 0)[0], key=lambda w: -w.z):
-        if w.driver not in search._drivers() or w.driver in kept or w.z < 3.5:
-            continue
-        if w.amplitude * value < 0:  # too much of it there: it acts on the other side
-            if math.isfinite(w.low) and math.isfinite(w.high):
-                continue
-            low = w.high if math.isfinite(w.high) else -math.inf
-            w = dataclasses.replace(w, low=low, high=w.low if math.isfinite(w.low) else math.inf, amplitude=0.0)
-        kept[w.driver] = w
+    for w in sorted(windows_of(model.numbers[0], residual, response, drivers, sign)[0], key=lambda w: -w.z):
+        if w.driver in search._drivers() and w.driver not in kept and w.z > 3.5:
+            kept[w.driver] = w
     return list(kept.values())
 
 
+def _amplitude(search: Search, model: Model) -> tuple[int, str, float]:
+    """Of a model of one term: the place of its amplitude, its name, and how far it is from neutral."""
+    plain = search.candidates[model.numbers[0]]
+    column = max(search.screening.best[model.numbers[0]], 0)
+    name = plain.problem.parameters[plain.amplitudes[int(search.screening.amplitude[column])]].name
+    place = [q.name for q in model.found.problem.parameters].index(name)
+    neutral = model.candidate.neutral[model.candidate.own.index(place)]
+    return place, name, float(model.found.values[place] - neutral)
+
+
 def refit_window(
-    search: Search, w: Window, prior: float, near: Model | None = None, edge: float = EDGE
+    search: Search, w: Window, prior: float, near: Model | None = None, *, edge: bool = False
 ) -> Model | None:
     """Base and one local term, begun at the window that the screening found, from the base or near a model of it."""
     plain = search.candidates[w.candidate]
@@ -126,20 +161,31 @@ def refit_window(
     except (SimulatorError, DomainError):
         return None
     column = search.screening.best[w.candidate]
-    values = dict(zip([plain.problem.parameters[i].name for i in plain.own],
-                      plain.shapes[int(search.screening.shape[column])].tolist(), strict=True))  # fmt: skip
-    amplitude = plain.problem.parameters[plain.amplitudes[int(search.screening.amplitude[column])]].name
-    begin = candidate.begin.clone()
-    values[amplitude] += 0.02 * w.amplitude
-    if near is not None:
+    amplitude = plain.amplitudes[int(search.screening.amplitude[column])]
+    names = [q.name for q in plain.problem.parameters]
+    values = dict(zip([names[i] for i in plain.own], plain.shapes[int(search.screening.shape[column])].tolist(),
+                      strict=True))  # fmt: skip
+    size = w.amplitude
+    if near is None:
+        size *= 0.02
+    else:
         values = dict(zip([q.name for q in near.found.problem.parameters], near.found.values.tolist(), strict=True))
-        values[amplitude] += w.amplitude
+    values[names[amplitude]] = float(plain.neutral[plain.own.index(amplitude)]) + size
     ends = {f"{term.name}.window from": w.low, f"{term.name}.window to": w.high}
-    for i, q in enumerate(candidate.problem.parameters):
-        begin[i] = ends.get(q.name, values.get(q.name, float(begin[i])))
+    width = span[1] - span[0]
+    shift = width * (FINE if edge else SHIFT)
+    choices = []
+    for q, start in zip(candidate.problem.parameters, candidate.begin.tolist(), strict=True):
+        if q.name in ends:
+            choices.append([ends[q.name] + k * shift for k in (0.0, -1.0, 1.0)])
+        elif is_window(q.name):
+            choices.append([share * width for share in (EDGE, *WIDTHS)])
+        else:
+            choices.append([values.get(q.name, start)])
+    begin = torch.tensor(list(itertools.product(*choices)), dtype=torch.float64)
     # Windows were searched on a grid of about 12 edges: the best of so many costs its logarithm.
     model = search._refit(
-        (w.candidate,), candidate, begin[None], prior - math.log(3.0 * len(search._drivers())), window=w
+        (w.candidate,), candidate, begin, prior - math.log(3.0 * len(search._drivers())), window=w
     )
     if model is None:
         return None
@@ -150,5 +196,7 @@ def refit_window(
             low = float(model.found.values[i])
         elif name.endswith("window to"):
             high = float(model.found.values[i])
+    if high - low < SHORT * width:
+        return None
     model.window = dataclasses.replace(w, low=low, high=high)
     return model

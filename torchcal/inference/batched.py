@@ -114,7 +114,7 @@ class _NUTS:
         )
 
     def positions(self, state: nuts_step.State) -> Tensor:
-        return state.proposal[:, 0]
+        return state.proposal[:, : state.momentum_sum.shape[1]]
 
     def tune(self, z: Tensor, groups: Tensor, space: Whitened, step_size: float) -> Tensor:
         self.tables = self.full

@@ -26,11 +26,17 @@ DIVERGENCE = 1000.0
 
 @dataclasses.dataclass(frozen=True)
 class Tables:
-    """For each leaf number of a subtree, the checkpoints that it closes a U-turn check with, ``(2**depth,)`` twice."""
+    """By the leaf number of a subtree, which checkpoint it writes and which it closes a U-turn check with.
 
-    first: Tensor
-    last: Tensor
-    max_depth: int
+    Attributes:
+        slot: Written by even leaves, ``(2**max_depth,)``; others write one past all that are read.
+        check: Closed by odd leaves, ``(2**max_depth, max_depth)`` bool.
+        depth: The largest.
+    """
+
+    slot: Tensor
+    check: Tensor
+    depth: int
 
     @classmethod
     def build(cls, max_depth: int, device: torch.device) -> "Tables":
@@ -39,30 +45,52 @@ class Tables:
         last = [bin(leaf >> 1).count("1") for leaf in leaves]
         trailing = [(leaf ^ (leaf + 1)).bit_length() - 1 for leaf in leaves]
         first = [high - ones + 1 for high, ones in zip(last, trailing, strict=True)]
-        return cls(torch.tensor(first, device=device), torch.tensor(last, device=device), max_depth)
+        slot = [max_depth if leaf % 2 else last[leaf] for leaf in leaves]
+        check = [[leaf % 2 == 1 and first[leaf] <= k <= last[leaf] for k in range(max_depth)] for leaf in leaves]
+        return cls(torch.tensor(slot, device=device), torch.tensor(check, device=device), max_depth)
 
 
 @dataclasses.dataclass(frozen=True)
 class State:
-    """Where every chain is in its trajectory. Points are stacked as (position, momentum, gradient), ``(C, 3, P)``."""
+    """Where every chain is in its trajectory.
+
+    Few large tensors rather than many small ones, since a step costs by the number of operations. A draw is
+    (position, gradient, energy), ``(C, 2P + 1)``; a point is a draw with its momentum behind it, ``(C, 3P + 1)``. A
+    checkpoint is (momentum, half sum): the sum of the subtree's momenta up to it, its own counted by half.
+
+    Attributes:
+        cursor: The point that moves.
+        ends: Of the trajectory, left and right, ``(C, 2, 3P + 1)``.
+        proposal: The draw that the trajectory would end with.
+        sub_proposal: The same of the subtree.
+        momentum_sum: Over the trajectory, ``(C, P)``.
+        sub_momentum_sum: Over the subtree.
+        checkpoints: ``(C, depth + 1, 2P)``, written in place: a state can be stepped on from once.
+        start_energy: Total energy at the start, ``(C,)``.
+        weight: Log of the trajectory's summed weights.
+        sub_weight: The same of the subtree.
+        rightward: Which way the subtree grows, bool.
+        step_size: Of this trajectory.
+        leaf: Number of the subtree's next leaf.
+        size: Leaves of the trajectory, and so of the subtree when it is whole.
+        accept_sum: Of acceptance probabilities over the trajectory.
+        leaves: Number of its leapfrog steps.
+    """
 
     cursor: Tensor
-    left: Tensor
-    right: Tensor
+    ends: Tensor
     proposal: Tensor
-    proposal_energy: Tensor
     sub_proposal: Tensor
-    sub_energy: Tensor
     momentum_sum: Tensor
     sub_momentum_sum: Tensor
     checkpoints: Tensor
     start_energy: Tensor
     weight: Tensor
     sub_weight: Tensor
-    direction: Tensor
+    rightward: Tensor
     step_size: Tensor
     leaf: Tensor
-    depth: Tensor
+    size: Tensor
     accept_sum: Tensor
     leaves: Tensor
 
@@ -93,27 +121,25 @@ def init(
     chains, size = position.shape
     energy, slope = potential(position)
     momentum = _normal(position, generator)
-    point = torch.stack([position, momentum, slope], dim=1)
+    draw = torch.cat([position, slope, energy[:, None]], dim=1)
+    point = torch.cat([draw, momentum], dim=1)
     zero = torch.zeros_like(energy)
     count = torch.zeros(chains, dtype=torch.long, device=position.device)
     return State(
         cursor=point,
-        left=point,
-        right=point,
-        proposal=point[:, ::2],
-        proposal_energy=energy,
-        sub_proposal=point[:, ::2],
-        sub_energy=energy,
+        ends=torch.stack([point, point], dim=1),
+        proposal=draw,
+        sub_proposal=draw,
         momentum_sum=momentum,
         sub_momentum_sum=torch.zeros_like(momentum),
-        checkpoints=position.new_zeros(chains, max(1, tables.max_depth), 2, size),
+        checkpoints=position.new_zeros(chains, tables.depth + 1, 2 * size),
         start_energy=energy + 0.5 * momentum.square().sum(-1),
         weight=zero,
         sub_weight=zero - torch.inf,
-        direction=_sign(energy, generator)[:, None],
-        step_size=torch.full_like(energy, step_size)[:, None],
+        rightward=_coin(energy, generator),
+        step_size=torch.full_like(energy, step_size),
         leaf=count,
-        depth=count,
+        size=count + 1,
         accept_sum=zero,
         leaves=zero,
     )
@@ -124,96 +150,89 @@ def step(
 ) -> tuple[State, Outcome]:
     """One leapfrog step of every chain; ``step_size`` holds for trajectories that start in this call."""
     s = state
-    move = s.direction * s.step_size
-    position, momentum, slope = s.cursor.unbind(1)
-    momentum = momentum - 0.5 * move * slope
-    position = position + move * momentum
+    size = s.momentum_sum.shape[1]
+    position, slope, _, momentum = s.cursor.split([size, size, 1, size], dim=1)
+    move = torch.where(s.rightward, s.step_size, -s.step_size)[:, None]
+    momentum = torch.addcmul(momentum, move, slope, value=-0.5)
+    position = torch.addcmul(position, move, momentum)
     energy, slope = potential(position)
-    momentum = momentum - 0.5 * move * slope
-    cursor = torch.stack([position, momentum, slope], dim=1)
+    momentum = torch.addcmul(momentum, move, slope, value=-0.5)
+    cursor = torch.cat([position, slope, energy[:, None], momentum], dim=1)
 
-    error = energy + 0.5 * momentum.square().sum(-1) - s.start_energy
-    error = torch.nan_to_num(error, nan=torch.inf)
-    divergent = error > DIVERGENCE
-    accept_sum = s.accept_sum + (-error.clamp_min(0)).exp()
+    gain = s.start_energy - torch.add(energy, momentum.square().sum(-1), alpha=0.5)
+    gain = torch.nan_to_num(gain, nan=-torch.inf, neginf=-torch.inf)
+    divergent = gain < -DIVERGENCE
+    accept_sum = s.accept_sum + gain.clamp_max(0).exp()
     leaves = s.leaves + 1
-    log_uniform = torch.rand((2, len(error)), dtype=error.dtype, device=error.device, generator=generator).log()
+    log_uniform = torch.rand((2, len(gain)), dtype=gain.dtype, device=gain.device, generator=generator).log()
 
     # The leaf joins the subtree.
-    sub_weight = torch.logaddexp(s.sub_weight, -error)
-    take = log_uniform[0] < -error - sub_weight
-    sub_proposal = torch.where(take[:, None, None], cursor[:, ::2], s.sub_proposal)
-    sub_energy = torch.where(take, energy, s.sub_energy)
+    sub_weight = torch.logaddexp(s.sub_weight, gain)
+    take = log_uniform[0] < gain - sub_weight
+    sub_proposal = torch.where(take[:, None], cursor[:, : 2 * size + 1], s.sub_proposal)
     sub_sum = s.sub_momentum_sum + momentum
-    first, last = tables.first[s.leaf][:, None], tables.last[s.leaf][:, None]
-    even = (s.leaf % 2 == 0)[:, None]
-    number = torch.arange(s.checkpoints.shape[1], device=error.device)
-    write = (number == last) & even
-    pair = torch.stack([momentum, sub_sum], dim=1)[:, None]
-    checkpoints = torch.where(write[:, :, None, None], pair, s.checkpoints)
-    opened = checkpoints[:, :, 0]
-    turns = _turning(opened, momentum[:, None], sub_sum[:, None] - checkpoints[:, :, 1] + opened)
-    stop = (turns & (number >= first) & (number <= last) & ~even).any(-1) | divergent
+    half = torch.sub(sub_sum, momentum, alpha=0.5)
+    chains = torch.arange(len(gain), device=gain.device)
+    s.checkpoints[chains, tables.slot[s.leaf]] = torch.cat([momentum, half], dim=1)
+    depth = int(s.leaf.max()).bit_length()  # of the checkpoints in use
+    opened, closed = s.checkpoints[:, :depth].split(size, dim=2)
+    check = tables.check[s.leaf, :depth]
+    turns = _turning(opened, momentum[:, None], half[:, None] - closed)
+    stop = (turns & check).any(-1) | divergent
 
     # A complete subtree joins the tree.
-    merge = (s.leaf + 1 == 2**s.depth) & ~stop
+    leaf = s.leaf + 1
+    merge = (leaf == s.size) & ~stop
     take = merge & (log_uniform[1] < sub_weight - s.weight)
-    proposal = torch.where(take[:, None, None], sub_proposal, s.proposal)
-    proposal_energy = torch.where(take, sub_energy, s.proposal_energy)
+    proposal = torch.where(take[:, None], sub_proposal, s.proposal)
     weight = torch.where(merge, torch.logaddexp(s.weight, sub_weight), s.weight)
     total = torch.where(merge[:, None], s.momentum_sum + sub_sum, s.momentum_sum)
-    rightward = s.direction[:, 0] > 0
-    left = torch.where((merge & ~rightward)[:, None, None], cursor, s.left)
-    right = torch.where((merge & rightward)[:, None, None], cursor, s.right)
-    depth = s.depth + merge
-    full = _turning(left[:, 1], right[:, 1], total) | (depth >= tables.max_depth)
+    grown = torch.stack([merge & ~s.rightward, merge & s.rightward], dim=1)
+    ends = torch.where(grown[:, :, None], cursor[:, None], s.ends)
+    count = torch.where(merge, 2 * s.size, s.size)
+    left, right = ends[:, :, 2 * size + 1 :].unbind(1)
+    full = _turning(left, right, torch.sub(total, left + right, alpha=0.5)) | (count >= 2**tables.depth)
     done = stop | (merge & full)
 
     # Ended trajectories start anew from their proposal; all others go on, some with a new subtree.
     fresh = _normal(position, generator)
-    start = torch.stack([proposal[:, 0], fresh, proposal[:, 1]], dim=1)
-    again = done[:, None, None]
-    left = torch.where(again, start, left)
-    right = torch.where(again, start, right)
+    start = torch.cat([proposal, fresh], dim=1)
+    ends = torch.where(done[:, None, None], start[:, None], ends)
     restart = done | merge
-    direction = torch.where(restart, _sign(error, generator), s.direction[:, 0])
-    end = torch.where((direction > 0)[:, None, None], right, left)
-    zero = torch.zeros_like(error)
-    outcome = Outcome(done, proposal[:, 0], accept_sum / leaves, divergent & done, leaves)
+    rightward = torch.where(restart, _coin(gain, generator), s.rightward)
+    end = torch.where(rightward[:, None], ends[:, 1], ends[:, 0])
+    outcome = Outcome(done, proposal[:, :size], accept_sum / leaves, divergent & done, leaves)
     state = State(
-        cursor=torch.where(restart[:, None, None], end, cursor),
-        left=left,
-        right=right,
+        cursor=torch.where(restart[:, None], end, cursor),
+        ends=ends,
         proposal=proposal,
-        proposal_energy=proposal_energy,
         sub_proposal=sub_proposal,
-        sub_energy=sub_energy,
         momentum_sum=torch.where(done[:, None], fresh, total),
-        sub_momentum_sum=torch.where(restart[:, None], torch.zeros_like(sub_sum), sub_sum),
-        checkpoints=checkpoints,
-        start_energy=torch.where(done, proposal_energy + 0.5 * fresh.square().sum(-1), s.start_energy),
-        weight=torch.where(done, zero, weight),
-        sub_weight=torch.where(restart, zero - torch.inf, sub_weight),
-        direction=direction[:, None],
-        step_size=torch.where(done[:, None], torch.full_like(s.step_size, step_size), s.step_size),
-        leaf=torch.where(restart, 0, s.leaf + 1),
-        depth=torch.where(done, 0, depth),
-        accept_sum=torch.where(done, zero, accept_sum),
-        leaves=torch.where(done, zero, leaves),
+        sub_momentum_sum=torch.where(restart[:, None], 0.0, sub_sum),
+        checkpoints=s.checkpoints,
+        start_energy=torch.where(
+            done, torch.add(proposal[:, 2 * size], fresh.square().sum(-1), alpha=0.5), s.start_energy
+        ),
+        weight=torch.where(done, 0.0, weight),
+        sub_weight=torch.where(restart, -torch.inf, sub_weight),
+        rightward=rightward,
+        step_size=torch.where(done, step_size, s.step_size),
+        leaf=torch.where(restart, 0, leaf),
+        size=torch.where(done, 1, count),
+        accept_sum=torch.where(done, 0.0, accept_sum),
+        leaves=torch.where(done, 0.0, leaves),
     )
     return state, outcome
 
 
-def _turning(left: Tensor, right: Tensor, total: Tensor) -> Tensor:
-    """Whether a trajectory with these end momenta and this sum of momenta has made a U-turn."""
-    middle = total - 0.5 * (left + right)
-    return ((left * middle).sum(-1) <= 0) | ((right * middle).sum(-1) <= 0)
+def _turning(left: Tensor, right: Tensor, middle: Tensor) -> Tensor:
+    """Whether a trajectory with these end momenta, and this sum of momenta with theirs by half, has made a U-turn."""
+    return torch.minimum((left * middle).sum(-1), (right * middle).sum(-1)) <= 0
 
 
 def _normal(like: Tensor, generator: torch.Generator) -> Tensor:
     return torch.randn(like.shape, dtype=like.dtype, device=like.device, generator=generator)
 
 
-def _sign(like: Tensor, generator: torch.Generator) -> Tensor:
-    uniform = torch.rand(like.shape, dtype=like.dtype, device=like.device, generator=generator)
-    return torch.where(uniform < 0.5, -1.0, 1.0).to(like.dtype)
+def _coin(like: Tensor, generator: torch.Generator) -> Tensor:
+    return torch.rand(like.shape, dtype=like.dtype, device=like.device, generator=generator) >= 0.5
