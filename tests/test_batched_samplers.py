@@ -43,11 +43,14 @@ def independent(draws, column):
 
 def test_checkpoint_tables_of_the_iterative_tree():
     tables = nuts_step.Tables.build(4, torch.device("cpu"))
+    closed = [row.nonzero()[:, 0].tolist() for row in tables.check]
     # Leaf 7 = 0b111 closes the subtrees of sizes 2, 4 and 8; leaf 13 = 0b1101 closes one of size 2 only.
-    assert (tables.first[7], tables.last[7]) == (0, 2)
-    assert (tables.first[13], tables.last[13]) == (2, 2)
-    # An even leaf closes nothing: the range of checkpoints is empty.
-    assert bool((tables.first[::2] > tables.last[::2]).all())
+    assert closed[7] == [0, 1, 2]
+    assert closed[13] == [2]
+    # An even leaf closes nothing and opens a subtree, at a checkpoint that no open one needs; an odd one opens none.
+    assert closed[::2] == [[]] * 8
+    assert tables.slot[::2].tolist() == [0, 1, 1, 2, 1, 2, 2, 3]
+    assert tables.slot[1::2].tolist() == [tables.depth] * 8
 
 
 def test_leapfrog_conserves_energy_to_second_order():
@@ -62,7 +65,7 @@ def test_leapfrog_conserves_energy_to_second_order():
         state = nuts_step.init(z, potential, step_size=step_size, tables=tables, generator=generator)
         start = state.start_energy
         state, _ = nuts_step.step(state, potential, step_size=step_size, tables=tables, generator=generator)
-        position, momentum, _ = state.cursor.unbind(1)
+        position, momentum = state.cursor[:, :2], state.cursor[:, -2:]
         # After the first leaf the cursor is at an end of the tree or at a new subtree's start: use the moved ones.
         energy = potential(position)[0] + 0.5 * momentum.square().sum(-1)
         errors.append(float((energy - start).abs().max()))

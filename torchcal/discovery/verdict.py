@@ -13,6 +13,8 @@ __all__ = ["Decision", "decide"]
 
 #: A hypothesis is named when it has at least this probability among those the library offers.
 NAMED = 0.97
+#: And at least this among all, "none of these" and the base included.
+SURE = 0.7
 #: Structure left after a hypothesis with less probability than this by noise alone speaks against it.
 WHITE = 0.005
 #: Structure left with at least this probability is none; and the share of its log evidence by which a linear estimate
@@ -108,8 +110,7 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
             and _certainty(groups, best) >= NAMED
             and not _other_names(search, best)
         ):
-            decision.verdict, decision.best = "named", best
-            _prove(search, decision, mask)
+            _name(search, decision, best, mask)
             return decision
     best = white[0]
     decision.verdict = "ambiguous"
@@ -132,9 +133,24 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
                 [other if name == search.candidates[model.numbers[0]].name else name for name in model.names]
             )
     if len(decision.tied) < 2:
-        decision.verdict, decision.best, decision.tied, decision.tied_models = "named", best, [], []
-        _prove(search, decision, mask)
+        decision.tied, decision.tied_models = [], []
+        _name(search, decision, best, mask)
     return decision
+
+
+def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) -> None:
+    """Name what a model adds, if it is probable enough and the held-out data do not object."""
+    names = set(best.names)
+    sure = sum(decision.probability[id(m)] for m in search.models if names <= set(m.names))
+    if sure < SURE:
+        decision.verdict = "unexplained"
+        decision.withdrawn = (
+            f"{' and '.join(best.names)} is the best explanation in the library, but its probability is {sure:.2f} "
+            f"only, against {decision.none:.2f} for something that is not in it: too little for a name."
+        )
+        return
+    decision.verdict, decision.best = "named", best
+    _prove(search, decision, mask)
 
 
 def _other_names(search: Search, model: Model) -> list[str]:
@@ -186,8 +202,10 @@ def _nearly(search: Search, ranked: list[Model], mask: Tensor | None, decision: 
     clean = [m for m in ranked if not m.note and m.window is None]  # a window bends to whatever is left
     if search.problem.recording.noise is not None or not clean:
         return
-    for size in sorted({len(m.numbers) for m in clean}):
+    for size in (1, 2):  # three bend to almost anything
         mine = sorted((m for m in clean if len(m.numbers) == size), key=lambda m: m.found.chi2)
+        if not mine:
+            continue
         best = mine[0]
         if explain.removed(search, best) < NEARLY or _gain(search, best, mask) < REMOVED:
             continue
