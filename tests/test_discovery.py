@@ -650,6 +650,19 @@ def test_a_name_that_predicts_worse_is_withdrawn(monkeypatch):
     assert quiet(*pushed(0.08)).terms == ["bias force"]
 
 
+def test_a_best_explanation_that_is_not_probable_enough_is_no_name(monkeypatch, tmp_path):
+    monkeypatch.setattr("torchcal.discovery.verdict.SURE", 0.999)
+    body, _, x = spring(named(tc.terms.mechanics(), "bias force"), seed=21, **{"bias force__b": 0.3})
+    d = quiet(body, tc.Recording(runs=[run_of(x)], noise=0.02), named(tc.terms.mechanics(), "bias force"))
+    assert d.verdict == "ambiguous"
+    assert d.terms == []
+    assert d.tied == [["bias force"], ["none of these"]]
+    assert d.experiment is None
+    assert "something that is not in this library" in str(d).splitlines()[0]
+    assert "too little for a name" in " ".join(str(d).split())
+    d.report(tmp_path / "report.html")
+
+
 def test_a_later_term_of_the_same_name_replaces_an_earlier_one():
     body, motion, library = pushed(0.1)
     mine = tc.Term("bias force", equation="v", rate=lambda t, s, p, u: p["mine"], parameters=[tc.Parameter("mine")])

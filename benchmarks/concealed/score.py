@@ -11,6 +11,8 @@ What the numbers mean:
 - *false alarm*: any verdict but ``consistent`` on a null; for a peer any term.
 - *wrong name*: verdict ``named`` where the effect is not in the library.
 - *precision*: share of right names among all names given, nulls and effects outside the library included.
+- *no wrong name*: share of the recordings with names in which every name given was planted, whether or not all that was
+  planted was named.
 - Of two terms, one named and the other reported as remaining (`REMAINS` of the misfit or more) counts as half.
 - *right equation*: the first place of ``where``, or the named term, acts on an equation or output of the effect.
 - *region F1*: overlap of the samples in the reported and in the planted region; 0 where nothing was found.
@@ -333,6 +335,9 @@ def table(
         if name is None:
             named = [k for k in pick((*every, "outside", "null")) if results[k].get("verdict") == "named"]
         column["precision when named"] = share(credit(results[k], answers[k]) for k in named)
+        column["no wrong name among those given"] = share(
+            float(matches(results[k]["terms"], answers[k], results[k]) == len(results[k]["terms"])) for k in named
+        )
         local = pick(("local",), name)
         column["region F1"] = _mean([region_f1(results[k], answers[k]) for k in local])
         column["held-out ratio"] = middle(

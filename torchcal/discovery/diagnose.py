@@ -19,7 +19,7 @@ from torchcal.discovery.experiment import propose
 from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.limits import limits
 from torchcal.discovery.problem import Problem
-from torchcal.discovery.records import Estimate, Hypothesis, Scores, Table
+from torchcal.discovery.records import NONE, Estimate, Hypothesis, Scores, Table
 from torchcal.discovery.result import Diagnosis
 from torchcal.discovery.search import PRIOR, Model, Search, describe
 from torchcal.discovery.several import refit_several
@@ -385,7 +385,7 @@ def _ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[H
     if not search.exact:
         rows.append(
             Hypothesis(
-                ("none of these",),
+                NONE,
                 decision.none_evidence - math.log(PRIOR["none"]),
                 decision.none,
                 note="something unknown and smooth",

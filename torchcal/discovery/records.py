@@ -11,6 +11,7 @@ from torch import Tensor
 from torchcal.errors import MissingDependencyError
 
 __all__ = [
+    "NONE",
     "Estimate",
     "Experiment",
     "Fit",
@@ -24,6 +25,9 @@ __all__ = [
     "Scores",
     "Table",
 ]
+
+#: Terms of the hypothesis that what is missing is not in the library.
+NONE = ("none of these",)
 
 Record = TypeVar("Record")
 

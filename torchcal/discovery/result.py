@@ -37,7 +37,8 @@ class Diagnosis:
             ``tied``, and these data cannot tell which; ``"unexplained"``: something is missing that is not in the
             library.
         terms: Names of the accepted terms, in order of acceptance.
-        tied: Hypotheses that the data cannot tell apart, each a list of terms.
+        tied: Hypotheses that the data cannot tell apart, each a list of terms; the last is ``["none of these"]`` where
+            the best of the library is not probable enough for a name.
         where: Where the mismatch sits: equations, parameters or outputs, with spans and share of the misfit.
         ranking: All hypotheses, the best first.
         detection_limit: By candidate, the smallest effect that these data could have shown.

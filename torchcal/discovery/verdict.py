@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from torchcal.discovery import explain, verify
+from torchcal.discovery.records import NONE
 from torchcal.discovery.search import PRIOR, Model, Search
 from torchcal.discovery.structure import Structure
 
@@ -143,11 +144,8 @@ def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) 
     names = set(best.names)
     sure = sum(decision.probability[id(m)] for m in search.models if names <= set(m.names))
     if sure < SURE:
-        decision.verdict = "unexplained"
-        decision.withdrawn = (
-            f"{' and '.join(best.names)} is the best explanation in the library, but its probability is {sure:.2f} "
-            f"only, against {decision.none:.2f} for something that is not in it: too little for a name."
-        )
+        decision.verdict = "ambiguous"
+        decision.tied, decision.tied_models = [list(best.names), list(NONE)], [best]
         return
     decision.verdict, decision.best = "named", best
     _prove(search, decision, mask)

@@ -2,7 +2,10 @@
 
 import math
 import textwrap
+from collections.abc import Sequence
 from typing import Any
+
+from torchcal.discovery.records import NONE
 
 __all__ = ["paragraph", "percent"]
 
@@ -50,8 +53,12 @@ def _headline(d: Any) -> str:
     if d.verdict == "named":
         return f"Verdict: named: {_and([_with_region(d, name) for name in d.terms])}"
     if d.verdict == "ambiguous":
-        return "Verdict: ambiguous: " + ", or ".join(" with ".join(tied) for tied in d.tied)
+        return "Verdict: ambiguous: " + ", or ".join(_hypothesis(tied) for tied in d.tied)
     return "Verdict: unexplained (something is missing that is not in this library)"
+
+
+def _hypothesis(terms: Sequence[str]) -> str:
+    return "something that is not in this library" if tuple(terms) == NONE else " with ".join(terms)
 
 
 def _with_region(d: Any, name: str) -> str:
@@ -151,6 +158,14 @@ def _named(d: Any) -> list[str]:
 
 
 def _ambiguous(d: Any) -> list[str]:
+    if tuple(d.tied[-1]) == NONE:
+        best = d.tied[0]
+        sure = sum(row.probability for row in d.ranking if set(best) <= set(row.terms))
+        return [
+            _where(d),
+            f"{_and(best)}, the best explanation in the library, has a probability of {sure:.2f} only, which is too "
+            "little for a name: more data, or less noise, would tell.",
+        ]
     parts = [_where(d), f"{len(d.tied)} hypotheses explain it equally well and these data cannot tell them apart."]
     if d.experiment is not None:
         parts.append(

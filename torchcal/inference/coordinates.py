@@ -35,14 +35,15 @@ class Whitened:
 
     def __init__(self, log_density: Callable[[Tensor], Tensor], loc: Tensor, scale_tril: Tensor) -> None:
         self.log_density, self.loc, self.scale_tril = log_density, loc, scale_tril
+        self._downhill = -scale_tril
 
     def potential(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """Negative log-density ``(C,)`` and its gradient ``(C, P)``; +inf and 0 where they are not finite."""
         u = self.outer(z.detach()).requires_grad_(True)
         with torch.enable_grad():
             value = self.log_density(u)
-            (slope,) = torch.autograd.grad(value, u, grad_outputs=-torch.ones_like(value))
-        energy, slope = -value.detach(), slope @ self.scale_tril
+            (slope,) = torch.autograd.grad(value.sum(), u)  # with grad_outputs=, PyTorch would import SymPy first
+        energy, slope = -value.detach(), slope @ self._downhill
         good = torch.isfinite(energy + slope.sum(-1))  # which is not finite where any of them is not
         return torch.where(good, energy, torch.inf), torch.where(good[:, None], slope, 0.0)
 
