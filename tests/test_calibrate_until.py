@@ -102,7 +102,7 @@ def test_chains_are_many_where_they_are_not_given():
 
 @pytest.mark.parametrize(
     ("target", "cost", "chains"),
-    [(1, 1, 32), (6400, 1, 32), (6401, 1, 33), (1e6, 1, 256), (1e6, 2**20, 4), (1, 2**22, 4), (1, 2**18, 16)],
+    [(1, 1, 32), (3840, 1, 32), (3841, 1, 33), (1e6, 1, 400), (1e6, 2**20, 4), (1, 2**22, 4), (1, 2**18, 16)],
 )
 def test_chains_follow_from_target_and_cost(target, cost, chains):
     plan = sampling.Plan(None, None, None, "nuts", 0, torch.float64, None, False, target)

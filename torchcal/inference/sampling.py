@@ -21,8 +21,8 @@ from torchcal.results.diagnostics import R_HAT_THRESHOLD, Mode
 
 __all__ = ["Plan", "draw"]
 
-_FEWEST_CHAINS, _MOST_CHAINS = 32, 256
-"""Where there is a target: so few chains cost no more than one, and so many use all of a core."""
+_FEWEST_CHAINS, _MOST_CHAINS, _DRAWS_EACH = 32, 400, 120
+"""Where there is a target: so few chains cost no more than one, so many use all of a core, so long each is to be."""
 
 MOST_DRAWS = 20_000
 """Draws of a chain at which a search for a wanted sample size gives up."""
@@ -90,12 +90,12 @@ class Plan:
         return 1000 if self.target_ess is None else MOST_DRAWS
 
     def chains(self, cost: int) -> int:
-        """Chains; with a target about 200 draws of each are meant to reach it, as R-hat asks for long chains."""
+        """Chains; with a target about 120 draws of each are meant to reach it, as R-hat asks for long chains."""
         if self.num_chains is not None:
             return self.num_chains
         if self.target_ess is None:
             return 4
-        wanted = min(max(_FEWEST_CHAINS, math.ceil(self.target_ess / 200)), _MOST_CHAINS)
+        wanted = min(max(_FEWEST_CHAINS, math.ceil(self.target_ess / _DRAWS_EACH)), _MOST_CHAINS)
         return max(4, min(wanted, MOST_ELEMENTS // max(1, cost)))
 
     @property
