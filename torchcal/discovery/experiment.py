@@ -1,7 +1,7 @@
 """Which new condition would tell tied hypotheses apart: where their predictions differ most after refitting."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -17,24 +17,42 @@ from torchcal.simulators import Trajectories
 
 __all__ = ["propose"]
 
+#: Distance in noise sd below which more samples are asked for, and how many times as many.
+ENOUGH, DENSER = 6.0, 4
+
+#: How much larger the distance must be for a less simple experiment.
+WORTH = 1.01
+
+Option = tuple[str, Recording, dict[str, Any]]
+
 
 def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
     """The experiment, among a few that anyone can do, that separates the two nearest of the models most.
 
     Runs are repeated with other initial states, stronger or weaker inputs, or for longer; static conditions are moved
-    beyond their range. The predicted distance is what is left after every model's parameters have been fitted to old
-    and new data together (linearised).
+    beyond their range or gathered in a third of it. Where none separates the models well, the best is asked for with
+    more samples. The predicted distance is what is left after every model's parameters have been fitted to old and new
+    data together (linearised).
     """
     if len(models) < 2:
         return None
     problem = models[0].found.problem
     options = _in_time(models[0].found) if problem.in_time else _static(problem.recording)
     best: Experiment | None = None
-    for description, recording, conditions in options:
-        distance = _separation(models, recording, noise)
-        if distance is not None and (best is None or distance > best.separation):
-            best = Experiment(description, distance, conditions)
+    for option in options:
+        best = _better(best, option, models, noise)
+    if best is not None and best.separation < ENOUGH:
+        best = _better(best, _denser(best, problem.recording), models, noise)
     return best
+
+
+def _better(best: Experiment | None, option: Option, models: Sequence[Model], noise: Noise) -> Experiment | None:
+    """The experiment with the larger predicted distance; the earlier one where it makes no difference."""
+    description, recording, conditions = option
+    distance = _separation(models, recording, noise)
+    if distance is None or (best is not None and distance < WORTH * best.separation):
+        return best
+    return Experiment(description, distance, conditions)
 
 
 def _separation(models: Sequence[Model], recording: Recording, noise: Noise) -> float | None:
@@ -101,8 +119,8 @@ def _value(found: Fitted, shared: dict[str, int], name: str) -> float:
     return float(torch.stack([found.values[i] for i in alike]).mean()) if alike else 0.0
 
 
-def _in_time(model: Fitted) -> list[tuple[str, Recording, dict[str, Any]]]:
-    found: list[tuple[str, Recording, dict[str, Any]]] = []
+def _in_time(model: Fitted) -> list[Option]:
+    found: list[Option] = []
     recording, bound = model.problem.recording, model.problem.simulator
     if not isinstance(bound, Trajectories) or recording.runs is None:
         return found
@@ -111,7 +129,7 @@ def _in_time(model: Fitted) -> list[tuple[str, Recording, dict[str, Any]]]:
     known = {
         name: float(states[0, 0, 0, i]) for i, name in enumerate(bound.ode.states) if name not in bound.ode.initial
     }
-    options: list[tuple[str, dict[str, float], float, float]] = []
+    options: list[tuple[str, dict[str, float], float, float]] = [("the first run again", known, 1.0, 1.0)]
     for factor in (2.0, 0.5, 3.0, -1.0):
         options.append(
             (
@@ -139,28 +157,52 @@ def _in_time(model: Fitted) -> list[tuple[str, Recording, dict[str, Any]]]:
         step = span / (len(first.time) - 1)
         time = torch.cat([first.time + k * (span + step) for k in range(copies)])
         inputs = {name: strength * values.repeat(copies) for name, values in first.inputs.items()}
-        blank = {name: torch.zeros(len(time), dtype=torch.float64) for name in recording.outputs}
-        run = Run(time=time, outputs=blank, inputs=inputs or None, initial=initial, hold=first.hold)
         conditions = {"time": time, "initial": initial, "inputs": inputs}
-        found.append((text, Recording(runs=[run]), conditions))
+        found.append((text, Recording(runs=[_run(recording, conditions)]), conditions))
     return found
 
 
-def _static(recording: Recording) -> list[tuple[str, Recording, dict[str, Any]]]:
-    found = []
+def _static(recording: Recording) -> list[Option]:
     x = recording.x if isinstance(recording.x, dict) else {"x": recording.x}
-    zeros = {name: torch.zeros(recording.n, dtype=torch.float64) for name in recording.outputs}
+    found: list[Option] = [("the same conditions again", _blank(recording, x), {"x": x})]
     for name, values in x.items():
         low, high = float(values.min()), float(values.max())
         width = high - low
-        for end, target in (("above", high + 0.5 * width), ("below", low - 0.5 * width)):
-            if low >= 0 > target:
-                continue
+        spans = [(f"above the recorded range, to {high + 0.5 * width:.4g}", high, high + 0.5 * width)]
+        below = low / 3 if 0 < low < 0.5 * width else low - 0.5 * width
+        if below >= 0 or low < 0:
+            spans.append((f"below the recorded range, to {below:.4g}", below, low))
+        cuts = values.quantile(torch.tensor([0.0, 1 / 3, 2 / 3, 1.0], dtype=values.dtype)).tolist()
+        spans += [(f"between {a:.4g} and {b:.4g}", a, b) for a, b in itertools.pairwise(cuts) if b > a]
+        for text, first, last in spans:
             moved = {k: v.clone() for k, v in x.items()}
-            moved[name] = torch.linspace(
-                *((high, target) if end == "above" else (target, low)), recording.n, dtype=torch.float64
-            )
-            given: Any = moved if isinstance(recording.x, dict) else moved["x"]
-            where = Recording(x=given, y=zeros)
-            found.append((f"conditions with {name} {end} the recorded range, to {target:.4g}", where, {"x": moved}))
+            moved[name] = torch.linspace(first, last, recording.n, dtype=torch.float64)
+            found.append((f"conditions with {name} {text}", _blank(recording, moved), {"x": moved}))
     return found
+
+
+def _blank(recording: Recording, x: dict[str, Tensor]) -> Recording:
+    n = len(next(iter(x.values())))
+    zeros = {name: torch.zeros(n, dtype=torch.float64) for name in recording.outputs}
+    return Recording(x=x if isinstance(recording.x, dict) else x["x"], y=zeros)
+
+
+def _denser(experiment: Experiment, recording: Recording) -> Option:
+    """The same with more samples: in time between the others, else of the same conditions."""
+    conditions = experiment.conditions
+    if "x" in conditions:
+        x = {name: values.repeat_interleave(DENSER) for name, values in conditions["x"].items()}
+        return f"{experiment.description}, each {DENSER} times", _blank(recording, x), {"x": x}
+    run = _run(recording, conditions)
+    place = torch.arange((len(run.time) - 1) * DENSER + 1, dtype=torch.float64) / DENSER
+    left = place.long().clamp(max=len(run.time) - 2)
+    time = run.time[left] + (place - left) * run.time.diff()[left]
+    dense = {"time": time, "initial": conditions["initial"], "inputs": run.inputs_at(time)}
+    text = f"{experiment.description}, sampled {DENSER} times as densely"
+    return text, Recording(runs=[_run(recording, dense)]), dense
+
+
+def _run(recording: Recording, conditions: Mapping[str, Any]) -> Run:
+    blank = {name: torch.zeros(len(conditions["time"]), dtype=torch.float64) for name in recording.outputs}
+    hold = recording.runs[0].hold if recording.runs else "linear"
+    return Run(outputs=blank, hold=hold, **{**conditions, "inputs": conditions["inputs"] or None})

@@ -1,0 +1,70 @@
+"""Experiments that are proposed where hypotheses are tied: which there are, and when more samples are asked for."""
+
+import pytest
+import torch
+
+import torchcal as tc
+from torchcal.discovery import experiment
+from torchcal.discovery.records import Experiment
+
+F64 = torch.float64
+
+
+@pytest.mark.parametrize("hold", ["linear", "zero"])
+def test_denser_samples_lie_between_the_others_and_inputs_hold_as_they_did(hold):
+    t = torch.tensor([0.0, 1.0, 3.0], dtype=F64)
+    u = torch.tensor([1.0, 3.0, 5.0], dtype=F64)
+    run = tc.Run(time=t, outputs={"x": torch.zeros(3, dtype=F64)}, inputs={"f": u}, hold=hold)
+    proposed = Experiment("a run", 1.0, {"time": t, "initial": {"x": 2.0}, "inputs": {"f": u}})
+    text, recording, conditions = experiment._denser(proposed, tc.Recording(runs=[run]))
+    assert text == "a run, sampled 4 times as densely"
+    wanted = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0], dtype=F64)
+    assert torch.equal(conditions["time"], wanted)
+    assert recording.runs[0].initial == {"x": 2.0}
+    between = [1.5, 2.0, 2.5] if hold == "linear" else [1.0, 1.0, 1.0]
+    assert conditions["inputs"]["f"][1:4].tolist() == between
+    assert torch.equal(conditions["inputs"]["f"][::4], u)
+
+
+def test_static_options_keep_to_what_they_say_and_to_positive_conditions():
+    x = {"dose": torch.logspace(-2, 2, 30, dtype=F64), "shift": torch.linspace(-1, 1, 30, dtype=F64)}
+    options = experiment._static(tc.Recording(x=x, y=torch.zeros(30, dtype=F64)))
+    texts = [text for text, _, _ in options]
+    assert texts[0] == "the same conditions again"
+    assert len(texts) == len(set(texts)) == 11
+    for text, recording, conditions in options:
+        assert recording.n == 30
+        assert bool((conditions["x"]["dose"] > 0).all())
+        if "dose above" in text:
+            assert float(conditions["x"]["dose"].min()) == pytest.approx(100.0)
+        if "dose below" in text:
+            assert float(conditions["x"]["dose"].max()) == pytest.approx(0.01)
+        if "shift below" in text:
+            assert float(conditions["x"]["shift"].min()) == pytest.approx(-2.0)
+
+
+def rivals():
+    """An offset and a signal in proportion to a small dose: apart only far below the doses recorded."""
+    base = tc.Simulator(
+        lambda x, p: p["top"] * x["dose"] / (1.0 + x["dose"]),
+        parameters=[tc.Parameter("top", low=0.1, high=5.0)],
+    )
+    offset = tc.Term("offset", outputs={"y": lambda x, p, y: y + p["b"]}, parameters=[tc.Parameter("b")])
+    steep = tc.Term(
+        "steep onset",
+        outputs={"y": lambda x, p, y: y + p["b"] * x["dose"] / (0.02 + x["dose"])},
+        parameters=[tc.Parameter("b")],
+    )
+    return base, [offset, steep]
+
+
+def test_the_condition_at_which_the_models_differ_is_proposed_and_more_samples_where_they_hardly_do():
+    base, terms = rivals()
+    g = torch.Generator().manual_seed(4)
+    dose = torch.logspace(-0.7, 2, 60, dtype=F64)
+    y = 2 * dose / (1 + dose) + 0.1 + 0.02 * torch.randn(60, generator=g, dtype=F64)
+    d = tc.diagnose(base, tc.Recording(x={"dose": dose}, y=y, noise=0.02), terms, seed=0, progress=False)
+    assert d.verdict == "ambiguous"
+    assert "dose below" in d.experiment.description
+    assert ("each 4 times" in d.experiment.description) == (len(d.experiment.conditions["x"]["dose"]) == 240)
+    assert d.experiment.separation > 0
