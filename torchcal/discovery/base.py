@@ -20,8 +20,17 @@ __all__ = ["calibrate_base"]
 SOLVER_SHARE = 0.05
 
 
-def calibrate_base(problem: Problem, fixed: Mapping[str, float], num_starts: int, seed: int) -> tuple[Fitted, Noise]:
+def calibrate_base(
+    problem: Problem, fixed: Mapping[str, float], num_starts: int, seed: int, *, clean: bool = False
+) -> tuple[Fitted, Noise]:
     """Fit the base, set outliers aside, estimate the noise, shorten the solver's steps where they matter.
+
+    Args:
+        problem: The data and the base.
+        fixed: Parameters that are held, by name.
+        num_starts: Starting values.
+        seed: Of these.
+        clean: Whether outliers are set aside already.
 
     Raises:
         ConvergenceError: If no starting value gives finite outputs.
@@ -42,7 +51,7 @@ def calibrate_base(problem: Problem, fixed: Mapping[str, float], num_starts: int
             f"{num_starts} (give initial= or bounds to the parameters)."
         )
     found = _sharpen(found)
-    if not exact:
+    if not exact and not clean:
         for _ in range(3):
             given = recording.noise if isinstance(recording.noise, Tensor) else None
             sd = given

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.fitting import Fitted
+from torchcal.discovery.local import is_window
 from torchcal.discovery.problem import Problem
 from torchcal.simulators import Trajectories
 
@@ -155,13 +156,13 @@ def definitions(bound: Trajectories, values: Tensor, states: Tensor) -> set[str]
 
 
 def channels(problem: Problem, found: Fitted) -> list[Channel]:
-    """Every equation that is no definition, every free parameter and every output."""
+    """Every equation that is no definition, every free parameter but those of windows, and every output."""
     list_: list[Channel] = []
     bound = problem.simulator
     names = [q.name for q in problem.parameters]
     if isinstance(bound, Trajectories):
         states = found.warm if found.warm is not None else bound.solve(found.values[None])
-        own = [i for i in found.free if names[i] not in bound.initial_names]
+        own = [i for i in found.free if names[i] not in bound.initial_names and not is_window(names[i])]
         size = len(bound.ode.states)
         _, _, by_parameter = bound._step_derivatives(found.values[None], states, own)
         kicks = torch.diag_embed(bound._h[..., None].expand(-1, -1, size))
@@ -187,6 +188,8 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
         at_data = problem.drivers_at_data(found.values[None], None)
         time = problem.order[problem.condition_of] if problem.order is not None else torch.arange(problem.n).double()
         for j, i in enumerate(found.free):
+            if is_window(names[i]):
+                continue
             list_.append(
                 Channel("parameter", names[i], problem.parameters[i].unit, at_data, time, found.jacobian[:, j])
             )

@@ -32,6 +32,8 @@ from torchcal.terms import Term, extend
 
 __all__ = ["diagnose"]
 
+#: How often everything is fitted again because other data turned out to be outliers.
+ROUNDS = 3
 #: Power of the stated detection limits.
 POWER = 0.95
 
@@ -118,18 +120,32 @@ def diagnose(
         search.calibrate_base()
         if holdout is None and mask is not None and _beyond_prediction(search, mask):
             mask = verify.within(recording)
-        search.screen_all()
-        detected = search.exact or search.p_detect < 1.0 - confidence
-        if terms:
-            search.refit_singles(detected=detected)
-            if detected:
-                refit_local(search)
-                if _wants_more(search):
-                    refit_several(search)
+        detected = _refit(search, confidence)
+        for _ in range(ROUNDS):
+            outliers = search.outliers() if detected else None
+            if outliers is None:
+                break
+            # Others than at the base, whose misfit hides them and looks like some.
+            search = dataclasses.replace(search, problem=problem.keeping(~outliers), clean=True)
+            search.calibrate_base()
+            detected = _refit(search, confidence)
+        if detected and terms and _wants_more(search):
+            refit_several(search)
         decision = decide(search, detected, mask)
         return _result(search, decision, simulator, recording, mask, confidence, begun, given, seed)
     finally:
         bar.close()
+
+
+def _refit(search: Search, confidence: float) -> bool:
+    """Screen and refit single terms, and local ones where there is more than noise, which is returned."""
+    search.screen_all()
+    detected = search.exact or search.p_detect < 1.0 - confidence
+    if search.terms:
+        search.refit_singles(detected=detected)
+        if detected:
+            refit_local(search)
+    return detected
 
 
 def _check(

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -10,18 +11,59 @@ from torch import Tensor
 from torchcal.simulators import Parameter
 from torchcal.terms import Term
 
-__all__ = ["EDGE", "WIDTHS", "beyond", "is_window", "localised", "region_text"]
+__all__ = ["EDGE", "WIDTHS", "Span", "beyond", "is_window", "localised", "region_text"]
 
 #: Width of a window's edges, as a share of the driver's range: wide enough for a fit to move them; and the limits
 #: between which it is fitted, from nearly a step.
 EDGE, WIDTHS = 0.02, (0.004, 0.1)
 
+#: Ratio of the ends of a positive driver's range from which on its windows are laid out in its logarithm.
+DECADES = 30.0
+
 _ENDS = {"from": "window from", "to": "window to"}
 _EDGE = "window edge"
 
 
+@dataclass(frozen=True)
+class Span:
+    """The range of a driver in a recording, on the scale that windows are laid out on.
+
+    Attributes:
+        low: Its lower end.
+        high: Its upper end.
+        log: Whether that scale is logarithmic.
+    """
+
+    low: float
+    high: float
+    log: bool
+
+    @classmethod
+    def of(cls, driver: Tensor) -> "Span":
+        """The range of values, on a logarithmic scale where they are positive and span decades."""
+        low, high = float(driver.min()), float(driver.max())
+        return cls(low, high, low > 0 and high > DECADES * low)
+
+    @property
+    def size(self) -> float:
+        """Of the range, on the scale."""
+        return math.log(self.high / self.low) if self.log else self.high - self.low
+
+    def distance(self, d: Any, end: Any) -> Any:
+        """From an end of a window to a value of the driver, on the scale."""
+        return torch.log(d / end) if self.log else d - end
+
+    def moved(self, value: float, by: float) -> float:
+        """A value of the driver some way off on the scale, within the range."""
+        if not math.isfinite(value):
+            return value
+        value = min(max(value, self.low), self.high)
+        found = value * math.exp(by) if self.log else value + by
+        return min(max(found, self.low), self.high)
+
+
 def localised(
-    term: Term, driver: str, low: float, high: float, span: tuple[float, float], *, static: bool, edge: bool = False
+    term: Term, driver: str, low: float, high: float, span: Span, *, static: bool, edge: bool = False
 ) -> Term:
     """The term multiplied by a window of a driver with smooth edges that are fitted with it.
 
@@ -37,8 +79,9 @@ def localised(
     ends = []
     for name, value in (("from", low), ("to", high)):
         if math.isfinite(value):
-            ends.append(Parameter(_ENDS[name], low=span[0], high=span[1], initial=min(max(value, span[0]), span[1])))
-    size = span[1] - span[0]
+            begin, scale = span.moved(value, 0.0), "log" if span.log else None
+            ends.append(Parameter(_ENDS[name], low=span.low, high=span.high, initial=begin, transform=scale))
+    size = span.size
     if edge:
         least, most = (share * size for share in WIDTHS)
         ends.append(Parameter(_EDGE, low=least, high=most, initial=EDGE * size, transform="log"))
@@ -47,9 +90,9 @@ def localised(
         width = p[_EDGE] if edge else EDGE * size
         w: Any = 1.0
         if math.isfinite(low):
-            w = w * torch.sigmoid((d - p[_ENDS["from"]]) / width)
+            w = w * torch.sigmoid(span.distance(d, p[_ENDS["from"]]) / width)
         if math.isfinite(high):
-            w = w * torch.sigmoid((p[_ENDS["to"]] - d) / width)
+            w = w * torch.sigmoid(-span.distance(d, p[_ENDS["to"]]) / width)
         return w
 
     def moving(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -88,11 +131,16 @@ def is_window(name: str) -> bool:
     return name.rsplit(".", 1)[-1] in (*_ENDS.values(), _EDGE)
 
 
-def beyond(name: str, low: float, high: float) -> float:
-    """A value of such a parameter, within these bounds, for a window that leaves nothing out."""
-    if name.endswith(_EDGE):
+def beyond(parameter: Parameter) -> float:
+    """A value of a window's parameter for a window that leaves nothing out; it has bounds."""
+    low, high = parameter.low or 0.0, parameter.high or 0.0
+    if parameter.name.endswith(_EDGE):
         return low
-    return low - (high - low) if name.endswith(_ENDS["from"]) else high + (high - low)
+    if parameter.transform == "log":
+        low, high = low * low / high, high * high / low
+    else:
+        low, high = 2 * low - high, 2 * high - low
+    return low if parameter.name.endswith(_ENDS["from"]) else high
 
 
 def region_text(driver: str, low: float, high: float) -> str:

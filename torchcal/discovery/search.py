@@ -1,5 +1,6 @@
 """Every surviving candidate is added and refitted with everything else; evidence and what is left decide."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -12,7 +13,7 @@ from torchcal.discovery.base import calibrate_base
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
 from torchcal.discovery.fitting import Fitted, refit, weighed
 from torchcal.discovery.local import region_text
-from torchcal.discovery.noise import Noise, estimate
+from torchcal.discovery.noise import Noise, estimate, spikes
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.refits import Refit, refit_all
 from torchcal.discovery.screen import Screening, Window, screen, windows
@@ -33,6 +34,8 @@ MOST = 40
 FEW, CHANCE = 6, 0.2
 #: Shares of the linear estimate from which refits begin.
 STEPS = (0.05, 1.0)
+#: Log evidence of a model from which on what sticks out of it alone are outliers, and how many these may be.
+CLEAR, MOST_OUTLIERS = 10.0, 0.1
 #: Share of the best log evidence below which a model is not fitted again when the noise estimate has changed.
 HOPELESS = 0.5
 #: Correlation of projected tangents above which two candidates are one.
@@ -100,6 +103,8 @@ class Search:
     max_terms: int
     tick: Callable[[str], None]
     executor: Executor | None = None
+    clean: bool = False
+    observed: Tensor = field(init=False)
     base: Fitted = field(init=False)
     noise: Noise = field(init=False)
     residual: Residual = field(init=False)
@@ -121,8 +126,9 @@ class Search:
         return self.problem.recording.noise == "none"
 
     def calibrate_base(self) -> None:
-        """Calibrate the base and estimate the noise."""
-        self.base, self.noise = calibrate_base(self.problem, self.fixed, self.num_starts, self.seed)
+        """Calibrate the base, set outliers aside unless that is done, and estimate the noise."""
+        self.observed = self.problem.keep
+        self.base, self.noise = calibrate_base(self.problem, self.fixed, self.num_starts, self.seed, clean=self.clean)
         self.problem = self.base.problem
 
     # --- screening --------------------------------------------------------------------------------------
@@ -351,6 +357,24 @@ class Search:
         self.residual = Residual(self.base, self.noise, seed=self.seed)
         self.screening = screen(self.residual, self.candidates)
         self.structure = analyse(self.residual, every=True)
+
+    def outliers(self) -> Tensor | None:
+        """Data that stick out alone once the best model explains the rest, bool ``(n_total,)``.
+
+        None where nothing explains enough to tell, or these are the ones that were set aside already.
+        """
+        best = max(self.models, key=lambda model: model.weight, default=None)
+        if self.exact or best is None or best.log_evidence < CLEAR:
+            return None
+        given = self.problem.recording.noise
+        whole = dataclasses.replace(best.found.problem, keep=self.observed)
+        found = refit(best.found, self.noise.whitening(whole), whole)  # what was set aside may be the effect itself
+        bad = spikes(whole, found.residual, given if isinstance(given, Tensor) else None)
+        outliers = torch.zeros_like(self.observed)
+        outliers[whole.index[bad]] = True
+        if torch.equal(self.observed & ~outliers, self.problem.keep) or float(bad.double().mean()) > MOST_OUTLIERS:
+            return None
+        return outliers
 
     # --- several terms ----------------------------------------------------------------------------------
 

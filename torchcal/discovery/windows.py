@@ -8,7 +8,7 @@ import torch
 
 from torchcal.discovery.candidates import prepare
 from torchcal.discovery.channels import responses
-from torchcal.discovery.local import EDGE, WIDTHS, beyond, is_window, localised
+from torchcal.discovery.local import EDGE, WIDTHS, Span, beyond, is_window, localised
 from torchcal.discovery.screen import Window, windows_of
 from torchcal.discovery.search import PRIOR, Model, Search
 from torchcal.discovery.structure import Residual
@@ -74,7 +74,10 @@ def _refine_edges(search: Search, prior: float) -> None:
         if model.window is None or model.log_evidence < least or search.examine(model).p_value >= PLAINLY_WHITE:
             continue
         w = dataclasses.replace(model.window, amplitude=_amplitude(search, model)[2])
-        other = refit_window(search, w, prior, model, edge=True)
+        span = Span.of(search._drivers()[w.driver])
+        scales = [span, dataclasses.replace(span, log=False)] if span.log else [span]
+        found = [refit_window(search, w, prior, model, edge=True, span=scale) for scale in scales]
+        other = max((one for one in found if one is not None), key=lambda one: one.weight, default=None)
         if other is not None and other.weight > model.weight:
             search.models[search.models.index(model)] = other
 
@@ -108,8 +111,7 @@ def _around(search: Search, model: Model) -> list[Window]:
     everywhere = found.values.clone()
     for i, name in enumerate(names):
         if is_window(name):
-            q = found.problem.parameters[i]
-            everywhere[i] = beyond(name, q.low or 0.0, q.high or 0.0)
+            everywhere[i] = beyond(found.problem.parameters[i])
     residual = Residual(found, search.noise, seed=search.seed, draws=10, without=own)
     bound = found.problem.simulator
     if isinstance(bound, Trajectories):
@@ -146,14 +148,19 @@ def _amplitude(search: Search, model: Model) -> tuple[int, str, float]:
 
 
 def refit_window(
-    search: Search, w: Window, prior: float, near: Model | None = None, *, edge: bool = False
+    search: Search,
+    w: Window,
+    prior: float,
+    near: Model | None = None,
+    *,
+    edge: bool = False,
+    span: Span | None = None,
 ) -> Model | None:
     """Base and one local term, begun at the window that the screening found, from the base or near a model of it."""
     plain = search.candidates[w.candidate]
-    driver = search._drivers()[w.driver]
-    span = (float(driver.min()), float(driver.max()))
+    span = span or Span.of(search._drivers()[w.driver])
     term = plain.terms[0]
-    if term.frees or not span[1] > span[0]:
+    if term.frees or not span.high > span.low:
         return None
     local = localised(term, w.driver, w.low, w.high, span, static=not search.problem.in_time, edge=edge)
     try:
@@ -172,14 +179,13 @@ def refit_window(
         values = dict(zip([q.name for q in near.found.problem.parameters], near.found.values.tolist(), strict=True))
     values[names[amplitude]] = float(plain.neutral[plain.own.index(amplitude)]) + size
     ends = {f"{term.name}.window from": w.low, f"{term.name}.window to": w.high}
-    width = span[1] - span[0]
-    shift = width * (FINE if edge else SHIFT)
+    shift = span.size * (FINE if edge else SHIFT)
     choices = []
     for q, start in zip(candidate.problem.parameters, candidate.begin.tolist(), strict=True):
         if q.name in ends:
-            choices.append([ends[q.name] + k * shift for k in (0.0, -1.0, 1.0)])
+            choices.append([span.moved(ends[q.name], k * shift) for k in (0.0, -1.0, 1.0)])
         elif is_window(q.name):
-            choices.append([share * width for share in (EDGE, *WIDTHS)])
+            choices.append([share * span.size for share in (EDGE, *WIDTHS)])
         else:
             choices.append([values.get(q.name, start)])
     begin = torch.tensor(list(itertools.product(*choices)), dtype=torch.float64)
@@ -196,7 +202,7 @@ def refit_window(
             low = float(model.found.values[i])
         elif name.endswith("window to"):
             high = float(model.found.values[i])
-    if high - low < SHORT * width:
+    if math.isfinite(low) and math.isfinite(high) and span.moved(low, SHORT * span.size) > high:
         return None
     model.window = dataclasses.replace(w, low=low, high=high)
     return model
