@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from typing import Any
 
+import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -121,12 +122,14 @@ def diagnose(
         if holdout is None and mask is not None and _beyond_prediction(search, mask):
             mask = verify.within(recording)
         detected = _refit(search, confidence)
+        seen = [search.problem.keep]
         for _ in range(ROUNDS):
             outliers = search.outliers() if detected else None
-            if outliers is None:
+            if outliers is None or any(torch.equal(keep, problem.keep & ~outliers) for keep in seen):
                 break
             # Others than at the base, whose misfit hides them and looks like some.
             search = dataclasses.replace(search, problem=problem.keeping(~outliers), clean=True)
+            seen.append(search.problem.keep)
             search.calibrate_base()
             detected = _refit(search, confidence)
         if detected and terms and _wants_more(search):

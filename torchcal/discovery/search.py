@@ -359,10 +359,8 @@ class Search:
         self.structure = analyse(self.residual, every=True)
 
     def outliers(self) -> Tensor | None:
-        """Data that stick out alone once the best model explains the rest, bool ``(n_total,)``.
-
-        None where nothing explains enough to tell, or these are the ones that were set aside already.
-        """
+        """Data that stick out alone once the best model explains the rest, bool ``(n_total,)``; None where nothing
+        explains enough to tell."""
         best = max(self.models, key=lambda model: model.weight, default=None)
         if self.exact or best is None or best.log_evidence < CLEAR:
             return None
@@ -372,9 +370,7 @@ class Search:
         bad = spikes(whole, found.residual, given if isinstance(given, Tensor) else None)
         outliers = torch.zeros_like(self.observed)
         outliers[whole.index[bad]] = True
-        if torch.equal(self.observed & ~outliers, self.problem.keep) or float(bad.double().mean()) > MOST_OUTLIERS:
-            return None
-        return outliers
+        return outliers if float(bad.double().mean()) <= MOST_OUTLIERS else None
 
     # --- several terms ----------------------------------------------------------------------------------
 

@@ -101,7 +101,7 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         return decision
     groups = _groups(ranked)
     white = [m for m in ranked[:6] if search.examine(m).p_value >= WHITE]
-    if not white or decision.none > 0.5:
+    if not white or decision.none > SURE:
         decision.verdict = "unexplained"
         _nearly(search, ranked, mask, decision)
         return decision
@@ -136,6 +136,8 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     if len(decision.tied) < 2:
         decision.tied, decision.tied_models = [], []
         _name(search, decision, best, mask)
+    elif decision.none > 1 - SURE:
+        decision.tied.append(list(NONE))
     return decision
 
 

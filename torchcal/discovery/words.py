@@ -158,15 +158,18 @@ def _named(d: Any) -> list[str]:
 
 
 def _ambiguous(d: Any) -> list[str]:
-    if tuple(d.tied[-1]) == NONE:
-        best = d.tied[0]
-        sure = sum(row.probability for row in d.ranking if set(best) <= set(row.terms))
+    unknown = sum(row.probability for row in d.ranking if row.terms == NONE)
+    known = [tied for tied in d.tied if tuple(tied) != NONE]
+    if len(known) == 1:
+        sure = sum(row.probability for row in d.ranking if set(known[0]) <= set(row.terms))
         return [
             _where(d),
-            f"{_and(best)}, the best explanation in the library, has a probability of {sure:.2f} only, which is too "
-            "little for a name: more data, or less noise, would tell.",
+            f"{_and(known[0])}, the best explanation in the library, has a probability of {sure:.2f} only, which is too"
+            f" little for a name, against {unknown:.2f} for something else: more data, or less noise, would tell.",
         ]
-    parts = [_where(d), f"{len(d.tied)} hypotheses explain it equally well and these data cannot tell them apart."]
+    parts = [_where(d), f"{len(known)} hypotheses explain it equally well and these data cannot tell them apart."]
+    if len(known) < len(d.tied):
+        parts.append(f"Nor can they exclude something that is not in the library (probability {unknown:.2f}).")
     if d.experiment is not None:
         parts.append(
             f"What would tell them apart: {d.experiment.description} (predicted distance "
