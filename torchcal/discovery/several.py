@@ -36,7 +36,8 @@ def refit_several(search: Search) -> None:
     prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))
     fitted = _refit_sets(search, [(pair, wanted[pair]) for pair in pairs], prior)
     search.models += fitted
-    search.reweigh()
+    if isinstance(search.problem.recording.noise, Tensor):  # else a smaller noise makes physics of any small misfit
+        search.reweigh()
     if search.max_terms < 3 or not fitted:
         return
     best = max(fitted, key=lambda m: m.weight)
