@@ -216,6 +216,11 @@ class Search:
             self._held_out[key] = (found, held_out_fit(found, self.noise, mask))
         return self._held_out[key][1]
 
+    def amplitude(self, column: int) -> int:
+        """Place of a screened column's amplitude among its candidate's parameters."""
+        candidate = self.candidates[int(self.screening.owner[column])]
+        return candidate.amplitudes[int(self.screening.amplitude[column])]
+
     def _drivers(self) -> dict[str, Tensor]:
         return self.base.problem.drivers(self.base.values[None], self.base.warm)
 

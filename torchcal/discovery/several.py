@@ -60,7 +60,7 @@ def _linear_pairs(search: Search) -> list[tuple[int, int]]:
     rest = (1 - c.square()).clamp_min(1e-6)
     size = (z[:, None] - c * z) / rest  # of the first of the two
     gain = (z[:, None].square() + z.square() - 2 * c * z[:, None] * z) / rest
-    sided = [search.candidates[int(owner[k])].one_sided(_amplitude(search, int(usable[k]))) for k in range(len(usable))]
+    sided = [search.candidates[int(owner[k])].one_sided(search.amplitude(int(usable[k]))) for k in range(len(usable))]
     sign = torch.tensor(sided, dtype=torch.float64)[:, None]
     allowed = sign * size >= 0
     allowed &= allowed.T & (c.abs() < NEARLY_SAME) & (owner[:, None] < owner)
@@ -74,12 +74,6 @@ def _linear_pairs(search: Search) -> list[tuple[int, int]]:
     return list(chosen.values())
 
 
-def _amplitude(search: Search, column: int) -> int:
-    """Place of a column's amplitude among its candidate's parameters."""
-    candidate = search.candidates[int(search.screening.owner[column])]
-    return candidate.amplitudes[int(search.screening.amplitude[column])]
-
-
 def _linear_row(search: Search, candidate: Candidate, columns: tuple[int, int]) -> Tensor:
     """Starting values of a pair: the linear estimate at the shapes of two columns, the base moved to make up for it."""
     screening = search.screening
@@ -91,7 +85,7 @@ def _linear_row(search: Search, candidate: Candidate, columns: tuple[int, int]) 
     effect = torch.zeros(search.base.problem.n, dtype=torch.float64)
     for column, size in zip(columns, sizes, strict=True):
         single = search.candidates[int(screening.owner[column])]
-        g, place = int(screening.shape[column]), _amplitude(search, column)
+        g, place = int(screening.shape[column]), search.amplitude(column)
         for i, value in zip(single.own, single.shapes[g].tolist(), strict=True):
             row[names.index(single.problem.parameters[i].name)] = value
         row[names.index(single.problem.parameters[place].name)] += float(size)

@@ -129,10 +129,11 @@ def _around(search: Search, model: Model) -> list[Window]:
     else:
         return []
     residual.e = residual.e + residual.tangent(value * acting[:, None])[:, 0]
-    sign = plain.one_sided(plain.amplitudes[int(search.screening.amplitude[column])])
+    sign = plain.one_sided(search.amplitude(column))
+    named = search._drivers()
     kept: dict[str, Window] = {}
     for w in sorted(windows_of(model.numbers[0], residual, response, drivers, sign)[0], key=lambda w: -w.z):
-        if w.driver in search._drivers() and w.driver not in kept and w.z > 3.5:
+        if w.driver in named and w.driver not in kept and w.z > 3.5:
             kept[w.driver] = w
     return list(kept.values())
 
@@ -140,8 +141,8 @@ def _around(search: Search, model: Model) -> list[Window]:
 def _amplitude(search: Search, model: Model) -> tuple[int, str, float]:
     """Of a model of one term: the place of its amplitude, its name, and how far it is from neutral."""
     plain = search.candidates[model.numbers[0]]
-    column = max(search.screening.best[model.numbers[0]], 0)
-    name = plain.problem.parameters[plain.amplitudes[int(search.screening.amplitude[column])]].name
+    column = search.screening.best[model.numbers[0]]  # local models come of candidates that have one
+    name = plain.problem.parameters[search.amplitude(column)].name
     place = [q.name for q in model.found.problem.parameters].index(name)
     neutral = model.candidate.neutral[model.candidate.own.index(place)]
     return place, name, float(model.found.values[place] - neutral)
@@ -168,7 +169,7 @@ def refit_window(
     except (SimulatorError, DomainError):
         return None
     column = search.screening.best[w.candidate]
-    amplitude = plain.amplitudes[int(search.screening.amplitude[column])]
+    amplitude = search.amplitude(column)
     names = [q.name for q in plain.problem.parameters]
     values = dict(zip([names[i] for i in plain.own], plain.shapes[int(search.screening.shape[column])].tolist(),
                       strict=True))  # fmt: skip
