@@ -147,7 +147,7 @@ def recalibrate(
         target: What to fit, ``(n,)``, outputs divided by their scales.
         scales: By output.
         start: First guess of the unknowns.
-        rng: For the other starts, which scatter by 20 %.
+        rng: For the other starts, which scatter by 20 % and by 5 % in turn.
         starts: Number of starts; the best end is returned.
         planted: Effects whose amplitudes are fitted too, from their values.
         weights: ``(n,)``, 0 leaves a datum out.
@@ -189,7 +189,8 @@ def recalibrate(
 
     best: Any = None
     for number in range(starts):
-        z0 = first if number == 0 else first + 0.2 * size * rng.standard_normal(len(first))
+        scatter = (0.05, 0.2)[number % 2] if number else 0.0
+        z0 = first + scatter * size * rng.standard_normal(len(first))
         inside = 1e-6 * size
         z0 = np.clip(z0, low + inside, high - inside)
         found = least_squares(
@@ -427,7 +428,7 @@ def make(index: int, seed: int, row: tuple[str, int, str, str], families: Sequen
             # Other starts only for what will be kept.
             theta = truth_vector(family, setting, parameters)
             target = stacked(family, setting, found.traces, found.scales)[0]
-            refit, residual = recalibrate(family, setting, target, found.scales, theta, rng, starts=3)
+            refit, residual = recalibrate(family, setting, target, found.scales, theta, rng, starts=6)
             rmse = float(np.sqrt(np.mean(residual**2)))
             if rmse < found.rmse * 0.999:
                 found = replace(found, refit=refit, residual=residual, rmse=rmse)

@@ -124,7 +124,7 @@ def diagnose(
         detected = _refit(search, confidence)
         seen = [search.problem.keep]
         for _ in range(ROUNDS):
-            outliers = search.outliers() if detected else None
+            outliers = search.outliers(problem.keep) if detected else None
             if outliers is None or any(torch.equal(keep, problem.keep & ~outliers) for keep in seen):
                 break
             # Others than at the base, whose misfit hides them and looks like some.

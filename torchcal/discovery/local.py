@@ -11,7 +11,7 @@ from torch import Tensor
 from torchcal.simulators import Parameter
 from torchcal.terms import Term
 
-__all__ = ["EDGE", "WIDTHS", "Span", "beyond", "is_window", "localised", "region_text"]
+__all__ = ["EDGE", "ENDS", "WIDTHS", "Span", "beyond", "is_window", "localised", "region_text"]
 
 #: Width of a window's edges, as a share of the driver's range: wide enough for a fit to move them; and the limits
 #: between which it is fitted, from nearly a step.
@@ -20,7 +20,8 @@ EDGE, WIDTHS = 0.02, (0.004, 0.1)
 #: Ratio of the ends of a positive driver's range from which on its windows are laid out in its logarithm.
 DECADES = 30.0
 
-_ENDS = {"from": "window from", "to": "window to"}
+#: Names of the parameters of a window's ends.
+ENDS = {"from": "window from", "to": "window to"}
 _EDGE = "window edge"
 
 
@@ -80,7 +81,7 @@ def localised(
     for name, value in (("from", low), ("to", high)):
         if math.isfinite(value):
             begin, scale = span.moved(value, 0.0), "log" if span.log else None
-            ends.append(Parameter(_ENDS[name], low=span.low, high=span.high, initial=begin, transform=scale))
+            ends.append(Parameter(ENDS[name], low=span.low, high=span.high, initial=begin, transform=scale))
     size = span.size
     if edge:
         least, most = (share * size for share in WIDTHS)
@@ -90,9 +91,9 @@ def localised(
         width = p[_EDGE] if edge else EDGE * size
         w: Any = 1.0
         if math.isfinite(low):
-            w = w * torch.sigmoid(span.distance(d, p[_ENDS["from"]]) / width)
+            w = w * torch.sigmoid(span.distance(d, p[ENDS["from"]]) / width)
         if math.isfinite(high):
-            w = w * torch.sigmoid(-span.distance(d, p[_ENDS["to"]]) / width)
+            w = w * torch.sigmoid(-span.distance(d, p[ENDS["to"]]) / width)
         return w
 
     def moving(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -128,7 +129,7 @@ def localised(
 
 def is_window(name: str) -> bool:
     """Whether a parameter is an end or the edge of a window, by its qualified name."""
-    return name.rsplit(".", 1)[-1] in (*_ENDS.values(), _EDGE)
+    return name.rsplit(".", 1)[-1] in (*ENDS.values(), _EDGE)
 
 
 def beyond(parameter: Parameter) -> float:
@@ -140,7 +141,7 @@ def beyond(parameter: Parameter) -> float:
         low, high = low * low / high, high * high / low
     else:
         low, high = 2 * low - high, 2 * high - low
-    return low if parameter.name.endswith(_ENDS["from"]) else high
+    return low if parameter.name.endswith(ENDS["from"]) else high
 
 
 def region_text(driver: str, low: float, high: float) -> str:

@@ -15,7 +15,7 @@ from torchcal.discovery.problem import Problem, Whitening
 from torchcal.discovery.records import NoiseModel
 from torchcal.errors import DomainError
 
-__all__ = ["Noise", "estimate", "smooth_columns", "spikes"]
+__all__ = ["GRID", "LEAST", "SHRINK", "Noise", "estimate", "least", "mine", "smooth_columns", "spikes"]
 
 #: AR(1) coefficients that are tried.
 GRID = torch.linspace(0.0, 0.95, 39, dtype=torch.float64)
@@ -27,6 +27,8 @@ SPIKE = 4.5
 BENT = 10.0
 #: Weight against correlation: log prior density of φ is −SHRINK·φ.
 SHRINK = 1.0
+#: Fewest data of an output whose noise may be correlated.
+LEAST = 40
 #: Quantile of its posterior at which a clear correlation is taken.
 CAUTION = 0.6
 #: Smallest noise sd that is estimated, in the output's spread.
@@ -47,6 +49,7 @@ class Noise:
         freedom: Degrees of freedom that the size was estimated with; infinite where it is known.
         posterior: Probability of each coefficient in `GRID`, by output, ``(outputs, grid)``.
         source: As in `NoiseModel`.
+        sizes: Noise sd at each coefficient in `GRID`, by output, ``(outputs, grid)``; of a known noise, in its sd.
         doubted: By how much the residual's fastest part exceeds the noise given, where that is a contradiction; else 1.
     """
 
@@ -55,8 +58,14 @@ class Noise:
     freedom: float
     posterior: Tensor
     source: str
+    sizes: Tensor
     doubted: float = 1.0
     step: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    @property
+    def open(self) -> bool:
+        """Whether its size is neither given nor known from replicates."""
+        return self.source == "estimated"
 
     def whitening(self, problem: Problem) -> Whitening:
         """Of a problem's residuals."""
@@ -128,9 +137,10 @@ def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor |
     correlation = torch.zeros(outputs, dtype=torch.float64)
     posterior = torch.zeros(outputs, len(GRID), dtype=torch.float64)
     posterior[:, 0] = 1.0
+    table = torch.ones(outputs, len(GRID), dtype=torch.float64)
     if isinstance(given, str):  # a detailed simulation: what counts is the misfit in units of the spread
         sd = recording.spread * 1e-3
-        return Noise(sd, correlation, math.inf, posterior, "none")
+        return Noise(sd, correlation, math.inf, posterior, "none", table)
     known = given if isinstance(given, Tensor) else torch.ones_like(recording.y)
     replicated = _pure_error(problem) if given is None else None
     sd = known.clone()
@@ -155,7 +165,7 @@ def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor |
                 f"Expected enough data to tell noise from misfit. Got {n} of output {recording.outputs[output]!r}. "
                 "Give noise= its standard deviation."
             )
-        correlated = n >= 40 and (replicated is None)
+        correlated = n >= LEAST and replicated is None
         logs, sizes = [], []
         for rho in GRID if correlated else GRID[:1]:
             square, log_det, count = 0.0, 0.0, 0
@@ -179,7 +189,8 @@ def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor |
             best = int((tail < CAUTION).sum())
         correlation[output] = GRID[best]
         scale = math.sqrt(sizes[best])
-        mask = torch.arange(len(recording.y)) // recording.n == output
+        mask = mine(problem, output)
+        table[output, : len(sizes)] = torch.tensor(sizes, dtype=torch.float64).sqrt()
         if given is None:
             if replicated is not None and replicated[1][output] >= 3:
                 sd[mask], freedom = replicated[0][output], min(freedom, float(replicated[1][output]))
@@ -187,14 +198,25 @@ def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor |
                 sd[mask], freedom = scale, min(freedom, usable)
         elif scale > EXCESS * (1 + 2 / math.sqrt(2 * usable)):
             doubted = max(doubted, scale)
-    if given is None:  # a perfect fit would leave no unit to measure anything in
-        sd = torch.maximum(sd, FLOOR * recording.spread)
     step = _quantisation(problem) if given is None else {}
-    for name, size in step.items():
-        mask = torch.arange(len(recording.y)) // recording.n == recording.outputs.index(name)
-        sd[mask] = sd[mask].clamp_min(size / math.sqrt(12.0))
+    if given is None:
+        sd = torch.maximum(sd, least(problem, step))
     source = "given" if isinstance(given, Tensor) else "replicates" if replicated is not None else "estimated"
-    return Noise(sd, correlation, freedom, posterior, source, doubted, step)
+    return Noise(sd, correlation, freedom, posterior, source, table, doubted, step)
+
+
+def mine(problem: Problem, output: int) -> Tensor:
+    """Which of all data are of an output, bool ``(n_total,)``."""
+    return torch.arange(len(problem.recording.y)) // problem.recording.n == output
+
+
+def least(problem: Problem, step: dict[str, float]) -> Tensor:
+    """Smallest noise sd of all data ``(n_total,)``: a perfect fit would leave no unit to measure anything in."""
+    sd = FLOOR * problem.recording.spread
+    for name, size in step.items():
+        mask = mine(problem, problem.recording.outputs.index(name))
+        sd[mask] = sd[mask].clamp_min(size / math.sqrt(12.0))
+    return sd
 
 
 def _decorrelate(values: Tensor, rho: Tensor) -> Tensor:

@@ -12,8 +12,9 @@ from torch import Tensor
 from torchcal.discovery.base import calibrate_base
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
 from torchcal.discovery.fitting import Fitted, refit, weighed
-from torchcal.discovery.local import region_text
-from torchcal.discovery.noise import Noise, estimate, spikes
+from torchcal.discovery.likeliest import alone, log_likelihood, settled, with_unknown
+from torchcal.discovery.local import is_window, region_text
+from torchcal.discovery.noise import Noise, spikes
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.refits import Refit, refit_all
 from torchcal.discovery.screen import Screening, Window, screen, windows
@@ -36,6 +37,10 @@ FEW, CHANCE = 6, 0.2
 STEPS = (0.05, 1.0)
 #: Log evidence of a model from which on what sticks out of it alone are outliers, and how many these may be.
 CLEAR, MOST_OUTLIERS = 10.0, 0.1
+#: Log evidence by which something unknown must explain the base's residual better than any noise, to be there.
+CLEARLY = 5.0
+#: Log odds from which on something unknown is clearly likelier than the best model.
+LIKELIER = 3.0
 #: Share of the best log evidence below which a model is not fitted again when the noise estimate has changed.
 HOPELESS = 0.5
 #: Correlation of projected tangents above which two candidates are one.
@@ -53,6 +58,7 @@ class Model:
         log_evidence: Against the base, penalties for parameters included.
         log_prior: Of the hypothesis.
         physical: Whether nothing lies on a bound that it wants to cross.
+        price: Log penalty for its parameters.
         note: What speaks against it.
         window: Where it acts, if locally.
         structure: What is left; filled in for the best.
@@ -64,6 +70,7 @@ class Model:
     log_evidence: float
     log_prior: float
     physical: bool
+    price: float = 0.0
     note: str = ""
     window: Window | None = None
     structure: Structure | None = None
@@ -104,7 +111,6 @@ class Search:
     tick: Callable[[str], None]
     executor: Executor | None = None
     clean: bool = False
-    observed: Tensor = field(init=False)
     base: Fitted = field(init=False)
     noise: Noise = field(init=False)
     residual: Residual = field(init=False)
@@ -118,6 +124,7 @@ class Search:
     gone: set[int] = field(init=False, default_factory=set)
     p_detect: float = field(init=False, default=1.0)
     least: Tensor = field(init=False)
+    _unknown: dict[int, tuple[Fitted, tuple[Noise, float]]] = field(init=False, default_factory=dict)
     _held_out: dict[tuple[int, bytes], tuple[Fitted, HeldOut | None]] = field(init=False, default_factory=dict)
 
     @property
@@ -127,9 +134,12 @@ class Search:
 
     def calibrate_base(self) -> None:
         """Calibrate the base, set outliers aside unless that is done, and estimate the noise."""
-        self.observed = self.problem.keep
         self.base, self.noise = calibrate_base(self.problem, self.fixed, self.num_starts, self.seed, clean=self.clean)
         self.problem = self.base.problem
+        if self.noise.open:
+            noise, evidence = self.with_unknown(self.base)
+            if evidence - settled(self.base, self.noise)[1] > CLEARLY:
+                self.noise, self.base = noise, refit(self.base, noise.whitening(self.problem))
 
     # --- screening --------------------------------------------------------------------------------------
 
@@ -310,8 +320,7 @@ class Search:
         stuck = [names[i] for i, at in zip(found.free, found.at_bound.tolist(), strict=True) if at]
         before = [q.name for q, at in zip([self.base.problem.parameters[i] for i in self.base.free],
                                           self.base.at_bound.tolist(), strict=True) if at]  # fmt: skip
-        edges = [name for name in stuck if "window" in name]
-        new = [name for name in stuck if name not in before and name not in edges]
+        new = [name for name in stuck if name not in before and not is_window(name)]
         amplitude = {names[i] for i in candidate.amplitudes}
         off = set()
         for i, at in zip(found.free, found.at_bound.tolist(), strict=True):
@@ -326,17 +335,16 @@ class Search:
             model.note = f"at its bound: {', '.join(new)}"
         else:
             model.note = ""
-        own = [i for i in candidate.own if names[i] not in off]
-        model.log_evidence = self._evidence(found.chi2, len(own)) + (UNPHYSICAL if new and not off else 0.0)
+        parameters = len([i for i in candidate.own if names[i] not in off])
+        model.price = -0.5 * parameters * math.log(self.problem.n) + (UNPHYSICAL if new and not off else 0.0)
+        model.log_evidence = self._gain(found.chi2) + model.price
         return model
 
-    def _evidence(self, chi2: float, parameters: int) -> float:
-        n = self.problem.n
+    def _gain(self, chi2: float) -> float:
         if self.exact:  # the size of the misfit is all that is known
             floor = 1e-12 * max(self.base.chi2, 1e-300)
-            gain = 0.5 * n * math.log(max(self.base.chi2, floor) / max(chi2, floor))
-            return gain - 0.5 * parameters * math.log(n)
-        return 0.5 * (self.base.chi2 - chi2) - 0.5 * parameters * math.log(n)
+            return 0.5 * self.problem.n * math.log(max(self.base.chi2, floor) / max(chi2, floor))
+        return 0.5 * (self.base.chi2 - chi2)
 
     def reweigh(self) -> None:
         """Estimate the noise again with the best model, and fit everything again where that changes it."""
@@ -345,8 +353,7 @@ class Search:
         best = max(self.models, key=lambda model: model.weight)
         if best.log_evidence < 3.0:
             return
-        given = self.problem.recording.noise
-        fresh = estimate(best.found.problem, best.found.residual, best.found.jacobian, given)
+        fresh = self._suited([m for m in self.models if m.log_evidence > HOPELESS * best.log_evidence])
         old = self.noise
         change = float((fresh.sd / old.sd).log().abs().max()) + float((fresh.correlation - old.correlation).abs().max())
         if change < 0.05:
@@ -363,17 +370,49 @@ class Search:
         self.screening = screen(self.residual, self.candidates)
         self.structure = analyse(self.residual, every=True)
 
-    def outliers(self) -> Tensor | None:
+    def _suited(self, models: Sequence[Model]) -> Noise:
+        """The noise of the likeliest hypothesis, each with its own: of these models, or of something unknown where that
+        is clearly likelier."""
+        own = {id(m): alone(m.found, self.noise) for m in models}
+        best = max(models, key=lambda m: own[id(m)][1] + self._prior(m))
+        noise, value = settled(best.found, self.noise)
+        value += self._prior(best) + LIKELIER
+        for found, prior in ((self.base, 0.0), (best.found, self._prior(best))):
+            other, evidence = self.with_unknown(found)
+            if evidence + prior + math.log(PRIOR["none"]) > value:
+                noise, value = other, evidence + prior + math.log(PRIOR["none"])
+        return noise
+
+    def with_unknown(self, found: Fitted) -> tuple[Noise, float]:
+        """Noise and log evidence of something unknown beside a fit; computed once."""
+        if id(found) not in self._unknown:  # the fit is kept beside it, so that its id stays its own
+            self._unknown[id(found)] = found, with_unknown(found, self.problem.recording.noise)
+        return self._unknown[id(found)][1]
+
+    def _prior(self, model: Model) -> float:
+        """Log prior of a model with the price of its parameters."""
+        return model.log_prior + model.price
+
+    def apart(self) -> tuple[float, float]:
+        """Log evidence of the base and of something unknown, each with its own noise, against the base here."""
+        here = log_likelihood(self.base, self.noise)
+        best = max(self.models, key=lambda model: model.weight, default=None)
+        unknown = [self.with_unknown(self.base)[1]]
+        if best is not None:
+            unknown.append(self.with_unknown(best.found)[1] + self._prior(best))
+        return max(settled(self.base, self.noise)[1] - here, 0.0), max(unknown) - here
+
+    def outliers(self, observed: Tensor) -> Tensor | None:
         """Data that stick out alone once the best model explains the rest, bool ``(n_total,)``; None where nothing
-        explains enough to tell."""
+        explains enough to tell. All ``observed`` data are judged, those that are set aside too."""
         best = max(self.models, key=lambda model: model.weight, default=None)
         if self.exact or best is None or best.log_evidence < CLEAR:
             return None
         given = self.problem.recording.noise
-        whole = dataclasses.replace(best.found.problem, keep=self.observed)
+        whole = dataclasses.replace(best.found.problem, keep=observed)
         found = refit(best.found, self.noise.whitening(whole), whole)  # what was set aside may be the effect itself
         bad = spikes(whole, found.residual, given if isinstance(given, Tensor) else None)
-        outliers = torch.zeros_like(self.observed)
+        outliers = torch.zeros_like(observed)
         outliers[whole.index[bad]] = True
         return outliers if float(bad.double().mean()) <= MOST_OUTLIERS else None
 

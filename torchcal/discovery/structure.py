@@ -5,7 +5,7 @@ every channel against every driver. Probabilities come from simulated noise that
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,14 +13,15 @@ from torch import Tensor
 
 from torchcal.discovery.channels import Channel, channels
 from torchcal.discovery.fitting import Fitted
+from torchcal.discovery.local import Span
 from torchcal.discovery.noise import GRID, Noise
 
-__all__ = ["Place", "Residual", "Structure", "analyse"]
+__all__ = ["Place", "Residual", "Structure", "analyse", "evidences"]
 
 #: Radial functions along time, and along any other driver: the evidence chooses how many.
 IN_TIME, ALONG = (12, 24, 48), (12, 24)
 #: Of more functions than the fewest, how many data there must be for each.
-DATA_EACH = 4
+DATA_EACH = 3
 #: Singular values below this share of the largest are none.
 SMALL = 1e-6
 #: Sizes of an unknown change that are tried, in noise sd.
@@ -75,6 +76,8 @@ def _noise_draws(found: Fitted, noise: Noise, draws: int, seed: int) -> Tensor:
     """Whitened noise ``(n, draws)``, as uncertain in size and correlation as the noise model is."""
     generator = torch.Generator().manual_seed(seed + 7919)
     problem, w = found.problem, found.whitening
+    if not draws:
+        return torch.zeros(problem.n, 0, dtype=torch.float64)
     e = torch.randn(problem.n, draws, generator=generator, dtype=torch.float64)
     if bool((noise.posterior[:, 1:].sum(1) > 1e-3).any()):
         groups = 20
@@ -140,7 +143,9 @@ class Structure:
 
 
 def _features(driver: Tensor, count: int) -> Tensor:
-    """Radial functions ``(K, count)`` that sum to smooth curves along a driver."""
+    """Radial functions ``(K, count)`` that sum to smooth curves along a driver, or along its logarithm over decades."""
+    if Span.of(driver).log:
+        driver = driver.log()
     low, high = float(driver.min()), float(driver.max())
     centres = torch.linspace(low, high, count, dtype=torch.float64)
     width = 1.2 * (high - low) / (count - 1)
@@ -207,22 +212,21 @@ class _Change:
         )  # fmt: skip
 
 
-def analyse(residual: Residual, *, every: bool = False) -> Structure:
-    """Look for smooth changes of every channel against every driver.
+def evidences(residual: Residual, available: Sequence[Channel]) -> list[float]:
+    """Log evidence for a smooth change of each of some channels against each of its drivers."""
+    found: dict[tuple[str, str, str], float] = {}
+    for channel, name, change in _changes(residual, available, residual.e[:, None]):
+        key = channel.kind, channel.target, name
+        found[key] = max(found.get(key, -math.inf), float(_evidence(change.along[:, None], change.s)[0]))
+    return list(found.values())
 
-    Args:
-        residual: The fit's.
-        every: Also look at channels of kinds that do not count for the test, for the report.
-    """
+
+def _changes(
+    residual: Residual, available: Sequence[Channel], residuals: Tensor
+) -> Iterator[tuple[Channel, str, _Change]]:
+    """Changes of every channel along every driver, with fewer and with more functions."""
     found = residual.found
-    available = channels(found.problem, found)
-    kinds = found.problem.kinds
-    chosen = [c for c in available if every or c.kind in kinds]
-    places: list[Place] = []
-    nulls: list[Tensor] = []
-    excess = max(residual.excess, 1e-300)
-    both = torch.cat([residual.e[:, None], residual.null], dim=1)
-    for channel in chosen:
+    for channel in available:
         data = found.problem.n if channel.kind != "output" else int((channel.matrix != 0).sum())
         most = max(ALONG[0], data // DATA_EACH)
         for name, driver in channel.drivers.items():
@@ -237,26 +241,40 @@ def analyse(residual: Residual, *, every: bool = False) -> Structure:
             if not bool(torch.isfinite(columns).all()):
                 continue
             sizes = [part.shape[1] for part in parts]
-            best: Place | None = None
-            null: Tensor | None = None
             for features, block, whole in zip(parts, columns.split(sizes, 1), responses.split(sizes, 1), strict=True):
-                change = _Change.of(features, block, 1e-9 * float(whole.norm()), both)
-                if change is None:
-                    continue
-                place = change.place(channel, name, residual, excess)
-                if best is None or place.evidence > best.evidence:
-                    best = place
-                if channel.kind in kinds:
-                    simulated = _evidence(change.null, change.s)[0]
-                    null = simulated if null is None else torch.maximum(null, simulated)
-            if best is not None:
-                places.append(best)
-            if null is not None:
-                nulls.append(null)
+                change = _Change.of(features, block, 1e-9 * float(whole.norm()), residuals)
+                if change is not None:
+                    yield channel, name, change
+
+
+def analyse(residual: Residual, *, every: bool = False) -> Structure:
+    """Look for smooth changes of every channel against every driver.
+
+    Args:
+        residual: The fit's.
+        every: Also look at channels of kinds that do not count for the test, for the report.
+    """
+    found = residual.found
+    available = channels(found.problem, found)
+    kinds = found.problem.kinds
+    chosen = [c for c in available if every or c.kind in kinds]
+    best: dict[tuple[str, str, str], Place] = {}
+    nulls: dict[tuple[str, str, str], Tensor] = {}
+    excess = max(residual.excess, 1e-300)
+    both = torch.cat([residual.e[:, None], residual.null], dim=1)
+    for channel, name, change in _changes(residual, chosen, both):
+        key = channel.kind, channel.target, name
+        place = change.place(channel, name, residual, excess)
+        if key not in best or place.evidence > best[key].evidence:
+            best[key] = place
+        if channel.kind in kinds:
+            simulated = _evidence(change.null, change.s)[0]
+            nulls[key] = torch.maximum(nulls[key], simulated) if key in nulls else simulated
+    places = list(best.values())
     places.sort(key=lambda place: -place.evidence)
     if not nulls:
         return Structure(places, 1.0, available, torch.zeros(1, dtype=torch.float64))
-    null = torch.stack(nulls).amax(0)
+    null = torch.stack(list(nulls.values())).amax(0)
     seen = max((p.evidence for p in places if p.channel.kind in kinds), default=0.0)
     p_value = (1.0 + float((null >= seen).sum())) / (1.0 + len(null))
     return Structure(places, p_value, available, null)

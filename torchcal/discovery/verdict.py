@@ -42,7 +42,8 @@ class Decision:
         probability: Of every model, by its ``id``.
         none: Probability of something that is not in the library.
         base: Probability of the base alone.
-        none_evidence: Log weight of the former.
+        base_evidence: Log evidence of the base with the noise that suits it, against the base with the noise chosen.
+        none_evidence: Log weight of something that is not in the library.
         withdrawn: Why a name was withdrawn, in words.
         nearly: Whether what is left is not white, and the name rests on the share of the misfit that it removes.
     """
@@ -55,6 +56,7 @@ class Decision:
         self.probability: dict[int, float] = {}
         self.none = 0.0
         self.base = 1.0
+        self.base_evidence = 0.0
         self.none_evidence = 0.0
         self.withdrawn = ""
         self.nearly = False
@@ -94,7 +96,11 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     ranked = sorted((m for m in search.models if m.physical), key=lambda m: -m.weight)
     if search.exact:
         return _decide_exact(search, ranked, mask, decision)
-    decision.none_evidence = _none_evidence(search, ranked) if detected else math.log(PRIOR["none"])
+    if detected:
+        decision.base_evidence, unknown = search.apart()
+        decision.none_evidence = max(_none_evidence(search, ranked), unknown + math.log(PRIOR["none"]))
+    else:
+        decision.none_evidence = math.log(PRIOR["none"])
     _weigh(search, decision)
     if not detected or decision.base >= max(decision.none, *decision.probability.values(), 0.0):
         decision.verdict = "consistent"
@@ -123,7 +129,7 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
             continue
         if covered >= TIED and seen:
             break
-        if seen and model.weight < math.log(PRIOR["base"]):
+        if seen and model.weight < math.log(PRIOR["base"]) + decision.base_evidence:
             break  # no better than the base is no explanation
         seen.add(names)
         covered += groups[names]
@@ -221,7 +227,7 @@ def _weigh(search: Search, decision: Decision, models: Sequence[Model] | None = 
     """Probabilities of all hypotheses (or of some of them alone), "none of these" among them."""
     models = search.models if models is None else models
     weights = [m.weight for m in models]
-    base = math.log(PRIOR["base"])
+    base = math.log(PRIOR["base"]) + decision.base_evidence
     top = max([*weights, base, decision.none_evidence])
     total = sum(math.exp(w - top) for w in [*weights, base, decision.none_evidence])
     decision.probability = {id(m): math.exp(m.weight - top) / total for m in models}

@@ -8,7 +8,7 @@ import torch
 
 from torchcal.discovery.candidates import prepare
 from torchcal.discovery.channels import responses
-from torchcal.discovery.local import EDGE, WIDTHS, Span, beyond, is_window, localised
+from torchcal.discovery.local import EDGE, ENDS, WIDTHS, Span, beyond, is_window, localised
 from torchcal.discovery.screen import Window, windows_of
 from torchcal.discovery.search import PRIOR, Model, Search
 from torchcal.discovery.structure import Residual
@@ -99,7 +99,8 @@ def _around(search: Search, model: Model) -> list[Window]:
     At the base a strong effect is far from linear; here only its range is still wrong.
     """
     found, term = model.found, model.candidate.terms[0]
-    if term.states or term.frees or term.outputs:
+    bound = found.problem.simulator
+    if term.states or term.frees or (term.outputs and isinstance(bound, Trajectories)):
         return []
     column = search.screening.best[model.numbers[0]]
     if column < 0:
@@ -113,7 +114,6 @@ def _around(search: Search, model: Model) -> list[Window]:
         if is_window(name):
             everywhere[i] = beyond(found.problem.parameters[i])
     residual = Residual(found, search.noise, seed=search.seed, draws=10, without=own)
-    bound = found.problem.simulator
     if isinstance(bound, Trajectories):
         with torch.no_grad():
             forcing, present = (
@@ -179,7 +179,7 @@ def refit_window(
     else:
         values = dict(zip([q.name for q in near.found.problem.parameters], near.found.values.tolist(), strict=True))
     values[names[amplitude]] = float(plain.neutral[plain.own.index(amplitude)]) + size
-    ends = {f"{term.name}.window from": w.low, f"{term.name}.window to": w.high}
+    ends = {f"{term.name}.{ENDS['from']}": w.low, f"{term.name}.{ENDS['to']}": w.high}
     shift = span.size * (FINE if edge else SHIFT)
     choices = []
     for q, start in zip(candidate.problem.parameters, candidate.begin.tolist(), strict=True):
@@ -199,9 +199,9 @@ def refit_window(
     low, high = w.low, w.high
     for i in candidate.own:
         name = candidate.problem.parameters[i].name
-        if name.endswith("window from"):
+        if name.endswith(ENDS["from"]):
             low = float(model.found.values[i])
-        elif name.endswith("window to"):
+        elif name.endswith(ENDS["to"]):
             high = float(model.found.values[i])
     if math.isfinite(low) and math.isfinite(high) and span.moved(low, SHORT * span.size) > high:
         return None

@@ -11,6 +11,7 @@ from torch.autograd import forward_ad
 
 from torchcal.data import Recording
 from torchcal.errors import DomainError, ShapeError, SimulatorError
+from torchcal.simulators.dual import Still, still
 from torchcal.simulators.parameter import Parameter
 
 __all__ = ["Conditions", "Linearisation", "Simulator", "check_parameters"]
@@ -51,12 +52,6 @@ def check_parameters(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
     if twice:
         raise DomainError(f"Expected every parameter named once. Got {twice} more than once in {names}.")
     return parameters
-
-
-def still(value: Tensor) -> Tensor:
-    """A tensor with a tangent of zeros, inside a dual level: PyTorch's implicit zeros are many times slower."""
-    value = value.contiguous()
-    return forward_ad.make_dual(value, torch.zeros_like(value))
 
 
 class Simulator:
@@ -165,7 +160,7 @@ class Simulator:
         tangent = values.new_zeros(len(columns), *values.shape)
         for j, column in enumerate(columns):
             tangent[j, ..., column] = 1.0
-        with _DUAL, torch.no_grad(), forward_ad.dual_level():
+        with _DUAL, torch.no_grad(), forward_ad.dual_level(), Still():
             dual = forward_ad.make_dual(values.expand(len(columns), *values.shape).contiguous(), tangent)
             fixed = {k: still(v) for k, v in x.items()} if isinstance(x, Mapping) else still(x)
             found = forward_ad.unpack_dual(self.at(fixed, outputs)(dual))
