@@ -13,7 +13,7 @@ from torchcal.discovery.base import calibrate_base
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
 from torchcal.discovery.fitting import Fitted, refit, weighed
 from torchcal.discovery.likeliest import alone, log_likelihood, settled, with_unknown
-from torchcal.discovery.local import is_window, region_text
+from torchcal.discovery.local import ENDS, is_window, region_text
 from torchcal.discovery.noise import Noise, spikes
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.refits import Refit, refit_all
@@ -314,9 +314,15 @@ class Search:
         ]  # fmt: skip
 
     def _judge(self, model: Model) -> Model:
-        """Evidence, bounds and what speaks against it."""
+        """Evidence, bounds, where it acts and what speaks against it."""
         found, candidate = model.found, model.candidate
         names = [q.name for q in candidate.problem.parameters]
+        if model.window is not None:
+            low, high = model.window.low, model.window.high
+            for i in candidate.own:
+                low = float(found.values[i]) if names[i].endswith(ENDS["from"]) else low
+                high = float(found.values[i]) if names[i].endswith(ENDS["to"]) else high
+            model.window = dataclasses.replace(model.window, low=low, high=high)
         stuck = [names[i] for i, at in zip(found.free, found.at_bound.tolist(), strict=True) if at]
         before = [q.name for q, at in zip([self.base.problem.parameters[i] for i in self.base.free],
                                           self.base.at_bound.tolist(), strict=True) if at]  # fmt: skip

@@ -20,8 +20,8 @@ __all__ = ["Place", "Residual", "Structure", "analyse", "evidences"]
 
 #: Radial functions along time, and along any other driver: the evidence chooses how many.
 IN_TIME, ALONG = (12, 24, 48), (12, 24)
-#: Of more functions than the fewest, how many data there must be for each.
-DATA_EACH = 3
+#: Of more functions than the fewest, how many data there must be for each, in time and among conditions.
+DATA_EACH = (4, 3)
 #: Singular values below this share of the largest are none.
 SMALL = 1e-6
 #: Sizes of an unknown change that are tried, in noise sd.
@@ -143,9 +143,7 @@ class Structure:
 
 
 def _features(driver: Tensor, count: int) -> Tensor:
-    """Radial functions ``(K, count)`` that sum to smooth curves along a driver, or along its logarithm over decades."""
-    if Span.of(driver).log:
-        driver = driver.log()
+    """Radial functions ``(K, count)`` that sum to smooth curves along a driver."""
     low, high = float(driver.min()), float(driver.max())
     centres = torch.linspace(low, high, count, dtype=torch.float64)
     width = 1.2 * (high - low) / (count - 1)
@@ -224,18 +222,19 @@ def evidences(residual: Residual, available: Sequence[Channel]) -> list[float]:
 def _changes(
     residual: Residual, available: Sequence[Channel], residuals: Tensor
 ) -> Iterator[tuple[Channel, str, _Change]]:
-    """Changes of every channel along every driver, with fewer and with more functions."""
+    """Changes of every channel along every driver, and its logarithm over decades, with fewer and more functions."""
     found = residual.found
     for channel in available:
         data = found.problem.n if channel.kind != "output" else int((channel.matrix != 0).sum())
-        most = max(ALONG[0], data // DATA_EACH)
+        most = max(ALONG[0], data // DATA_EACH[0 if found.problem.in_time else 1])
         for name, driver in channel.drivers.items():
             distinct = len(driver.unique())
             tried = IN_TIME if name == "t" else ALONG
             counts = dict.fromkeys(min(count, distinct) for count in tried if count <= most)
             if distinct < 2:
                 continue
-            parts = [_features(driver, count) for count in counts]
+            scales = [driver, driver.log()] if name != "t" and Span.of(driver).log else [driver]
+            parts = [_features(scale, count) for scale in scales for count in counts]
             responses = found.whitening(channel.response(torch.cat(parts, dim=1)))
             columns = residual.project(responses)
             if not bool(torch.isfinite(columns).all()):

@@ -194,16 +194,9 @@ def refit_window(
     model = search._refit(
         (w.candidate,), candidate, begin, prior - math.log(3.0 * len(search._drivers())), window=w
     )
-    if model is None:
+    if model is None or model.window is None:
         return None
-    low, high = w.low, w.high
-    for i in candidate.own:
-        name = candidate.problem.parameters[i].name
-        if name.endswith(ENDS["from"]):
-            low = float(model.found.values[i])
-        elif name.endswith(ENDS["to"]):
-            high = float(model.found.values[i])
+    low, high = model.window.low, model.window.high
     if math.isfinite(low) and math.isfinite(high) and span.moved(low, SHORT * span.size) > high:
         return None
-    model.window = dataclasses.replace(w, low=low, high=high)
     return model
