@@ -9,7 +9,7 @@ import torch
 from torchcal.errors import ConvergenceError
 from torchcal.inference import diagnostics, hmc_step, nuts_step
 from torchcal.inference.batched import run_batched
-from torchcal.inference.coordinates import Laplace, Whitened
+from torchcal.inference.coordinates import Laplace, Whitened, gathered
 from torchcal.priors import Bounds
 
 stats = pytest.importorskip("scipy.stats")
@@ -296,3 +296,62 @@ def test_the_trajectory_length_is_that_of_the_density():
     assert 0.5 * hmc_step.QUARTER <= white <= 1.5 * hmc_step.QUARTER
     wide = length(torch.diag(torch.tensor([1, 1, 1, 1, 4], dtype=torch.float64)))
     assert wide > white
+
+
+# --- starting points at bent ridges -------------------------------------------------------------------------
+
+
+def bent(u):
+    """A ridge of width 0.05 along a parabola: its normal approximation at (0, 0) knows nothing of the bend."""
+    along, off = u[..., 0], u[..., 1] - u[..., 0].square()
+    return -0.5 * along.square() - 0.5 * (off / 0.05).square() - 0.5 * u[..., 2:].square().sum(-1)
+
+
+def test_starting_points_far_up_the_slopes_are_gathered():
+    space = Whitened(bent, torch.zeros(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64))
+    generator = torch.Generator().manual_seed(0)
+    z = torch.randn(64, 3, dtype=torch.float64, generator=generator)
+    groups, lowest = torch.zeros(64, dtype=torch.long), torch.zeros(64, dtype=torch.float64)
+    assert float(space.height(z).median()) > 100
+    other, there = gathered(space, z, groups, lowest, generator)
+    # Half a chi-square of three: its median is 1.2, and 99 % lie below 5.7. The points need not have settled.
+    assert float(other.height(there).median()) < 4
+    assert float((other.height(there) < 15).double().mean()) > 0.9
+    torch.testing.assert_close(other.height(there), space.height(space.inner(other.outer(there))))
+
+
+def test_starting_points_of_a_good_approximation_stay():
+    unit = torch.zeros(5, dtype=torch.float64), torch.eye(5, dtype=torch.float64)
+    space = Whitened(lambda u: -0.5 * u.square().sum(-1), *unit)
+    generator = torch.Generator().manual_seed(0)
+    z = torch.randn(64, 5, dtype=torch.float64, generator=generator)
+    same = gathered(space, z, torch.zeros(64, dtype=torch.long), torch.zeros(64, dtype=torch.float64), generator)
+    assert same[0] is space
+    assert same[1] is z
+
+
+def test_gathering_keeps_a_distribution_and_the_modes_apart():
+    def two(u):
+        return torch.logaddexp(-0.5 * (u - 50).square().sum(-1), -0.5 * (u + 50).square().sum(-1))
+
+    space = Whitened(two, torch.zeros(2, dtype=torch.float64), torch.eye(2, dtype=torch.float64))
+    generator = torch.Generator().manual_seed(1)
+    groups = torch.arange(400) % 2
+    z = torch.randn(400, 2, dtype=torch.float64, generator=generator) + torch.where(groups == 0, 50.0, -50.0)[:, None]
+    z[:60] += 30.0  # enough far ones that all are moved
+    other, there = gathered(space, z, groups, torch.zeros(400, dtype=torch.float64), generator)
+    u = other.outer(there)
+    assert bool(((u.mean(1) > 0) == (groups == 0)).all())
+    spread = u - torch.where(groups == 0, 50.0, -50.0)[:, None]
+    p = stats.kstest(spread.flatten().numpy(), stats.norm.cdf).pvalue
+    assert p > 1e-3
+
+
+def test_a_bent_ridge_is_sampled_right_from_a_bad_approximation():
+    wide = torch.diag(torch.tensor([1.0, 0.5, 1.0], dtype=torch.float64))
+    draws = run(bent, 3, scale_tril=wide, kernel="hmc", num_samples=150).alpha
+    along, across = draws[:, :, 0], (draws[:, :, 1] - draws[:, :, 0].square()) / 0.05
+    error = 5 / math.sqrt(float(diagnostics.figures(draws).ess_bulk.min()))
+    assert float(along.mean()) == pytest.approx(0.0, abs=error)
+    assert float(along.var()) == pytest.approx(1.0, abs=2 * error)
+    assert float(across.var()) == pytest.approx(1.0, abs=0.15)

@@ -12,7 +12,7 @@ from tqdm.auto import tqdm
 
 from torchcal.errors import ConvergenceError, ConvergenceWarning
 from torchcal.inference import hmc_step, nuts_step
-from torchcal.inference.coordinates import Laplace, Whitened, starting_points
+from torchcal.inference.coordinates import Laplace, Whitened, gathered, starting_points
 from torchcal.inference.draws import Draws, most_divergences
 from torchcal.inference.nuts_step import Outcome
 from torchcal.priors import Bounds
@@ -198,6 +198,8 @@ def run_batched(
     try:
         space = Whitened(log_density, loc, modes[0].scale_tril)
         z, groups = starting_points(space, modes, crowd, generator)
+        lowest = space.height(space.inner(torch.stack([mode.loc for mode in modes])))[groups]
+        space, z = gathered(space, z, groups, lowest, generator)
         space, z, averaging = _warm_up(moves, space, z, groups, num_warmup, target_accept, bar)
         owners = groups[:num_chains]
         for repeat in range(_REPEATS + 1):

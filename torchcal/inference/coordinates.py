@@ -8,7 +8,13 @@ from torch import Tensor
 
 from torchcal.errors import ConvergenceError
 
-__all__ = ["Laplace", "Whitened", "dealt_out", "group_means", "starting_points"]
+__all__ = ["Laplace", "Whitened", "dealt_out", "gathered", "group_means", "starting_points"]
+
+#: Times the height that it would have in a normal density above which a starting point is far from its mode; and the
+#: share of such points above which they are gathered first.
+FAR, MANY = 3.0, 0.1
+#: Moves of every point between two looks at their heights, and looks at most.
+MOVES, LOOKS = 20, 20
 
 
 @dataclass(frozen=True)
@@ -47,6 +53,12 @@ class Whitened:
         good = torch.isfinite(energy + slope.sum(-1))  # which is not finite where any of them is not
         return torch.where(good, energy, torch.inf), torch.where(good[:, None], slope, 0.0)
 
+    def height(self, z: Tensor) -> Tensor:
+        """Negative log-density ``(C,)`` alone; +inf where it is not finite."""
+        with torch.no_grad():
+            value = -self.log_density(self.outer(z))
+        return torch.where(torch.isfinite(value), value, torch.inf)
+
     def outer(self, z: Tensor) -> Tensor:
         """u of z."""
         return torch.addmm(self.loc, z, self.scale_tril.T) if z.ndim == 2 else self.loc + z @ self.scale_tril.T
@@ -55,7 +67,7 @@ class Whitened:
         """Z of u, ``(C, P)``."""
         return torch.linalg.solve_triangular(self.scale_tril, (u - self.loc).T, upper=False).T
 
-    def refined(self, z: Tensor, groups: Tensor) -> "Whitened":
+    def refined(self, z: Tensor, groups: Tensor, *, weight: float = 5.0) -> "Whitened":
         """Coordinates in which pooled draws are white: z ``(S, P)``, each about the mean of its group ``(S,)``.
 
         Groups are the modes that chains began at: where they stay apart, the distance between modes is no width.
@@ -65,8 +77,8 @@ class Whitened:
         offset = z - means[groups]
         mean = means[0]
         identity = torch.eye(size, dtype=z.dtype, device=z.device)
-        # Shrunk to what the coordinates assume already, with the weight of a few draws (as in Stan).
-        covariance = (offset.T @ offset + 5 * identity) / (count + 5)
+        # Shrunk to what the coordinates assume already, with the weight of a few draws.
+        covariance = (offset.T @ offset + weight * identity) / (count + weight)
         factor = torch.linalg.cholesky(covariance)
         return Whitened(self.log_density, self.outer(mean[None])[0], self.scale_tril @ factor)
 
@@ -119,3 +131,54 @@ def starting_points(
     raise ConvergenceError(
         "Expected a finite posterior around the best point found. Got none. Look at the simulator there."
     )
+
+
+def gathered(
+    space: Whitened, z: Tensor, groups: Tensor, lowest: Tensor, generator: torch.Generator
+) -> tuple[Whitened, Tensor]:
+    """Points drawn together where the normal approximation is a bad one, as at a bent ridge.
+
+    Half of the points at a time moves along differences of two others of the same mode (differential evolution Markov
+    chain, ter Braak 2006), whose sizes and directions adapt to the density by themselves, until the points come no
+    lower. Trajectories from slopes that are too high by thousands would learn steps that are too short.
+
+    Args:
+        space: The density.
+        z: Starting points ``(C, P)``.
+        groups: The mode of each, ``(C,)``.
+        lowest: Height of each one's mode, ``(C,)``.
+        generator: Of random numbers.
+
+    Returns:
+        Coordinates in which the points are white on their last ways, and the points in them ``(C, P)``; both as they
+        came where at most a few are far from their modes.
+    """
+    count, size = z.shape
+    height = space.height(z)
+    usual = 0.5 * size + 2 * (0.5 * size) ** 0.5  # of half a chi-square, and two sd
+    if float((height - lowest > FAR * usual).double().mean()) <= MANY or count < 8:
+        return space, z
+    rest = float(height.median())
+    for _ in range(LOOKS):
+        ways = []
+        for move in range(2 * MOVES):
+            mine = torch.randperm(count, generator=generator, device=z.device)
+            moving, others = mine[: count // 2], mine[count // 2 :]
+            same = (groups[moving][:, None] == groups[others]).to(z.dtype) + 1e-9
+            first, second = torch.multinomial(same, 2, generator=generator).unbind(1)
+            length = 1.0 if move % 10 == 9 else 2.38 / (2 * size) ** 0.5
+            step = length * (z[others[first]] - z[others[second]])
+            jitter = torch.randn(step.shape, dtype=z.dtype, device=z.device, generator=generator)
+            there = z[moving] + step + 1e-4 * jitter
+            new = space.height(there)
+            chance = torch.rand(len(moving), dtype=z.dtype, device=z.device, generator=generator)
+            better = chance.log() < height[moving] - new
+            z = z.index_copy(0, moving, torch.where(better[:, None], there, z[moving]))
+            height = height.index_copy(0, moving, torch.where(better, new, height[moving]))
+            ways.append(z)
+        now = float(height.median())
+        if not now < rest - 1.0:
+            break
+        rest = now
+    other = space.refined(torch.cat(ways), groups.repeat(len(ways)), weight=0.05)
+    return other, other.inner(space.outer(z))
