@@ -382,6 +382,17 @@ def test_two_terms_and_half_credit():
     assert score.credit(result_of("named", ["cubic stiffness", "end stop"], remaining=0.3), truth) == 0
 
 
+def test_top_1_as_stated_is_the_share_of_the_first_among_those_with_terms():
+    one, other = ["cubic stiffness"], ["end stop"]
+    ranking = [(["none of these"], 0.5), (one, 0.2), (other, 0.15), (one, 0.1), ([], 0.05)]
+    found = result_of("ambiguous", ranking=ranking)
+    assert score.first_share(found) == pytest.approx(0.3 / 0.45)  # wherever it acts
+    assert score.first_share({**found, "verdict": "unexplained"}) == 0
+    mean = score.average([0.5, 0.7, 0.9])
+    assert mean["value"] == pytest.approx(0.7)
+    assert mean["high"] - mean["value"] == pytest.approx(1.96 * 0.1633 / 3**0.5, rel=1e-3)
+
+
 def test_region_and_held_out():
     truth = answer_of("local", ["cubic stiffness"], truth=[{"force": [0.0, 0.0, 0.0, 0.0]}])
     truth["effects"][0]["active"] = [[0, 1, 1, 0]]

@@ -7,6 +7,9 @@ What the numbers mean:
   merged both and says so.
 - *top-1*: the best hypothesis with a term is the planted one, and the verdict is ``named`` or ``ambiguous``; for a peer
   its first term.
+- *top-1 as stated*: the same as far as the tool's own probabilities go, the mean over the cases of the first
+  hypothesis' share of all that have terms (0 with another verdict). Beyond it top-1 can only be luck, if the
+  probabilities are right; if they are, the two agree.
 - *tied-set hit*: named right, or ``ambiguous`` with the planted term among the tied hypotheses.
 - *false alarm*: any verdict but ``consistent`` on a null; for a peer any term.
 - *wrong name*: verdict ``named`` where the effect is not in the library.
@@ -41,6 +44,7 @@ BANDS = {"κ < 0.3": (0.0, 0.3), "0.3 ≤ κ < 1": (0.3, 1.0), "κ ≥ 1": (1.0,
 SAME = 0.9999
 NEARLY = 0.995
 REMAINS = 0.02
+NONE = ["none of these"]
 PEERS = ("joint SINDy", "ensemble SINDy", "weak SINDy", "residual regression", "refit + BIC")
 GOALS = {
     "top-1": "≥ 0.85 / ≥ 0.95",
@@ -90,6 +94,15 @@ def middle(values: Iterable[float | None]) -> dict[str, Any]:
         return {"n": 0, "value": None, "low": None, "high": None}
     low, value, high = (float(q) for q in np.quantile(found, [0.25, 0.5, 0.75]))
     return {"n": len(found), "value": value, "low": low, "high": high}
+
+
+def average(values: Iterable[float]) -> dict[str, Any]:
+    """Mean with two standard errors."""
+    found = list(values)
+    if not found:
+        return {"n": 0, "value": None, "low": None, "high": None}
+    mean, half = float(np.mean(found)), 1.959964 * float(np.std(found)) / math.sqrt(len(found))
+    return {"n": len(found), "value": mean, "low": max(0.0, mean - half), "high": min(1.0, mean + half)}
 
 
 def band(kappa: float) -> str:
@@ -145,7 +158,7 @@ def best_terms(result: Mapping[str, Any]) -> list[str]:
     """Terms of the best hypothesis that has any."""
     if result.get("verdict") == "named":
         return list(result["terms"])
-    rows = (row["terms"] for row in result.get("ranking", ()) if row["terms"] and row["terms"] != ["none of these"])
+    rows = (row["terms"] for row in result.get("ranking", ()) if row["terms"] and row["terms"] != NONE)
     return list(next(rows, []))
 
 
@@ -157,6 +170,15 @@ def top(result: Mapping[str, Any], answer: Mapping[str, Any]) -> float:
     if answer["kind"] == "two":
         return max(credit(result, answer), 1.0 if exact(terms, answer, result) else 0.0)
     return float(exact(terms, answer, result))
+
+
+def first_share(result: Mapping[str, Any]) -> float:
+    """Probability of the best hypothesis among those with terms, wherever they act."""
+    if result.get("verdict") not in ("named", "ambiguous"):
+        return 0.0
+    best, every = frozenset(best_terms(result)), [row for row in result["ranking"] if row["terms"] not in ([], NONE)]
+    total = sum(row["probability"] for row in every)
+    return sum(row["probability"] for row in every if frozenset(row["terms"]) == best) / total if total else 0.0
 
 
 def tied_hit(result: Mapping[str, Any], answer: Mapping[str, Any]) -> float:
@@ -216,7 +238,7 @@ def stated(result: Mapping[str, Any], answer: Mapping[str, Any]) -> tuple[float,
     if answer["kind"] == "null":
         return best["probability"], terms == []
     if answer["kind"] == "outside":
-        return best["probability"], terms == ["none of these"]
+        return best["probability"], terms == NONE
     return best["probability"], exact(terms, answer, result)
 
 
@@ -319,6 +341,7 @@ def table(
         column: dict[str, Any] = {}
         keys = pick(single, name)
         column["top-1"] = share(top(results[k], answers[k]) for k in keys)
+        column["top-1 as stated"] = average(first_share(results[k]) for k in keys)
         column["named right"] = share(credit(results[k], answers[k]) for k in keys)
         column["tied-set hit"] = share(tied_hit(results[k], answers[k]) for k in keys)
         column["two terms, credit"] = share(credit(results[k], answers[k]) for k in pick(("two",), name))
