@@ -140,8 +140,8 @@ def gathered(
 
     Half of the points at a time moves along differences of two others of the same mode (differential evolution Markov
     chain, ter Braak 2006, Statistics and Computing 16, 239), whose sizes and directions adapt to the density by
-    themselves, until the points come no lower. Trajectories from slopes that are too high by thousands would learn steps
-    that are too short.
+    themselves, until the points come no lower. Trajectories from slopes that are too high by thousands would learn
+    steps that are too short.
 
     Args:
         space: The density.
