@@ -10,7 +10,8 @@ from scipy.linalg import toeplitz
 
 import torchcal as tc
 from torchcal.discovery.base import calibrate_base
-from torchcal.discovery.likeliest import alone, log_likelihood, settled, with_unknown
+from torchcal.discovery.likeliest import Tangents, alone, log_likelihood, settled, with_unknown
+from torchcal.discovery.noise import GRID
 from torchcal.discovery.problem import Problem
 
 F64 = torch.float64
@@ -29,29 +30,40 @@ def correlated(rng, n, rho):
     return e
 
 
-def line(y, **options):
-    x = torch.linspace(0, 1, len(y), dtype=F64)
-    simulator = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
-    return calibrate_base(Problem.of(simulator, tc.Recording(x=x, y=torch.tensor(y), **options)), {}, 4, 0)
+def curve(y, size=2, **options):
+    """A polynomial of some coefficients fitted to data, the noise estimated, and the fit's tangents."""
+    x = torch.linspace(-1, 1, len(y), dtype=F64)
+    names = [f"c{k}" for k in range(size)]
+    simulator = tc.Simulator(
+        lambda x, p: sum(p[name] * x**k for k, name in enumerate(names)),
+        [tc.Parameter(name, initial=0.1) for name in names],
+    )
+    found, noise = calibrate_base(Problem.of(simulator, tc.Recording(x=x, y=torch.tensor(y), **options)), {}, 2, 0)
+    return found, noise, Tangents.of(found, noise)
 
 
 def test_log_likelihood_is_the_normal_one_but_for_a_constant():
     rng = np.random.default_rng(0)
-    found, noise = line(2 + 0.3 * correlated(rng, 60, 0.6))
+    found, noise, tangents = curve(2 + 0.3 * correlated(rng, 60, 0.6))
     rho, sd = float(noise.correlation[0]), float(noise.sd[0])
-    expected = stats.multivariate_normal(cov=sd**2 * toeplitz(rho ** np.arange(60))).logpdf(found.residual.numpy())
-    assert log_likelihood(found, noise) == pytest.approx(expected + 30 * math.log(2 * math.pi) - rho, abs=1e-8)
+    covariance = sd**2 * toeplitz(rho ** np.arange(60))
+    expected = stats.multivariate_normal(cov=covariance).logpdf(found.residual.numpy())
+    # Both coefficients integrated out.
+    q = np.linalg.qr(found.jacobian.numpy())[0]
+    expected -= 0.5 * np.linalg.slogdet(q.T @ np.linalg.solve(covariance, q))[1]
+    expected += 30 * math.log(2 * math.pi) - rho
+    assert log_likelihood(found, noise, tangents) == pytest.approx(expected, abs=1e-8)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.5, 0.8])
 def test_the_likeliest_noise_of_a_right_model_is_the_true_one(rho):
     found, size = [], []
     for seed in range(20):
-        fit, first = line(2 + 0.3 * correlated(np.random.default_rng(seed), 300, rho))
-        noise, value = settled(fit, first)
+        fit, first, tangents = curve(2 + 0.3 * correlated(np.random.default_rng(seed), 300, rho))
+        noise, value = settled(fit, first, tangents)
         found.append(float(noise.correlation[0]))
         size.append(float(noise.sd[0]) / 0.3)
-        assert value >= log_likelihood(fit, first) - 0.05  # sizes are freed of the two parameters
+        assert value >= log_likelihood(fit, first, tangents) - 1e-3
     # sd of an estimate of ρ: √((1 − ρ²)/300), at most 0.06; four times that of the mean of 20, and the grid's step.
     assert np.mean(found) == pytest.approx(rho, abs=4 * 0.06 / math.sqrt(20) + 0.025)
     # The variance has 300 (1 − ρ²)/(1 + ρ²) independent values.
@@ -61,8 +73,8 @@ def test_the_likeliest_noise_of_a_right_model_is_the_true_one(rho):
 
 def test_a_known_size_stays_and_replicates_stay():
     rng = np.random.default_rng(1)
-    found, noise = line(2 + 0.3 * correlated(rng, 100, 0.7), noise=0.3)
-    fresh, _ = alone(found, noise)
+    found, noise, tangents = curve(2 + 0.3 * correlated(rng, 100, 0.7), noise=0.3)
+    fresh, _ = alone(found, noise, tangents)
     assert torch.equal(fresh.sd, noise.sd)
     assert float(fresh.correlation[0]) == pytest.approx(0.7, abs=0.2)
     x = torch.linspace(0, 1, 20, dtype=F64).repeat_interleave(3)
@@ -70,16 +82,18 @@ def test_a_known_size_stays_and_replicates_stay():
     data = tc.Recording(x=x, y=torch.tensor(2 + 0.3 * rng.standard_normal(60)))
     found, noise = calibrate_base(Problem.of(simulator, data), {}, 4, 0)
     assert noise.source == "replicates"
-    assert alone(found, noise)[0] is noise
+    assert alone(found, noise, Tangents.of(found, noise))[0] is noise
 
 
-def test_noise_alone_is_not_taken_for_something_unknown():
-    # A Bayes factor above e^4.6 has a probability of at most 1 % by noise alone: 3 or more of 40, one of 1000.
+@pytest.mark.parametrize("size", [2, 8])
+def test_noise_alone_is_not_taken_for_something_unknown(size):
+    # A Bayes factor above e^4.6 has a probability of at most 1 % by noise alone: 3 or more of 40, one of 1000. Without
+    # the determinant of what is calibrated, eight coefficients would make it a quarter at ρ = 0.9.
     odds = []
     for seed in range(40):
         rng = np.random.default_rng(100 + seed)
-        found, noise = line(2 + 0.3 * correlated(rng, 90, (0.0, 0.4, 0.7, 0.9)[seed % 4]))
-        odds.append(with_unknown(found, None)[1] - settled(found, noise)[1])
+        found, noise, tangents = curve(2 + 0.3 * correlated(rng, 90, (0.0, 0.9, 0.7, 0.9)[seed % 4]), size)
+        odds.append(with_unknown(found, None, tangents)[1] - settled(found, noise, tangents)[1])
     assert sum(value > 4.6 for value in odds) <= 2
 
 
@@ -87,9 +101,11 @@ def test_a_ripple_in_white_noise_is_no_correlated_noise():
     x = np.linspace(0, 1, 90)
     for seed in range(5):
         rng = np.random.default_rng(seed)
-        found, noise = line(2 + 0.3 * np.sin(2 * np.pi * 5 * x) + 0.05 * rng.standard_normal(90))
-        unknown, evidence = with_unknown(found, None)
-        assert evidence > settled(found, noise)[1] + 10
+        found, noise, tangents = curve(2 + 0.3 * np.sin(2 * np.pi * 5 * x) + 0.05 * rng.standard_normal(90))
+        unknown, evidence = with_unknown(found, None, tangents)
+        assert evidence > settled(found, noise, tangents)[1] + 10
+        # What noise alone gives is simulated with the correlation in use.
+        assert float((unknown.posterior[0] * GRID).sum()) == pytest.approx(float(unknown.correlation[0]), abs=0.1)
         assert float(unknown.sd[0]) == pytest.approx(0.05, rel=0.6)
 
 

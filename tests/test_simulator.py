@@ -223,3 +223,28 @@ def test_bad_simulator_is_refused(arguments, message):
 def test_bad_degree_is_refused(degree):
     with pytest.raises(DomainError, match="degree"):
         tc.Simulator(line, AB, degree=degree)
+
+
+def test_constants_beside_parameters_change_no_derivative():
+    # Inside, numbers and plain tensors beside dual ones get tangents; the values are those of plain code.
+    x = torch.linspace(0.5, 2, 7, dtype=torch.float64)
+    plain = torch.linspace(1, 3, 7, dtype=torch.float64)
+
+    def function(x, p):
+        a = p["a"]
+        return (a * 2 + 1.5 - x) / 3 + 2 / a - (4 - a) * plain / x + torch.sub(a, 1, alpha=2) + (x > 1) * a + 3 * a**2
+
+    simulator = tc.Simulator(function, [tc.Parameter("a")])
+    values = torch.tensor([[0.7], [1.9]], dtype=torch.float64)
+    found = simulator.linearise(x, values)
+    torch.testing.assert_close(found.y, simulator.at(x)(values), rtol=0, atol=0)
+    h = 1e-6
+    slope = (simulator.at(x)(values + h) - simulator.at(x)(values - h)) / (2 * h)
+    torch.testing.assert_close(found.jacobian[..., 0], slope, rtol=1e-7, atol=1e-7)
+
+
+def test_a_function_that_maps_over_its_conditions_is_derived():
+    x = torch.linspace(0, 1, 5, dtype=torch.float64)
+    simulator = tc.Simulator(lambda x, p: p["a"] * torch.vmap(lambda t: t * 2.0 + 1.0)(x), [tc.Parameter("a")])
+    found = simulator.linearise(x, torch.tensor([[3.0]], dtype=torch.float64))
+    torch.testing.assert_close(found.jacobian[0, :, 0], 2 * x + 1)

@@ -7,6 +7,7 @@ judged by the noise that another one needs: each has its own, and the data decid
 import dataclasses
 import itertools
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -15,9 +16,9 @@ from torchcal.discovery.channels import channels
 from torchcal.discovery.fitting import Fitted, refit, weighed
 from torchcal.discovery.noise import GRID, LEAST, SHRINK, Noise, estimate, least, mine
 from torchcal.discovery.problem import Whitening
-from torchcal.discovery.structure import Residual, evidences
+from torchcal.discovery.structure import Residual, evidences, responses_of
 
-__all__ = ["alone", "log_likelihood", "settled", "with_unknown"]
+__all__ = ["Tangents", "alone", "log_likelihood", "settled", "with_unknown"]
 
 #: Places in `GRID` of the coefficients that are tried beside something unknown, and how often for every output.
 TRIED, ROUNDS = (0, 8, 16, 24, 30, 36), 2
@@ -29,85 +30,138 @@ SMALLER = (1.0, 0.75, 0.5, 0.35, 0.25)
 _Places = tuple[tuple[int, ...], tuple[int, ...]]
 
 
-def log_likelihood(found: Fitted, noise: Noise) -> float:
-    """Of the data by a fit under a noise model, the log prior of its correlation included."""
+@dataclass(frozen=True, eq=False)
+class Tangents:
+    """Directions in which the base can move the data, which every likelihood is integrated over.
+
+    Fits are normal in all parameters: what integrating does is a determinant, and that of the base's tangents alone
+    differs from noise to noise for every hypothesis alike.
+
+    Attributes:
+        directions: Orthonormal, ``(n, r)``.
+        grams: Of the whitened directions within each output, for noise of unit size (or of the size that is given) and
+            each coefficient in `GRID`, ``(outputs, grid, r, r)``.
+        logs: Half the log determinant of the noise's correlation, ``(outputs, grid)``.
+    """
+
+    directions: Tensor
+    grams: Tensor
+    logs: Tensor
+
+    @classmethod
+    def of(cls, base: Fitted, noise: Noise) -> "Tangents":
+        """Of the base's fit."""
+        slope = base.jacobian[:, ~base.at_bound]
+        size = slope.norm(dim=0)
+        slope = slope[:, size > 0] / size[size > 0]
+        if slope.shape[1]:
+            u, s, _ = torch.linalg.svd(slope, full_matrices=False)
+            slope = u[:, s > 1e-7 * s[0]]
+        problem, outputs, unit = base.problem, len(noise.correlation), _unit(noise)
+        grams, logs = [], []
+        for rho in GRID:
+            w = problem.whitening(unit, torch.full_like(noise.correlation, float(rho)))
+            white, half = w(slope), 0.5 * torch.log1p(-w.correlation.square())
+            parts = [problem.output_of == k for k in range(outputs)]
+            grams.append(torch.stack([white[part].T @ white[part] for part in parts]))
+            logs.append(torch.stack([half[part].sum() for part in parts]))
+        return cls(slope, torch.stack(grams, 1), torch.stack(logs, 1))
+
+
+def _unit(noise: Noise) -> Tensor:
+    return torch.ones_like(noise.sd) if noise.open else noise.sd
+
+
+def log_likelihood(found: Fitted, noise: Noise, tangents: Tangents) -> float:
+    """Of the data by a fit under a noise model, the base's parameters integrated out.
+
+    The log prior of the correlation is included.
+    """
     w = noise.whitening(found.problem)
-    return _log_density(w, w.vector(found.residual), noise)
+    return _log_density(w, w.vector(found.residual), noise, tangents)
 
 
-def _log_density(w: Whitening, e: Tensor, noise: Noise) -> float:
+def _log_density(w: Whitening, e: Tensor, noise: Noise, tangents: Tangents) -> float:
     size = 0.5 * float(torch.log1p(-w.correlation.square()).sum()) + float(w.sd.log().sum())
+    if tangents.directions.shape[1]:
+        size += float(torch.linalg.qr(w(tangents.directions)).R.diagonal().abs().log().sum())
     return -size - 0.5 * float(e.square().sum()) - SHRINK * float(noise.correlation.sum())
 
 
-def alone(found: Fitted, noise: Noise) -> tuple[Noise, float]:
+def alone(found: Fitted, noise: Noise, tangents: Tangents) -> tuple[Noise, float]:
     """The likeliest noise of a model that leaves nothing else, and the log-likelihood with it.
 
     Args:
         found: The model's fit.
         noise: Estimated before; it says what is known.
+        tangents: The base's.
     """
     problem = found.problem
     if noise.source == "replicates":
-        return noise, log_likelihood(found, noise)
-    unit = torch.ones_like(noise.sd) if noise.open else noise.sd
-    squares, logs = [], []
-    for rho in GRID:
-        w = problem.whitening(unit, torch.full_like(noise.correlation, float(rho)))
-        squares.append(w.vector(found.residual).square())
-        logs.append(0.5 * torch.log1p(-w.correlation.square()))
-    sd, correlation, posterior = noise.sd.clone(), noise.correlation.clone(), noise.posterior.clone()
-    least_freedom = math.inf
-    for output in range(len(correlation)):
-        here = problem.output_of == output
-        n = int(here.sum())
-        if n == 0:
+        return noise, log_likelihood(found, noise, tangents)
+    unit, outputs = _unit(noise), len(noise.correlation)
+    squares = torch.stack([
+        problem.whitening(unit, torch.full_like(noise.correlation, float(rho))).vector(found.residual).square()
+        for rho in GRID
+    ])  # fmt: skip
+    count = torch.bincount(problem.output_of, minlength=outputs).double()
+    freedom = (count * (1 - len(found.free) / problem.n)).clamp_min(1.0)
+    square = torch.stack([squares[:, problem.output_of == k].sum(1) for k in range(outputs)])  # (outputs, grid)
+    sizes = (square / freedom[:, None]).clamp_min(1e-300) if noise.open else torch.ones_like(square)
+    blocks = tangents.grams / sizes[:, :, None, None]
+    best = [int((GRID - rho).abs().argmin()) for rho in noise.correlation]
+    posterior = noise.posterior.clone()
+    for k in range(outputs):
+        if not count[k]:
             continue
-        square = torch.stack([part[here].sum() for part in squares])
-        freedom = n * (1 - len(found.free) / problem.n)
-        size = (square / freedom).clamp_min(1e-300) if noise.open else torch.ones_like(square)
-        logs_here = torch.stack([part[here].sum() for part in logs])
-        like = -logs_here - 0.5 * square / size - 0.5 * n * size.log() - SHRINK * GRID
-        if n < LEAST:
+        others = torch.zeros_like(blocks[0, 0])
+        for j in range(outputs):
+            others = others + blocks[j, best[j]] if j != k else others
+        like = -tangents.logs[k] - 0.5 * count[k] * sizes[k].log() - 0.5 * square[k] / sizes[k] - SHRINK * GRID
+        like = like - 0.5 * torch.linalg.slogdet(others + blocks[k])[1]
+        if count[k] < LEAST:
             like[1:] = -math.inf
-        best = int(like.argmax())
-        posterior[output] = (like - like[best]).exp() / (like - like[best]).exp().sum()
-        correlation[output] = GRID[best]
-        if noise.open:
-            sd[mine(problem, output)] = size[best].sqrt()
-            least_freedom = min(least_freedom, freedom)
+        best[k] = int(like.argmax())
+        posterior[k] = (like - like[best[k]]).exp() / (like - like[best[k]]).exp().sum()
+    sd, correlation = noise.sd.clone(), noise.correlation.clone()
+    for k in range(outputs):
+        if count[k]:
+            correlation[k] = GRID[best[k]]
+            if noise.open:
+                sd[mine(problem, k)] = sizes[k, best[k]].sqrt()
     if noise.open:
         sd = torch.maximum(sd, least(problem, noise.step))
-        noise = dataclasses.replace(noise, freedom=least_freedom)
+        noise = dataclasses.replace(noise, freedom=float(freedom[count > 0].min()))
     fresh = dataclasses.replace(noise, sd=sd, correlation=correlation, posterior=posterior)
-    return fresh, log_likelihood(found, fresh)
+    return fresh, log_likelihood(found, fresh, tangents)
 
 
-def settled(found: Fitted, noise: Noise) -> tuple[Noise, float]:
+def settled(found: Fitted, noise: Noise, tangents: Tangents) -> tuple[Noise, float]:
     """The same with the model fitted again under that noise."""
-    fresh, _ = alone(found, noise)
-    return alone(refit(found, fresh.whitening(found.problem)), noise)
+    fresh, _ = alone(found, noise, tangents)
+    return alone(refit(found, fresh.whitening(found.problem)), noise, tangents)
 
 
-def with_unknown(model: Fitted, given: Tensor | str | None) -> tuple[Noise, float]:
+def with_unknown(model: Fitted, given: Tensor | str | None, tangents: Tangents) -> tuple[Noise, float]:
     """The likeliest noise beside a model and something smooth and unknown, and the log evidence of the two.
 
     Args:
         model: The model's fit.
         given: As ``recording.noise``.
+        tangents: The base's.
     """
     noise = estimate(model.problem, model.residual, model.jacobian, given)
     problem = model.problem
-    available = [c for c in channels(problem, model) if c.kind in problem.kinds]
+    looks = responses_of(problem, [c for c in channels(problem, model) if c.kind in problem.kinds])
     found: dict[_Places, tuple[Noise, float]] = {}
 
     def evidence(at: _Places) -> float:
         if at not in found:
             tried = _at(model, noise, *at)
             residual = Residual(weighed(model, tried.whitening(problem)), tried, draws=0)
-            seen = evidences(residual, available)
+            seen = evidences(residual, looks)
             gain = max(seen) - math.log(len(seen)) if seen else -math.inf
-            found[at] = tried, _log_density(residual.found.whitening, residual.e, tried) + gain
+            found[at] = tried, _log_density(residual.found.whitening, residual.e, tried, tangents) + gain
         return found[at][1]
 
     factors = range(len(SMALLER) if noise.open and problem.order is None else 1)
@@ -133,12 +187,13 @@ def _with(at: _Places, k: int, rho: int, factor: int) -> _Places:
 def _at(model: Fitted, noise: Noise, places: tuple[int, ...], smaller: tuple[int, ...]) -> Noise:
     """The noise model at other coefficients, by their places in `GRID`, and sizes, by those in `SMALLER`."""
     correlation = GRID[list(places)]
-    sd = noise.sd.clone()
+    sd, posterior = noise.sd.clone(), noise.posterior.clone()
+    for output, (place, factor) in enumerate(zip(places, smaller, strict=True)):
+        here, other = mine(model.problem, output), correlation[output] != noise.correlation[output]
+        if other:
+            posterior[output] = (torch.arange(len(GRID)) == place).to(posterior)
+        if noise.open:
+            sd[here] = SMALLER[factor] * (noise.sizes[output, place] if other else sd[here])
     if noise.open:
-        for output, (place, factor) in enumerate(zip(places, smaller, strict=True)):
-            here = mine(model.problem, output)
-            if correlation[output] != noise.correlation[output]:
-                sd[here] = noise.sizes[output, place]
-            sd[here] *= SMALLER[factor]
         sd = torch.maximum(sd, least(model.problem, noise.step))
-    return dataclasses.replace(noise, sd=sd, correlation=correlation)
+    return dataclasses.replace(noise, sd=sd, correlation=correlation, posterior=posterior)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchcal.discovery.base import calibrate_base
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
 from torchcal.discovery.fitting import Fitted, refit, weighed
-from torchcal.discovery.likeliest import alone, log_likelihood, settled, with_unknown
+from torchcal.discovery.likeliest import Tangents, alone, log_likelihood, settled, with_unknown
 from torchcal.discovery.local import ENDS, is_window, region_text
 from torchcal.discovery.noise import Noise, spikes
 from torchcal.discovery.problem import Problem
@@ -59,6 +59,7 @@ class Model:
         log_prior: Of the hypothesis.
         physical: Whether nothing lies on a bound that it wants to cross.
         price: Log penalty for its parameters.
+        in_use: Log evidence with the search's noise, in the end, when ``log_evidence`` is with its own.
         note: What speaks against it.
         window: Where it acts, if locally.
         structure: What is left; filled in for the best.
@@ -71,6 +72,7 @@ class Model:
     log_prior: float
     physical: bool
     price: float = 0.0
+    in_use: float = 0.0
     note: str = ""
     window: Window | None = None
     structure: Structure | None = None
@@ -113,6 +115,7 @@ class Search:
     clean: bool = False
     base: Fitted = field(init=False)
     noise: Noise = field(init=False)
+    tangents: Tangents = field(init=False)
     residual: Residual = field(init=False)
     structure: Structure = field(init=False)
     candidates: list[Candidate] = field(init=False, default_factory=list)
@@ -136,9 +139,11 @@ class Search:
         """Calibrate the base, set outliers aside unless that is done, and estimate the noise."""
         self.base, self.noise = calibrate_base(self.problem, self.fixed, self.num_starts, self.seed, clean=self.clean)
         self.problem = self.base.problem
+        if not self.exact:
+            self.tangents = Tangents.of(self.base, self.noise)
         if self.noise.open:
             noise, evidence = self.with_unknown(self.base)
-            if evidence - settled(self.base, self.noise)[1] > CLEARLY:
+            if evidence - settled(self.base, self.noise, self.tangents)[1] > CLEARLY:
                 self.noise, self.base = noise, refit(self.base, noise.whitening(self.problem))
 
     # --- screening --------------------------------------------------------------------------------------
@@ -379,9 +384,9 @@ class Search:
     def _suited(self, models: Sequence[Model]) -> Noise:
         """The noise of the likeliest hypothesis, each with its own: of these models, or of something unknown where that
         is clearly likelier."""
-        own = {id(m): alone(m.found, self.noise) for m in models}
+        own = {id(m): alone(m.found, self.noise, self.tangents) for m in models}
         best = max(models, key=lambda m: own[id(m)][1] + self._prior(m))
-        noise, value = settled(best.found, self.noise)
+        noise, value = settled(best.found, self.noise, self.tangents)
         value += self._prior(best) + LIKELIER
         for found, prior in ((self.base, 0.0), (best.found, self._prior(best))):
             other, evidence = self.with_unknown(found)
@@ -392,21 +397,30 @@ class Search:
     def with_unknown(self, found: Fitted) -> tuple[Noise, float]:
         """Noise and log evidence of something unknown beside a fit; computed once."""
         if id(found) not in self._unknown:  # the fit is kept beside it, so that its id stays its own
-            self._unknown[id(found)] = found, with_unknown(found, self.problem.recording.noise)
+            self._unknown[id(found)] = found, with_unknown(found, self.problem.recording.noise, self.tangents)
         return self._unknown[id(found)][1]
 
     def _prior(self, model: Model) -> float:
         """Log prior of a model with the price of its parameters."""
         return model.log_prior + model.price
 
-    def apart(self) -> tuple[float, float]:
-        """Log evidence of the base and of something unknown, each with its own noise, against the base here."""
-        here = log_likelihood(self.base, self.noise)
+    def own_noise(self) -> tuple[float, float]:
+        """Weigh every model against the base, each of them with its own noise.
+
+        Returns:
+            Log evidence of something unknown, and that of the base as it stands here, against the base with its own.
+        """
+        base = settled(self.base, self.noise, self.tangents)[1]
+        here = log_likelihood(self.base, self.noise, self.tangents) - base
+        for model in self.models:
+            found = alone(model.found, self.noise, self.tangents)[1] - base
+            model.in_use = self._gain(model.found.chi2) + here + model.price
+            model.log_evidence = max(found + model.price, model.in_use)
         best = max(self.models, key=lambda model: model.weight, default=None)
         unknown = [self.with_unknown(self.base)[1]]
         if best is not None:
             unknown.append(self.with_unknown(best.found)[1] + self._prior(best))
-        return max(settled(self.base, self.noise)[1] - here, 0.0), max(unknown) - here
+        return max(unknown) - base, min(here, 0.0)
 
     def outliers(self, observed: Tensor) -> Tensor | None:
         """Data that stick out alone once the best model explains the rest, bool ``(n_total,)``; None where nothing

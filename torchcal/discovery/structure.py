@@ -15,8 +15,9 @@ from torchcal.discovery.channels import Channel, channels
 from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.local import Span
 from torchcal.discovery.noise import GRID, Noise
+from torchcal.discovery.problem import Problem
 
-__all__ = ["Place", "Residual", "Structure", "analyse", "evidences"]
+__all__ = ["Place", "Residual", "Structure", "analyse", "evidences", "responses_of"]
 
 #: Radial functions along time, and along any other driver: the evidence chooses how many.
 IN_TIME, ALONG = (12, 24, 48), (12, 24)
@@ -210,40 +211,55 @@ class _Change:
         )  # fmt: skip
 
 
-def evidences(residual: Residual, available: Sequence[Channel]) -> list[float]:
-    """Log evidence for a smooth change of each of some channels against each of its drivers."""
-    found: dict[tuple[str, str, str], float] = {}
-    for channel, name, change in _changes(residual, available, residual.e[:, None]):
-        key = channel.kind, channel.target, name
-        found[key] = max(found.get(key, -math.inf), float(_evidence(change.along[:, None], change.s)[0]))
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """Smooth changes of a channel along a driver: functions ``(K, m)`` and responses ``(n, m)``, not whitened."""
+
+    channel: Channel
+    driver: str
+    features: list[Tensor]
+    responses: Tensor
+
+
+def responses_of(problem: Problem, available: Sequence[Channel]) -> list[_Look]:
+    """Every channel along every driver, and its logarithm over decades, with fewer and more functions."""
+    found = []
+    for channel in available:
+        data = problem.n if channel.kind != "output" else int((channel.matrix != 0).sum())
+        most = max(ALONG[0], data // DATA_EACH[0 if problem.in_time else 1])
+        for name, driver in channel.drivers.items():
+            distinct = len(driver.unique())
+            if distinct < 2:
+                continue
+            tried = IN_TIME if name == "t" else ALONG
+            counts = dict.fromkeys(min(count, distinct) for count in tried if count <= most)
+            scales = [driver, driver.log()] if name != "t" and Span.of(driver).log else [driver]
+            parts = [_features(scale, count) for scale in scales for count in counts]
+            found.append(_Look(channel, name, parts, channel.response(torch.cat(parts, dim=1))))
+    return found
+
+
+def evidences(residual: Residual, looks: Sequence[_Look]) -> list[float]:
+    """Log evidence for a smooth change of each channel against each driver."""
+    found: dict[int, float] = {}
+    for number, _, change in _changes(residual, looks, residual.e[:, None]):
+        found[number] = max(found.get(number, -math.inf), float(_evidence(change.along[:, None], change.s)[0]))
     return list(found.values())
 
 
-def _changes(
-    residual: Residual, available: Sequence[Channel], residuals: Tensor
-) -> Iterator[tuple[Channel, str, _Change]]:
-    """Changes of every channel along every driver, and its logarithm over decades, with fewer and more functions."""
-    found = residual.found
-    for channel in available:
-        data = found.problem.n if channel.kind != "output" else int((channel.matrix != 0).sum())
-        most = max(ALONG[0], data // DATA_EACH[0 if found.problem.in_time else 1])
-        for name, driver in channel.drivers.items():
-            distinct = len(driver.unique())
-            tried = IN_TIME if name == "t" else ALONG
-            counts = dict.fromkeys(min(count, distinct) for count in tried if count <= most)
-            if distinct < 2:
-                continue
-            scales = [driver, driver.log()] if name != "t" and Span.of(driver).log else [driver]
-            parts = [_features(scale, count) for scale in scales for count in counts]
-            responses = found.whitening(channel.response(torch.cat(parts, dim=1)))
-            columns = residual.project(responses)
-            if not bool(torch.isfinite(columns).all()):
-                continue
-            sizes = [part.shape[1] for part in parts]
-            for features, block, whole in zip(parts, columns.split(sizes, 1), responses.split(sizes, 1), strict=True):
-                change = _Change.of(features, block, 1e-9 * float(whole.norm()), residuals)
-                if change is not None:
-                    yield channel, name, change
+def _changes(residual: Residual, looks: Sequence[_Look], residuals: Tensor) -> Iterator[tuple[int, _Look, _Change]]:
+    """Changes of every channel along every driver, under the residual's noise."""
+    for number, look in enumerate(looks):
+        responses = residual.found.whitening(look.responses)
+        columns = residual.project(responses)
+        if not bool(torch.isfinite(columns).all()):
+            continue
+        sizes = [part.shape[1] for part in look.features]
+        pieces = zip(look.features, columns.split(sizes, 1), responses.split(sizes, 1), strict=True)
+        for features, block, whole in pieces:
+            change = _Change.of(features, block, 1e-9 * float(whole.norm()), residuals)
+            if change is not None:
+                yield number, look, change
 
 
 def analyse(residual: Residual, *, every: bool = False) -> Structure:
@@ -257,16 +273,15 @@ def analyse(residual: Residual, *, every: bool = False) -> Structure:
     available = channels(found.problem, found)
     kinds = found.problem.kinds
     chosen = [c for c in available if every or c.kind in kinds]
-    best: dict[tuple[str, str, str], Place] = {}
-    nulls: dict[tuple[str, str, str], Tensor] = {}
+    best: dict[int, Place] = {}
+    nulls: dict[int, Tensor] = {}
     excess = max(residual.excess, 1e-300)
     both = torch.cat([residual.e[:, None], residual.null], dim=1)
-    for channel, name, change in _changes(residual, chosen, both):
-        key = channel.kind, channel.target, name
-        place = change.place(channel, name, residual, excess)
+    for key, look, change in _changes(residual, responses_of(found.problem, chosen), both):
+        place = change.place(look.channel, look.driver, residual, excess)
         if key not in best or place.evidence > best[key].evidence:
             best[key] = place
-        if channel.kind in kinds:
+        if look.channel.kind in kinds:
             simulated = _evidence(change.null, change.s)[0]
             nulls[key] = torch.maximum(nulls[key], simulated) if key in nulls else simulated
     places = list(best.values())

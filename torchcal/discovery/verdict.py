@@ -42,7 +42,6 @@ class Decision:
         probability: Of every model, by its ``id``.
         none: Probability of something that is not in the library.
         base: Probability of the base alone.
-        base_evidence: Log evidence of the base with the noise that suits it, against the base with the noise chosen.
         none_evidence: Log weight of something that is not in the library.
         withdrawn: Why a name was withdrawn, in words.
         nearly: Whether what is left is not white, and the name rests on the share of the misfit that it removes.
@@ -56,7 +55,6 @@ class Decision:
         self.probability: dict[int, float] = {}
         self.none = 0.0
         self.base = 1.0
-        self.base_evidence = 0.0
         self.none_evidence = 0.0
         self.withdrawn = ""
         self.nearly = False
@@ -79,14 +77,18 @@ def _unknown(search: Search, structure: Structure, *, calibrated: bool) -> float
     return bound + max(seen - float(structure.null_best.max()), 0.0)
 
 
-def _none_evidence(search: Search, ranked: list[Model]) -> float:
-    """Log weight of "none of these": something unknown in the base, or beside the best models."""
+def _none_evidence(search: Search, ranked: list[Model], here: float) -> float:
+    """Log weight of "none of these": something unknown in the base, or beside the best models.
+
+    ``here`` is the log evidence of the base with the noise in use.
+    """
     prior = math.log(PRIOR["none"])
-    found = _unknown(search, search.structure, calibrated=False) + prior
+    found = _unknown(search, search.structure, calibrated=False) + here + prior
     if any(search.examine(model).p_value >= PLAINLY_WHITE for model in ranked[:2]):
         found -= LINEAR * max(found, 0.0)  # refitted and white: its rival is linear, and as wrong as that
     for model in ranked[:4]:
-        found = max(found, model.weight + _unknown(search, search.examine(model), calibrated=True) + prior)
+        left = _unknown(search, search.examine(model), calibrated=True)  # of the search's noise, as this evidence
+        found = max(found, model.in_use + model.log_prior + left + prior)
     return found
 
 
@@ -96,11 +98,11 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     ranked = sorted((m for m in search.models if m.physical), key=lambda m: -m.weight)
     if search.exact:
         return _decide_exact(search, ranked, mask, decision)
+    decision.none_evidence = math.log(PRIOR["none"])
     if detected:
-        decision.base_evidence, unknown = search.apart()
-        decision.none_evidence = max(_none_evidence(search, ranked), unknown + math.log(PRIOR["none"]))
-    else:
-        decision.none_evidence = math.log(PRIOR["none"])
+        unknown, here = search.own_noise()
+        ranked.sort(key=lambda m: -m.weight)
+        decision.none_evidence = max(_none_evidence(search, ranked, here), unknown + decision.none_evidence)
     _weigh(search, decision)
     if not detected or decision.base >= max(decision.none, *decision.probability.values(), 0.0):
         decision.verdict = "consistent"
@@ -129,7 +131,7 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
             continue
         if covered >= TIED and seen:
             break
-        if seen and model.weight < math.log(PRIOR["base"]) + decision.base_evidence:
+        if seen and model.weight < math.log(PRIOR["base"]):
             break  # no better than the base is no explanation
         seen.add(names)
         covered += groups[names]
@@ -227,7 +229,7 @@ def _weigh(search: Search, decision: Decision, models: Sequence[Model] | None = 
     """Probabilities of all hypotheses (or of some of them alone), "none of these" among them."""
     models = search.models if models is None else models
     weights = [m.weight for m in models]
-    base = math.log(PRIOR["base"]) + decision.base_evidence
+    base = math.log(PRIOR["base"])
     top = max([*weights, base, decision.none_evidence])
     total = sum(math.exp(w - top) for w in [*weights, base, decision.none_evidence])
     decision.probability = {id(m): math.exp(m.weight - top) / total for m in models}

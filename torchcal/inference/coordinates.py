@@ -1,5 +1,6 @@
 """White coordinates for samplers, and the points that chains start from."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -76,10 +77,12 @@ class Whitened:
         means = group_means(z, groups)
         offset = z - means[groups]
         mean = means[0]
-        identity = torch.eye(size, dtype=z.dtype, device=z.device)
-        # Shrunk to what the coordinates assume already, with the weight of a few draws.
-        covariance = (offset.T @ offset + weight * identity) / (count + weight)
-        factor = torch.linalg.cholesky(covariance)
+        # Shrunk to what the coordinates assume already, with the weight of a few draws; in double precision, as single
+        # precision loses a narrow direction beside a long one.
+        identity = torch.eye(size, dtype=torch.float64, device=z.device)
+        wide = offset.double()
+        covariance = (wide.T @ wide + weight * identity) / (count + weight)
+        factor = torch.linalg.cholesky(covariance).to(z.dtype)
         return Whitened(self.log_density, self.outer(mean[None])[0], self.scale_tril @ factor)
 
 
@@ -140,8 +143,8 @@ def gathered(
 
     Half of the points at a time moves along differences of two others of the same mode (differential evolution Markov
     chain, ter Braak 2006, Statistics and Computing 16, 239), whose sizes and directions adapt to the density by
-    themselves, until the points come no lower. Trajectories from slopes that are too high by thousands would learn
-    steps that are too short.
+    themselves, until few are far from their modes or they come no nearer. Those that are left behind begin where others
+    are. Trajectories from slopes that are too high by thousands would learn steps that are too short.
 
     Args:
         space: The density.
@@ -156,30 +159,41 @@ def gathered(
     """
     count, size = z.shape
     height = space.height(z)
-    usual = 0.5 * size + 2 * (0.5 * size) ** 0.5  # of half a chi-square, and two sd
-    if float((height - lowest > FAR * usual).double().mean()) <= MANY or count < 8:
+    most = lowest + FAR * (0.5 * size + 2 * (0.5 * size) ** 0.5)  # half a chi-square's mean and two sd, three times
+    if float((height > most).double().mean()) <= MANY or count < 8:
         return space, z
-    rest = float(height.median())
+    before = math.inf
     for _ in range(LOOKS):
-        ways = []
+        ways, near = [], []
         for move in range(2 * MOVES):
-            mine = torch.randperm(count, generator=generator, device=z.device)
-            moving, others = mine[: count // 2], mine[count // 2 :]
-            same = (groups[moving][:, None] == groups[others]).to(z.dtype) + 1e-9
+            order = torch.randperm(count, generator=generator, device=z.device)
+            moving, others = order[: count // 2], order[count // 2 :]
+            same = (groups[moving][:, None] == groups[others]).to(z.dtype)
+            moving, same = moving[same.sum(1) >= 2], same[same.sum(1) >= 2]
+            if len(moving) == 0:
+                continue
             first, second = torch.multinomial(same, 2, generator=generator).unbind(1)
             length = 1.0 if move % 10 == 9 else 2.38 / (2 * size) ** 0.5
-            step = length * (z[others[first]] - z[others[second]])
-            jitter = torch.randn(step.shape, dtype=z.dtype, device=z.device, generator=generator)
-            there = z[moving] + step + 1e-4 * jitter
+            jitter = torch.randn((len(moving), size), dtype=z.dtype, device=z.device, generator=generator)
+            there = z[moving] + length * (z[others[first]] - z[others[second]]) + 1e-4 * jitter
             new = space.height(there)
             chance = torch.rand(len(moving), dtype=z.dtype, device=z.device, generator=generator)
             better = chance.log() < height[moving] - new
             z = z.index_copy(0, moving, torch.where(better[:, None], there, z[moving]))
             height = height.index_copy(0, moving, torch.where(better, new, height[moving]))
             ways.append(z)
-        now = float(height.median())
-        if not now < rest - 1.0:
+            near.append(height <= most)
+        excess = float((height - most).clamp_min(0).mean())
+        if float((height > most).double().mean()) <= MANY or not excess < 0.9 * before:
             break
-        rest = now
-    other = space.refined(torch.cat(ways), groups.repeat(len(ways)), weight=0.05)
+        before = excess
+    pool, mode = torch.cat(ways)[torch.cat(near)], groups.repeat(len(ways))[torch.cat(near)]
+    if len(pool) < 10 * size:
+        return space, z
+    for group in groups.unique():  # who is left behind begins where others of its mode are
+        settled, stuck = ((groups == group) & side for side in (height <= most, height > most))
+        if bool(settled.any()) and bool(stuck.any()):
+            chosen = torch.multinomial(settled.to(z.dtype), int(stuck.sum()), replacement=True, generator=generator)
+            z = z.index_copy(0, stuck.nonzero()[:, 0], z[chosen])
+    other = space.refined(pool, mode, weight=0.05)
     return other, other.inner(space.outer(z))

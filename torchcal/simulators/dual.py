@@ -47,7 +47,7 @@ class Still(TorchFunctionMode):
 
 def _beside(value: Any, other: Any) -> Any:
     """A constant beside a dual tensor, with a tangent; anything else as it is."""
-    if not isinstance(other, Tensor) or not other.dtype.is_floating_point:
+    if not isinstance(other, Tensor) or not other.dtype.is_floating_point or _wrapped(other) or _wrapped(value):
         return value
     if isinstance(value, Tensor):
         if not value.dtype.is_floating_point or _moves(value) or not _moves(other):
@@ -56,6 +56,11 @@ def _beside(value: Any, other: Any) -> Any:
     if isinstance(value, bool) or not isinstance(value, int | float) or not _moves(other):
         return value
     return still(torch.tensor(value, dtype=other.dtype, device=other.device))
+
+
+def _wrapped(value: Any) -> bool:
+    """Whether a transform of `torch.func`, as `torch.vmap`, is at work, which knows of no dual level."""
+    return isinstance(value, Tensor) and torch._C._functorch.is_functorch_wrapped_tensor(value)
 
 
 def _moves(value: Tensor) -> bool:
