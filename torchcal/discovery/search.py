@@ -339,8 +339,11 @@ class Search:
                 value, neutral = float(found.values[i]), float(candidate.neutral[candidate.own.index(i)])
                 if abs(value - neutral) <= 1e-9 * (1 + abs(value)):
                     off.add(names[i])
-        model.physical = not new
-        if off:
+        closed = model.window is not None and model.window.low >= model.window.high
+        model.physical = not new and not closed
+        if closed:
+            model.note = "its window has closed"
+        elif off:
             model.note = f"wants the wrong sign: {', '.join(sorted(off))} stays at its neutral value"
         elif new:
             model.note = f"at its bound: {', '.join(new)}"
