@@ -45,3 +45,20 @@ def star():
 
     states = {"x": None, "y": None, "vx": None, "vy": None}
     return tc.ODESimulator(rates, states, [tc.Parameter("mu", low=0.0, initial=1.0)], observe=("x", "y"))
+
+
+@pytest.fixture
+def binding() -> tuple[tc.Simulator, list[tc.Term]]:
+    """Response to a dose by saturation, and terms that a recording at several doses and ages may need."""
+    base = tc.Simulator(
+        lambda x, p: p["top"] * x["dose"] / (p["half"] + x["dose"]),
+        parameters=[tc.Parameter("top", low=0.1, high=5.0), tc.Parameter("half", low=0.05, high=20.0)],
+    )
+    terms = [
+        tc.Term("effect of age", outputs={"y": lambda x, p, y: y * (1 + p["a"] * (x["age"] / 25 - 1.8))},
+                parameters=[tc.Parameter("a")]),
+        tc.Term("offset", outputs={"y": lambda x, p, y: y + p["a"]}, parameters=[tc.Parameter("a")]),
+        tc.Term("unspecific binding", outputs={"y": lambda x, p, y: y + p["a"] * x["dose"]},
+                parameters=[tc.Parameter("a", low=0.0)]),
+    ]  # fmt: skip
+    return base, terms

@@ -392,3 +392,12 @@ def test_those_left_behind_begin_where_others_of_their_mode_are():
     other, there = gathered(space, z, groups, torch.zeros(64, dtype=torch.float64), generator)
     assert bool((other.height(there) < 15).all())
     assert bool(((other.outer(there).mean(1) > 50) == (groups == 0)).all())
+
+
+def test_points_that_are_alone_in_their_modes_stay():
+    space = Whitened(bent, torch.zeros(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64))
+    generator = torch.Generator().manual_seed(0)
+    z = 5 * torch.randn(8, 3, dtype=torch.float64, generator=generator)
+    other, there = gathered(space, z, torch.arange(8), torch.zeros(8, dtype=torch.float64), generator)
+    assert other is space
+    torch.testing.assert_close(there, z, rtol=0, atol=0)

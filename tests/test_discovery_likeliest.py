@@ -109,37 +109,27 @@ def test_a_ripple_in_white_noise_is_no_correlated_noise():
         assert float(unknown.sd[0]) == pytest.approx(0.05, rel=0.6)
 
 
-def dose_response(ripple, seed, *, rho=0.0, n=90):
+def dose_response(binding, ripple, seed, *, rho=0.0, n=90):
     """Responses at doses over decades, in rising order, with a ripple in the dose that no library has."""
     rng = np.random.default_rng(seed)
     dose, age = np.exp(np.linspace(-4.5, 4.5, n)), rng.uniform(20, 70, n)
     effect = 1.3 * dose / (1.2 + dose) + ripple * np.sin(2 * np.pi * 3 * np.linspace(0, 1, n))
     effect += 0.01 * correlated(rng, n, rho)
-    base = tc.Simulator(
-        lambda x, p: p["top"] * x["dose"] / (p["half"] + x["dose"]),
-        parameters=[tc.Parameter("top", low=0.1, high=5.0), tc.Parameter("half", low=0.05, high=20.0)],
-    )
-    terms = [
-        tc.Term("effect of age", outputs={"y": lambda x, p, y: y * (1 + p["a"] * (x["age"] / 25 - 1.8))},
-                parameters=[tc.Parameter("a")]),
-        tc.Term("offset", outputs={"y": lambda x, p, y: y + p["a"]}, parameters=[tc.Parameter("a")]),
-        tc.Term("unspecific binding", outputs={"y": lambda x, p, y: y + p["a"] * x["dose"]},
-                parameters=[tc.Parameter("a", low=0.0)]),
-    ]  # fmt: skip
+    base, terms = binding
     data = tc.Recording(x={"dose": torch.tensor(dose), "age": torch.tensor(age)}, y=torch.tensor(effect))
     return diagnose(base, data, terms)
 
 
-def test_a_ripple_over_decades_of_a_condition_is_something_unknown():
+def test_a_ripple_over_decades_of_a_condition_is_something_unknown(binding):
     # Taken for noise, it has a correlation of 0.9.
-    d = dose_response(0.06, 0)
+    d = dose_response(binding, 0.06, 0)
     assert d.verdict == "unexplained"
     assert d.noise.sd["y"] == pytest.approx(0.01, rel=1.0)
 
 
 @pytest.mark.parametrize("rho", [0.0, 0.6, 0.9])
-def test_without_the_ripple_nothing_is_missing(rho):
-    assert dose_response(0.0, 1, rho=rho).verdict == "consistent"
+def test_without_the_ripple_nothing_is_missing(binding, rho):
+    assert dose_response(binding, 0.0, 1, rho=rho).verdict == "consistent"
 
 
 def oscillator(rho, size, seed, n=250):

@@ -76,15 +76,12 @@ def test_a_kick_at_one_moment_is_no_window():
         assert row.region is None or row.probability < 0.5
 
 
-def test_opposite_terms_of_one_sign_each_are_no_aliases():
+def test_opposite_terms_of_one_sign_each_are_no_aliases(binding):
     # With the base calibrated, what one of them does is minus what the other does. Six others are refitted before them.
     def term(name, change, **bounds):
         return tc.Term(name, outputs={"y": change}, parameters=[tc.Parameter("a", **bounds)])
 
-    base = tc.Simulator(
-        lambda x, p: p["top"] * x["dose"] / (p["half"] + x["dose"]),
-        parameters=[tc.Parameter("top", low=0.1, high=5.0), tc.Parameter("half", low=0.05, high=20.0)],
-    )
+    base, _ = binding
     terms = [
         term("loss with dose", lambda x, p, y: y - p["a"] * x["dose"], low=0.0),
         term("unspecific binding", lambda x, p, y: y + p["a"] * x["dose"], low=0.0),
@@ -104,24 +101,14 @@ def test_opposite_terms_of_one_sign_each_are_no_aliases():
     assert "unspecific binding" in notes
 
 
-def test_outliers_that_a_strong_local_effect_hid_are_set_aside():
+def test_outliers_that_a_strong_local_effect_hid_are_set_aside(binding):
     # No smooth curve follows the step that the effect makes in the base's residual, so that nothing sticks out of it.
     rng = np.random.default_rng(5)
     dose, age = np.exp(rng.uniform(-4, 4, 130)), rng.uniform(20, 70, 130)
     effect = 1.3 * dose / (1 + dose) * (1 + 0.5 * (age / 25 - 1.8) * (dose < 0.8)) + 0.01 * rng.standard_normal(130)
     wrong = np.array([7, 40, 66, 95, 121])
     effect[wrong] += 0.01 * np.array([9, -12, 10, 14, -8])
-    base = tc.Simulator(
-        lambda x, p: p["top"] * x["dose"] / (p["half"] + x["dose"]),
-        parameters=[tc.Parameter("top", low=0.1, high=5.0), tc.Parameter("half", low=0.05, high=20.0)],
-    )
-    terms = [
-        tc.Term("effect of age", outputs={"y": lambda x, p, y: y * (1 + p["a"] * (x["age"] / 25 - 1.8))},
-                parameters=[tc.Parameter("a")]),
-        tc.Term("offset", outputs={"y": lambda x, p, y: y + p["a"]}, parameters=[tc.Parameter("a")]),
-        tc.Term("unspecific binding", outputs={"y": lambda x, p, y: y + p["a"] * x["dose"]},
-                parameters=[tc.Parameter("a", low=0.0)]),
-    ]  # fmt: skip
+    base, terms = binding
     data = tc.Recording(x={"dose": torch.tensor(dose), "age": torch.tensor(age)}, y=torch.tensor(effect), noise=0.01)
     d = diagnose(base, data, terms)
     assert d.verdict in ("named", "ambiguous")

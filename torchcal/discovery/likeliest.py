@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchcal.discovery.channels import channels
 from torchcal.discovery.fitting import Fitted, refit, weighed
-from torchcal.discovery.noise import GRID, LEAST, SHRINK, Noise, estimate, least, mine
+from torchcal.discovery.noise import GRID, LEAST, SHRINK, Noise, estimate, least, mine, orthonormal
 from torchcal.discovery.problem import Whitening
 from torchcal.discovery.structure import Residual, evidences, responses_of
 
@@ -51,12 +51,7 @@ class Tangents:
     @classmethod
     def of(cls, base: Fitted, noise: Noise) -> "Tangents":
         """Of the base's fit."""
-        slope = base.jacobian[:, ~base.at_bound]
-        size = slope.norm(dim=0)
-        slope = slope[:, size > 0] / size[size > 0]
-        if slope.shape[1]:
-            u, s, _ = torch.linalg.svd(slope, full_matrices=False)
-            slope = u[:, s > 1e-7 * s[0]]
+        slope = orthonormal(base.jacobian[:, ~base.at_bound], cut=1e-7)
         problem, outputs, unit = base.problem, len(noise.correlation), _unit(noise)
         grams, logs = [], []
         for rho in GRID:

@@ -15,7 +15,7 @@ from torchcal.discovery.problem import Problem, Whitening
 from torchcal.discovery.records import NoiseModel
 from torchcal.errors import DomainError
 
-__all__ = ["GRID", "LEAST", "SHRINK", "Noise", "estimate", "least", "mine", "smooth_columns", "spikes"]
+__all__ = ["GRID", "LEAST", "SHRINK", "Noise", "estimate", "least", "mine", "orthonormal", "smooth_columns", "spikes"]
 
 #: AR(1) coefficients that are tried.
 GRID = torch.linspace(0.0, 0.95, 39, dtype=torch.float64)
@@ -111,13 +111,20 @@ def smooth_columns(problem: Problem, places: Tensor) -> Tensor:
     return u[:, : min(count, int((s > 1e-9 * s[0]).sum()))]
 
 
-def _orthonormal(columns: Tensor, most: int) -> Tensor:
+def orthonormal(columns: Tensor, *, most: int | None = None, cut: float = 1e-8) -> Tensor:
+    """Orthonormal directions that columns ``(n, m)`` span, the strongest first.
+
+    Args:
+        columns: Of any lengths; those of length zero are left out.
+        most: How many directions at most.
+        cut: Share of the largest singular value, with columns of unit length, up to which there is no direction.
+    """
     size = columns.norm(dim=0)
     columns = columns[:, size > 0] / size[size > 0]
     if columns.shape[1] == 0:
         return columns
     u, s, _ = torch.linalg.svd(columns, full_matrices=False)
-    return u[:, : min(most, int((s > 1e-8 * s[0]).sum()))]
+    return u[:, s > cut * s[0]][:, :most]
 
 
 def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor | str | None) -> Noise:
@@ -155,8 +162,8 @@ def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor |
         for places in parts:
             own = design[places] / known[problem.index[places]][:, None]
             share = max(int(len(places) * SMOOTH_SHARE), min(design.shape[1], len(places) // 2))
-            wide = torch.cat([smooth_columns(problem, places), _orthonormal(own, share)], dim=1)
-            bases.append(_orthonormal(wide, int(0.6 * len(places))))
+            wide = torch.cat([smooth_columns(problem, places), orthonormal(own, most=share)], dim=1)
+            bases.append(orthonormal(wide, most=int(0.6 * len(places))))
             usable += len(places) - bases[-1].shape[1]
         if usable < 2 and given is not None:
             continue

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchcal.discovery.channels import Channel, channels
 from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.local import Span
-from torchcal.discovery.noise import GRID, Noise
+from torchcal.discovery.noise import GRID, Noise, orthonormal
 from torchcal.discovery.problem import Problem
 
 __all__ = ["Place", "Residual", "Structure", "analyse", "evidences", "responses_of"]
@@ -48,13 +48,7 @@ class Residual:
         w = found.whitening
         mine = torch.tensor([i not in without for i in found.free], dtype=torch.bool)
         tangents = w(found.jacobian[:, mine & ~found.at_bound])
-        size = tangents.norm(dim=0)
-        tangents = tangents[:, size > 0] / size[size > 0]
-        if tangents.shape[1]:
-            u, s, _ = torch.linalg.svd(tangents, full_matrices=False)
-            self.basis = u[:, s > 1e-7 * s[0]]
-        else:
-            self.basis = tangents
+        self.basis = orthonormal(tangents, cut=1e-7)
         self.e = self.project(w.vector(found.residual)[:, None])[:, 0]
         self.freedom = len(self.e) - self.basis.shape[1]
         self.null = self.project(_noise_draws(found, noise, draws, seed))

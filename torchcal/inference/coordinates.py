@@ -166,21 +166,8 @@ def gathered(
     for _ in range(LOOKS):
         ways, near = [], []
         for move in range(2 * MOVES):
-            order = torch.randperm(count, generator=generator, device=z.device)
-            moving, others = order[: count // 2], order[count // 2 :]
-            same = (groups[moving][:, None] == groups[others]).to(z.dtype)
-            moving, same = moving[same.sum(1) >= 2], same[same.sum(1) >= 2]
-            if len(moving) == 0:
-                continue
-            first, second = torch.multinomial(same, 2, generator=generator).unbind(1)
             length = 1.0 if move % 10 == 9 else 2.38 / (2 * size) ** 0.5
-            jitter = torch.randn((len(moving), size), dtype=z.dtype, device=z.device, generator=generator)
-            there = z[moving] + length * (z[others[first]] - z[others[second]]) + 1e-4 * jitter
-            new = space.height(there)
-            chance = torch.rand(len(moving), dtype=z.dtype, device=z.device, generator=generator)
-            better = chance.log() < height[moving] - new
-            z = z.index_copy(0, moving, torch.where(better[:, None], there, z[moving]))
-            height = height.index_copy(0, moving, torch.where(better, new, height[moving]))
+            z, height = _moved(space, z, height, groups, length, generator)
             ways.append(z)
             near.append(height <= most)
         excess = float((height - most).clamp_min(0).mean())
@@ -197,3 +184,24 @@ def gathered(
             z = z.index_copy(0, stuck.nonzero()[:, 0], z[chosen])
     other = space.refined(pool, mode, weight=0.05)
     return other, other.inner(space.outer(z))
+
+
+def _moved(
+    space: Whitened, z: Tensor, height: Tensor, groups: Tensor, length: float, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Points and heights after half of the points have tried to move along differences of the others."""
+    count, size = z.shape
+    order = torch.randperm(count, generator=generator, device=z.device)
+    moving, others = order[: count // 2], order[count // 2 :]
+    same = (groups[moving][:, None] == groups[others]).to(z.dtype)
+    moving, same = moving[same.sum(1) >= 2], same[same.sum(1) >= 2]
+    if len(moving) == 0:
+        return z, height
+    first, second = torch.multinomial(same, 2, generator=generator).unbind(1)
+    jitter = torch.randn((len(moving), size), dtype=z.dtype, device=z.device, generator=generator)
+    there = z[moving] + length * (z[others[first]] - z[others[second]]) + 1e-4 * jitter
+    new = space.height(there)
+    chance = torch.rand(len(moving), dtype=z.dtype, device=z.device, generator=generator)
+    better = chance.log() < height[moving] - new
+    z = z.index_copy(0, moving, torch.where(better[:, None], there, z[moving]))
+    return z, height.index_copy(0, moving, torch.where(better, new, height[moving]))
