@@ -499,7 +499,7 @@ def test_what_cannot_be_bound() -> None:
     t = np.linspace(0, 1, 5)
     with pytest.raises(RecordingError, match=r"initial values of states .* Got \['z'\]"):
         model.bind(tc.Recording(runs=[run_of(t, {"z": 1.0})]))
-    with pytest.raises(DomainError, match="2 000 000 steps"):
+    with pytest.raises(DomainError, match="2,000,000 steps"):
         oscillator(max_step=1e-9).bind(short_recording())
     bound = model.bind(short_recording())
     for x in (bound.x["time"], {"time": bound.x["time"][:3], "run": bound.x["run"][:3]}, {"time": bound.x["time"] + 1}):

@@ -53,10 +53,10 @@ def _binning(bound: Trajectories) -> tuple[Tensor, int]:
     """Bin of every step ``(R, K)`` (−1 for padding), and how many there are."""
     runs = len(bound.runs)
     each = max(30, BINS // runs)
-    bins = torch.full_like(bound._h, -1, dtype=torch.long)
+    bins = torch.full_like(bound.grid.h, -1, dtype=torch.long)
     first = 0
     for r in range(runs):
-        real = int((bound._h[r] > 0).sum())
+        real = int((bound.grid.h[r] > 0).sum())
         count = min(each, real)
         bins[r, :real] = first + (torch.arange(real) * count) // real
         first += count
@@ -83,7 +83,7 @@ def responses(problem: Problem, found: Fitted, forcing: Tensor) -> tuple[Tensor,
     flow = bound.flow(values, states)[0]  # (R, K, S, S)
     size = flow.shape[-1]
     rows = bound.observation_slopes(values, states, problem.recording.outputs)[problem.index]  # (n, S)
-    run_of, node_of = bound._run_of[problem.condition_of], bound._node_of[problem.condition_of]
+    run_of, node_of = bound.grid.run_of[problem.condition_of], bound.grid.node_of[problem.condition_of]
     bins, count = _binning(bound)
     result = torch.zeros(problem.n, count, forcing.shape[-1], dtype=torch.float64)
     for r in range(len(bound.runs)):
@@ -93,7 +93,7 @@ def responses(problem: Problem, found: Fitted, forcing: Tensor) -> tuple[Tensor,
         nodes = node_of[mine].tolist()
         adjoint = torch.zeros(len(mine), size, dtype=torch.float64)
         filled = 0
-        last = int((bound._h[r] > 0).sum())
+        last = int((bound.grid.h[r] > 0).sum())
         block = torch.zeros(len(mine), count, forcing.shape[-1], dtype=torch.float64)
         where = bins[r].tolist()
         for k in range(last - 1, -1, -1):
@@ -139,11 +139,11 @@ def definitions(bound: Trajectories, values: Tensor, states: Tensor) -> set[str]
         return tensor + 0.1 * size * torch.randn(tensor.shape, generator=generator, dtype=tensor.dtype)
 
     rates, there = [], []
-    for node in torch.linspace(0, bound._t.shape[1] - 1, 4).round().long().tolist():
+    for node in torch.linspace(0, bound.grid.t.shape[1] - 1, 4).round().long().tolist():
         here = torch.stack([moved(column) for column in states[0, :, node].unbind(-1)], dim=-1)[None]  # (1, R, S)
         others = torch.stack([moved(value[None])[0] for value in values])  # each by its own size, and none stays 0
-        u = {name: moved(table[0, :, node]) for name, table in bound._u.items()}
-        rates.append(bound._slope(bound._t[:, node], here, bound._p(others[None]), u))
+        u = {name: moved(table[0, :, node]) for name, table in bound.grid.u.items()}
+        rates.append(bound.rates_at(bound.grid.t[:, node], here, bound.layout.by_name(others[None]), u))
         there.append(here)
     slopes, here = torch.cat(rates), torch.cat(there)
     names = list(bound.ode.states)
@@ -164,8 +164,8 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
         states = found.warm if found.warm is not None else bound.solve(found.values[None])
         own = [i for i in found.free if names[i] not in bound.initial_names and not is_window(names[i])]
         size = len(bound.ode.states)
-        _, _, by_parameter = bound._step_derivatives(found.values[None], states, own)
-        kicks = torch.diag_embed(bound._h[..., None].expand(-1, -1, size))
+        _, _, by_parameter = bound.step_derivatives(found.values[None], states, own)
+        kicks = torch.diag_embed(bound.grid.h[..., None].expand(-1, -1, size))
         forcing = torch.cat([kicks, by_parameter[0]], dim=-1)
         response, drivers, time = responses(problem, found, forcing)
         labels = [

@@ -143,7 +143,7 @@ def follow_slopes(problem: Problem, begin: Tensor) -> Tensor:
             leaf = values[:, places].clone().requires_grad_(True)
             full = values.clone()
             full[:, places] = leaf
-            rates = bound.slopes(full, bound._start(full))
+            rates = bound.slopes(full, bound.layout.start(full))
             left = torch.stack([(rates[:, r, i] - slope) / scale for r, i, slope, scale in targets], dim=-1)
             rows = [torch.autograd.grad(left[:, k].sum(), leaf, retain_graph=True, allow_unused=True)[0]
                     if left.requires_grad else None for k in range(left.shape[1])]  # fmt: skip

@@ -186,7 +186,7 @@ class Problem:
         if not isinstance(bound, Trajectories):
             return {"t": self.recording.x["time"]}  # type: ignore[index]
         found = bound.along(values, warm)
-        return {name: table[bound._run_of, bound._node_of] for name, table in found.items()}
+        return {name: table[bound.grid.run_of, bound.grid.node_of] for name, table in found.items()}
 
     def drivers_at_data(self, values: Tensor, warm: Any) -> dict[str, Tensor]:
         """The same at the data in use, ``(n,)`` each."""

@@ -9,8 +9,9 @@ import torch
 from torchcal.discovery.candidates import prepare
 from torchcal.discovery.channels import responses
 from torchcal.discovery.local import EDGE, ENDS, WIDTHS, Span, beyond, is_window, localised
+from torchcal.discovery.model import PRIOR, Model
 from torchcal.discovery.screen import Window, windows_of
-from torchcal.discovery.search import PRIOR, Model, Search
+from torchcal.discovery.search import Search
 from torchcal.discovery.structure import Residual
 from torchcal.discovery.verdict import PLAINLY_WHITE
 from torchcal.errors import DomainError, SimulatorError
@@ -117,7 +118,7 @@ def _around(search: Search, model: Model) -> list[Window]:
     if isinstance(bound, Trajectories):
         with torch.no_grad():
             forcing, present = (
-                bound._step_derivatives(values[None], found.warm, [place])[2][0]
+                bound.step_derivatives(values[None], found.warm, [place])[2][0]
                 for values in (everywhere, found.values)
             )
         response, drivers, _ = responses(found.problem, found, torch.cat([forcing, present], dim=-1))

@@ -1,0 +1,174 @@
+"""What each number is that the trajectories of a recording depend on: parameters, each run's own, initial states."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from torchcal.data import Recording, Run
+from torchcal.errors import RecordingError, SimulatorError
+from torchcal.simulators.parameter import Parameter
+
+if TYPE_CHECKING:
+    from torchcal.simulators.ode import ODESimulator
+
+__all__ = ["Layout"]
+
+
+class Layout:
+    """The columns of parameter values ``(H, P)`` for R runs.
+
+    Args:
+        ode: The simulator.
+        recording: What is recorded.
+        runs: Its runs.
+
+    Attributes:
+        parameters: Of the columns: the simulator's own, each run's copy of a per-run parameter, unknown initial states.
+        initial_names: Of the unknown initial states.
+    """
+
+    def __init__(self, ode: "ODESimulator", recording: Recording, runs: Sequence[Run]) -> None:
+        self._states = tuple(ode.states)
+        parameters: list[Parameter] = []
+        self._places: dict[str, list[int]] = {}
+        for parameter in ode.parameters:
+            first = len(parameters)
+            if parameter.per_run and len(runs) > 1:
+                self._places[parameter.name] = [first + r for r in range(len(runs))]
+                parameters += [
+                    dataclasses.replace(parameter, name=f"{parameter.name}[{r}]") for r in range(len(runs))
+                ]
+            else:
+                self._places[parameter.name] = [first]
+                parameters.append(parameter)
+        # Which parameter, and which run's, each column is; initial states act on no rate.
+        self._owner: dict[int, tuple[str, int | None]] = {
+            place: (name, None if len(places) == 1 else r)
+            for name, places in self._places.items() for r, place in enumerate(places)
+        }  # fmt: skip
+        self._initial: list[dict[str, Any]] = []
+        self.initial_names: list[str] = []
+        for r, run in enumerate(runs):
+            if unknown := [name for name in run.initial if name not in self._states]:
+                raise RecordingError(f"Expected initial values of states {list(self._states)}. Got {unknown}.")
+            known: dict[str, Any] = {}
+            for state, unit in ode.states.items():
+                if state in run.initial:
+                    known[state] = float(run.initial[state])
+                elif state in ode.initial:
+                    known[state] = ode.initial[state]
+                else:
+                    name = f"{state}(0)" if len(runs) == 1 else f"{state}(0)[{r}]"
+                    known[state] = ("free", len(parameters))
+                    self.initial_names.append(name)
+                    seen = state in recording.outputs and state in ode.outputs
+                    first_seen = _first_seen(run, state) if seen else None
+                    parameters.append(Parameter(name, unit=unit, initial=first_seen))
+            self._initial.append(known)
+        self.parameters = tuple(parameters)
+
+    @property
+    def nuisance(self) -> tuple[str, ...]:
+        """What each run has for itself: unknown initial states and per-run parameters."""
+        own = [i for i, (_, run) in sorted(self._owner.items()) if run is not None]
+        return (*(self.parameters[i].name for i in own), *self.initial_names)
+
+    def by_name(self, values: Tensor, run_of: Tensor | None = None) -> dict[str, Tensor]:
+        """Parameters by name, ``(H, 1)`` or ``(H, R)``; those of runs picked by ``run_of`` ``(M,)`` where given."""
+        found = {}
+        for name, places in self._places.items():
+            block = values[..., places]
+            found[name] = block if len(places) == 1 or run_of is None else block[..., run_of]
+        return found
+
+    def leaves(self, values: Tensor, run_of: Tensor, columns: Sequence[int]) -> dict[str, Tensor]:
+        """The same, where those of some columns are spread over points ``(H, M)`` as leaves of a graph."""
+        wanted = set(columns)
+        found = {}
+        for name, places in self._places.items():
+            block = values[..., places]
+            spread = block.expand(-1, len(run_of)) if len(places) == 1 else block[..., run_of]
+            if wanted & set(places):
+                found[name] = spread.clone().requires_grad_(True)
+            else:
+                found[name] = block if len(places) == 1 else spread
+        return found
+
+    def derivatives(
+        self, result: Tensor, begin: Tensor, leaves: dict[str, Tensor], run_of: Tensor, columns: Sequence[int]
+    ) -> tuple[Tensor, Tensor]:
+        """Derivatives of pointwise results ``(H, M, O)`` by states ``(H, M, O, S)`` and columns ``(H, M, O, C)``.
+
+        Every point depends on its own state and parameters alone, so that one backward pass for each component of the
+        result gives the derivatives at all points.
+        """
+        names = [name for name, leaf in leaves.items() if leaf.requires_grad]
+        inputs = [begin, *(leaves[name] for name in names)]
+        by_state, by_column = [], []
+        for k in range(result.shape[-1]):
+            part = result[..., k]
+            grads: Sequence[Tensor | None] = [None] * len(inputs)
+            if part.requires_grad:
+                keep = k + 1 < result.shape[-1]
+                grads = torch.autograd.grad(part.sum(), inputs, retain_graph=keep, allow_unused=True)
+            by_state.append(torch.zeros_like(begin) if grads[0] is None else grads[0])
+            own = dict(zip(names, grads[1:], strict=True))
+            rows = []
+            for column in columns:
+                name, run = self._owner.get(column, ("", None))
+                grad = own.get(name)
+                if grad is None:
+                    rows.append(torch.zeros_like(part))
+                else:
+                    rows.append(grad if run is None else grad * (run_of == run))
+            by_column.append(torch.stack(rows, dim=-1) if rows else part.new_zeros(*part.shape, 0))
+        return torch.stack(by_state, dim=-2), torch.stack(by_column, dim=-2)
+
+    def start(self, values: Tensor) -> Tensor:
+        """Initial states ``(H, R, S)``."""
+        rows = []
+        for r, known in enumerate(self._initial):
+            entries: dict[str, Tensor] = {}
+            own = {name: values[..., places[0 if len(places) == 1 else r], None]
+                   for name, places in self._places.items()}  # fmt: skip
+            for state, value in known.items():
+                if isinstance(value, tuple):
+                    entries[state] = values[..., value[1], None]
+                elif isinstance(value, float | int):
+                    entries[state] = values.new_full((*values.shape[:-1], 1), float(value))
+            for state, value in known.items():
+                try:
+                    if isinstance(value, str):
+                        entries[state] = entries[value]
+                    elif callable(value):
+                        entries[state] = value(entries, own) + torch.zeros_like(values[..., :1])
+                except Exception as error:
+                    raise SimulatorError(
+                        f"Expected the initial value of {state!r} from those of {list(entries)}, which are known by "
+                        f"then, and parameters {list(own)}. It raised {type(error).__name__}: {error}."
+                    ) from error
+            rows.append(torch.cat([entries[state] for state in self._states], dim=-1))
+        return torch.stack(rows, dim=-2)
+
+    def start_slopes(self, values: Tensor) -> Tensor:
+        """∂ initial states / ∂ columns, ``(H, R, S, P)``."""
+        with torch.enable_grad():
+            leaf = values.detach().requires_grad_(True)
+            start = self.start(leaf)
+            rows = []
+            for part in start.flatten(1).unbind(-1):
+                grad = torch.autograd.grad(part.sum(), leaf, retain_graph=True)[0] if part.requires_grad else None
+                rows.append(torch.zeros_like(leaf) if grad is None else grad)
+        return torch.stack(rows, dim=1).unflatten(1, start.shape[1:])
+
+
+def _first_seen(run: Run, output: str) -> float | None:
+    """The first recorded value of an output."""
+    values = run.outputs.get(output)
+    if values is None:
+        return None
+    seen = values[~torch.isnan(values)]
+    return float(seen[0]) if len(seen) else None
