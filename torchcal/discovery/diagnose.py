@@ -19,10 +19,12 @@ from torchcal.discovery.embedded import embed_each, model_error_sd
 from torchcal.discovery.experiment import propose
 from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.limits import limits
+from torchcal.discovery.model import PRIOR, Model
+from torchcal.discovery.own_noise import outliers
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.records import NONE, Estimate, Hypothesis, Scores, Table
 from torchcal.discovery.result import Diagnosis
-from torchcal.discovery.search import PRIOR, Model, Search, describe
+from torchcal.discovery.search import Search
 from torchcal.discovery.several import refit_several
 from torchcal.discovery.verdict import PLAINLY_WHITE, Decision, decide
 from torchcal.discovery.windows import refit_local
@@ -124,11 +126,11 @@ def diagnose(
         detected = _refit(search, confidence)
         seen = [search.problem.keep]
         for _ in range(ROUNDS):
-            outliers = search.outliers(problem.keep) if detected else None
-            if outliers is None or any(torch.equal(keep, problem.keep & ~outliers) for keep in seen):
+            sticking = outliers(search, problem.keep) if detected else None
+            if sticking is None or any(torch.equal(keep, problem.keep & ~sticking) for keep in seen):
                 break
             # Others than at the base, whose misfit hides them and looks like some.
-            search = dataclasses.replace(search, problem=problem.keeping(~outliers), clean=True)
+            search = dataclasses.replace(search, problem=problem.keeping(~sticking), clean=True)
             seen.append(search.problem.keep)
             search.calibrate_base()
             detected = _refit(search, confidence)
@@ -388,7 +390,7 @@ def _ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[H
                 held_out_rmse=held,
                 score=search.screening.score(model.numbers[0]) if len(model.numbers) == 1 else None,
                 refitted=True,
-                region=describe(model),
+                region=model.where,
                 aliases=tuple(search.aliases.get(model.numbers[0], ())) if len(model.numbers) == 1 else (),
                 note=model.note,
             )

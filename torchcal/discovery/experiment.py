@@ -9,9 +9,9 @@ from torch import Tensor
 
 from torchcal.data import Recording, Run
 from torchcal.discovery.fitting import Fitted
+from torchcal.discovery.model import Model
 from torchcal.discovery.noise import Noise
 from torchcal.discovery.records import Experiment
-from torchcal.discovery.search import Model
 from torchcal.errors import TorchcalError
 from torchcal.simulators import Trajectories
 

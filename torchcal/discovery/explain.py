@@ -9,8 +9,9 @@ from torch import Tensor
 from torchcal.discovery.channels import Channel
 from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.local import region_text
+from torchcal.discovery.model import Model
 from torchcal.discovery.records import Estimate, Fit, Location, MissingRate, NeededShift, Table
-from torchcal.discovery.search import Model, Search
+from torchcal.discovery.search import Search
 from torchcal.discovery.structure import Place, Structure
 
 __all__ = [

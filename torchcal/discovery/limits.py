@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.fitting import fit
+from torchcal.discovery.model import PRIOR
 from torchcal.discovery.records import Limit, Table
-from torchcal.discovery.search import PRIOR, Search
+from torchcal.discovery.search import Search
 from torchcal.terms import Term
 
 __all__ = ["limits"]

@@ -12,9 +12,11 @@ from torch import Tensor
 from torchcal.discovery.base import calibrate_base
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
 from torchcal.discovery.fitting import Fitted, refit, weighed
-from torchcal.discovery.likeliest import Tangents, alone, log_likelihood, settled, with_unknown
-from torchcal.discovery.local import ENDS, is_window, region_text
-from torchcal.discovery.noise import Noise, spikes
+from torchcal.discovery.likeliest import Tangents, settled, with_unknown
+from torchcal.discovery.local import ENDS, is_window
+from torchcal.discovery.model import PRIOR, Hypothetical, Model
+from torchcal.discovery.noise import Noise
+from torchcal.discovery.own_noise import suited
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.refits import Refit, refit_all
 from torchcal.discovery.screen import Screening, Window, screen, windows
@@ -23,10 +25,8 @@ from torchcal.discovery.verify import HeldOut, held_out_fit
 from torchcal.simulators import Trajectories
 from torchcal.terms import Term
 
-__all__ = ["Hypothetical", "Model", "Search"]
+__all__ = ["Search"]
 
-#: Prior probabilities: of the base, of one library term, of a local one, of two, and of something else.
-PRIOR = {"base": 0.30, "single": 0.35, "local": 0.13, "several": 0.11, "none": 0.11}
 #: Prior odds against an estimate on a physical bound that it wants to cross.
 UNPHYSICAL = math.log(1e-3)
 #: Single terms that are refitted at most.
@@ -35,69 +35,12 @@ MOST = 40
 FEW, CHANCE = 6, 0.2
 #: Shares of the linear estimate from which refits begin.
 STEPS = (0.05, 1.0)
-#: Log evidence of a model from which on what sticks out of it alone are outliers, and how many these may be.
-CLEAR, MOST_OUTLIERS = 10.0, 0.1
 #: Log evidence by which something unknown must explain the base's residual better than any noise, to be there.
 CLEARLY = 5.0
-#: Log odds from which on something unknown is clearly likelier than the best model.
-LIKELIER = 3.0
 #: Share of the best log evidence below which a model is not fitted again when the noise estimate has changed.
 HOPELESS = 0.5
 #: Correlation of projected tangents above which two candidates are one.
 SAME = 0.9999
-
-
-@dataclass(eq=False)
-class Model:
-    """A hypothesis that was refitted.
-
-    Attributes:
-        numbers: Numbers of its candidates in the library.
-        candidate: Terms, simulator and places of parameters.
-        found: Its fit.
-        log_evidence: Against the base, penalties for parameters included.
-        log_prior: Of the hypothesis.
-        physical: Whether nothing lies on a bound that it wants to cross.
-        price: Log penalty for its parameters.
-        in_use: Log evidence with the search's noise, in the end, when ``log_evidence`` is with its own.
-        note: What speaks against it.
-        window: Where it acts, if locally.
-        structure: What is left; filled in for the best.
-    """
-
-    numbers: tuple[int, ...]
-    candidate: Candidate
-    found: Fitted
-    log_evidence: float
-    log_prior: float
-    physical: bool
-    price: float = 0.0
-    in_use: float = 0.0
-    note: str = ""
-    window: Window | None = None
-    structure: Structure | None = None
-    residual: Residual | None = None
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of its terms."""
-        return tuple(term.name for term in self.candidate.terms)
-
-    @property
-    def weight(self) -> float:
-        """Log of prior times evidence."""
-        return self.log_evidence + self.log_prior
-
-
-@dataclass(frozen=True, eq=False)
-class Hypothetical:
-    """A hypothesis to refit: see `Model`; ``begin`` holds its starting values ``(H, P)``."""
-
-    numbers: tuple[int, ...]
-    candidate: Candidate
-    begin: Tensor
-    prior: float
-    window: Window | None = None
 
 
 @dataclass(eq=False)
@@ -145,8 +88,6 @@ class Search:
             noise, evidence = self.with_unknown(self.base)
             if evidence - settled(self.base, self.noise, self.tangents)[1] > CLEARLY:
                 self.noise, self.base = noise, refit(self.base, noise.whitening(self.problem))
-
-    # --- screening --------------------------------------------------------------------------------------
 
     def screen_all(self) -> None:
         """Tangents of all candidates, and whether there is more than noise."""
@@ -207,8 +148,6 @@ class Search:
         a, b = self.candidates[i], self.candidates[j]
         u, v = a.tangents[0, :, 0], b.tangents[0, :, 0]
         return float((u @ v).abs()) >= (1 - 1e-9) * float(u.norm() * v.norm())
-
-    # --- refits -----------------------------------------------------------------------------------------
 
     def refit_singles(self, *, detected: bool = True) -> None:
         """Every candidate that the screening leaves a chance; where nothing was detected only the leading few."""
@@ -298,7 +237,7 @@ class Search:
     ) -> Model | None:
         return self.refit_together([Hypothetical(numbers, candidate, begin, prior, window)])[0]
 
-    def refit_together(self, wanted: Sequence["Hypothetical"]) -> list[Model | None]:
+    def refit_together(self, wanted: Sequence[Hypothetical]) -> list[Model | None]:
         """Refit several hypotheses, on the executor where there is one."""
         jobs = []
         for one in wanted:
@@ -351,10 +290,11 @@ class Search:
             model.note = ""
         parameters = len([i for i in candidate.own if names[i] not in off])
         model.price = -0.5 * parameters * math.log(self.problem.n) + (UNPHYSICAL if new and not off else 0.0)
-        model.log_evidence = self._gain(found.chi2) + model.price
+        model.log_evidence = self.gain(found.chi2) + model.price
         return model
 
-    def _gain(self, chi2: float) -> float:
+    def gain(self, chi2: float) -> float:
+        """Log evidence of a fit against the base, without its price."""
         if self.exact:  # the size of the misfit is all that is known
             floor = 1e-12 * max(self.base.chi2, 1e-300)
             return 0.5 * self.problem.n * math.log(max(self.base.chi2, floor) / max(chi2, floor))
@@ -367,7 +307,7 @@ class Search:
         best = max(self.models, key=lambda model: model.weight)
         if best.log_evidence < 3.0:
             return
-        fresh = self._suited([m for m in self.models if m.log_evidence > HOPELESS * best.log_evidence])
+        fresh = suited(self, [m for m in self.models if m.log_evidence > HOPELESS * best.log_evidence])
         old = self.noise
         change = float((fresh.sd / old.sd).log().abs().max()) + float((fresh.correlation - old.correlation).abs().max())
         if change < 0.05:
@@ -384,62 +324,11 @@ class Search:
         self.screening = screen(self.residual, self.candidates)
         self.structure = analyse(self.residual, every=True)
 
-    def _suited(self, models: Sequence[Model]) -> Noise:
-        """The noise of the likeliest hypothesis, each with its own: of these models, or of something unknown where that
-        is clearly likelier."""
-        own = {id(m): alone(m.found, self.noise, self.tangents) for m in models}
-        best = max(models, key=lambda m: own[id(m)][1] + self._prior(m))
-        noise, value = settled(best.found, self.noise, self.tangents)
-        value += self._prior(best) + LIKELIER
-        for found, prior in ((self.base, 0.0), (best.found, self._prior(best))):
-            other, evidence = self.with_unknown(found)
-            if evidence + prior + math.log(PRIOR["none"]) > value:
-                noise, value = other, evidence + prior + math.log(PRIOR["none"])
-        return noise
-
     def with_unknown(self, found: Fitted) -> tuple[Noise, float]:
         """Noise and log evidence of something unknown beside a fit; computed once."""
         if id(found) not in self._unknown:  # the fit is kept beside it, so that its id stays its own
             self._unknown[id(found)] = found, with_unknown(found, self.problem.recording.noise, self.tangents)
         return self._unknown[id(found)][1]
-
-    def _prior(self, model: Model) -> float:
-        """Log prior of a model with the price of its parameters."""
-        return model.log_prior + model.price
-
-    def own_noise(self) -> tuple[float, float]:
-        """Weigh every model against the base, each of them with its own noise.
-
-        Returns:
-            Log evidence of something unknown, and that of the base as it stands here, against the base with its own.
-        """
-        base = settled(self.base, self.noise, self.tangents)[1]
-        here = log_likelihood(self.base, self.noise, self.tangents) - base
-        for model in self.models:
-            found = alone(model.found, self.noise, self.tangents)[1] - base
-            model.in_use = self._gain(model.found.chi2) + here + model.price
-            model.log_evidence = max(found + model.price, model.in_use)
-        best = max(self.models, key=lambda model: model.weight, default=None)
-        unknown = [self.with_unknown(self.base)[1]]
-        if best is not None:
-            unknown.append(self.with_unknown(best.found)[1] + self._prior(best))
-        return max(unknown) - base, min(here, 0.0)
-
-    def outliers(self, observed: Tensor) -> Tensor | None:
-        """Data that stick out alone once the best model explains the rest, bool ``(n_total,)``; None where nothing
-        explains enough to tell. All ``observed`` data are judged, those that are set aside too."""
-        best = max(self.models, key=lambda model: model.weight, default=None)
-        if self.exact or best is None or best.log_evidence < CLEAR:
-            return None
-        given = self.problem.recording.noise
-        whole = dataclasses.replace(best.found.problem, keep=observed)
-        found = refit(best.found, self.noise.whitening(whole), whole)  # what was set aside may be the effect itself
-        bad = spikes(whole, found.residual, given if isinstance(given, Tensor) else None)
-        outliers = torch.zeros_like(observed)
-        outliers[whole.index[bad]] = True
-        return outliers if float(bad.double().mean()) <= MOST_OUTLIERS else None
-
-    # --- several terms ----------------------------------------------------------------------------------
 
     def examine(self, model: Model) -> Structure:
         """What is left after a model."""
@@ -467,8 +356,3 @@ def _joint(nulls: Sequence[Tensor], seen: Sequence[float]) -> tuple[float, Tenso
         return 1.0, torch.ones(draws, dtype=torch.float64)
     least = torch.stack(ranks).amin(0)
     return (1.0 + float((least <= min(p)).sum())) / (1.0 + draws), least
-
-
-def describe(model: Model) -> str | None:
-    """Where a local model acts."""
-    return None if model.window is None else region_text(model.window.driver, model.window.low, model.window.high)

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
+from torchcal.discovery.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.screen import screen
-from torchcal.discovery.search import PRIOR, Hypothetical, Model, Search
+from torchcal.discovery.search import Search
 from torchcal.discovery.structure import Residual
 from torchcal.errors import DomainError, SimulatorError
 

@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from torchcal.discovery import explain, verify
+from torchcal.discovery.model import PRIOR, Model
+from torchcal.discovery.own_noise import weigh_alone
 from torchcal.discovery.records import NONE
-from torchcal.discovery.search import PRIOR, Model, Search
+from torchcal.discovery.search import Search
 from torchcal.discovery.structure import Structure
 
 __all__ = ["Decision", "decide"]
@@ -100,7 +102,7 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         return _decide_exact(search, ranked, mask, decision)
     decision.none_evidence = math.log(PRIOR["none"])
     if detected:
-        unknown, here = search.own_noise()
+        unknown, here = weigh_alone(search)
         ranked.sort(key=lambda m: -m.weight)
         decision.none_evidence = max(_none_evidence(search, ranked, here), unknown + decision.none_evidence)
     _weigh(search, decision)

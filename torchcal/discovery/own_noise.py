@@ -1,0 +1,72 @@
+"""Which noise suits the hypotheses of a search, and what sticks out once the best of them explains the rest."""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.fitting import refit
+from torchcal.discovery.likeliest import alone, log_likelihood, settled
+from torchcal.discovery.model import PRIOR, Model
+from torchcal.discovery.noise import Noise, spikes
+
+if TYPE_CHECKING:
+    from torchcal.discovery.search import Search
+
+__all__ = ["outliers", "suited", "weigh_alone"]
+
+#: Log evidence of a model from which on what sticks out of it alone are outliers, and how many these may be.
+CLEAR, MOST_OUTLIERS = 10.0, 0.1
+#: Log odds from which on something unknown is clearly likelier than the best model.
+LIKELIER = 3.0
+
+
+def suited(search: "Search", models: Sequence[Model]) -> Noise:
+    """The noise of the likeliest hypothesis, each with its own: of these models, or of something unknown where that is
+    clearly likelier."""
+    own = {id(m): alone(m.found, search.noise, search.tangents) for m in models}
+    best = max(models, key=lambda m: own[id(m)][1] + m.prior)
+    noise, value = settled(best.found, search.noise, search.tangents)
+    value += best.prior + LIKELIER
+    for found, prior in ((search.base, 0.0), (best.found, best.prior)):
+        other, evidence = search.with_unknown(found)
+        if evidence + prior + math.log(PRIOR["none"]) > value:
+            noise, value = other, evidence + prior + math.log(PRIOR["none"])
+    return noise
+
+
+def weigh_alone(search: "Search") -> tuple[float, float]:
+    """Weigh every model against the base, each of them with its own noise.
+
+    Returns:
+        Log evidence of something unknown, and that of the base as it stands here, against the base with its own.
+    """
+    base = settled(search.base, search.noise, search.tangents)[1]
+    here = log_likelihood(search.base, search.noise, search.tangents) - base
+    for model in search.models:
+        found = alone(model.found, search.noise, search.tangents)[1] - base
+        model.in_use = search.gain(model.found.chi2) + here + model.price
+        model.log_evidence = max(found + model.price, model.in_use)
+    best = max(search.models, key=lambda model: model.weight, default=None)
+    unknown = [search.with_unknown(search.base)[1]]
+    if best is not None:
+        unknown.append(search.with_unknown(best.found)[1] + best.prior)
+    return max(unknown) - base, min(here, 0.0)
+
+
+def outliers(search: "Search", observed: Tensor) -> Tensor | None:
+    """Data that stick out alone once the best model explains the rest, bool ``(n_total,)``; None where nothing explains
+    enough to tell. All ``observed`` data are judged, those that are set aside too."""
+    best = max(search.models, key=lambda model: model.weight, default=None)
+    if search.exact or best is None or best.log_evidence < CLEAR:
+        return None
+    given = search.problem.recording.noise
+    whole = dataclasses.replace(best.found.problem, keep=observed)
+    found = refit(best.found, search.noise.whitening(whole), whole)  # what was set aside may be the effect itself
+    bad = spikes(whole, found.residual, given if isinstance(given, Tensor) else None)
+    sticking = torch.zeros_like(observed)
+    sticking[whole.index[bad]] = True
+    return sticking if float(bad.double().mean()) <= MOST_OUTLIERS else None
