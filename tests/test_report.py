@@ -13,9 +13,10 @@ import pytest
 import torch
 from test_plots_discovery import NASTY, STAND_INS, cooling, ignition, oscillator, unexplained
 
-from torchcal import report
 from torchcal.discovery.records import Hypothesis
 from torchcal.errors import DomainError
+from torchcal.report import diagnosis_page as report
+from torchcal.report import markup
 
 VOID = {"meta", "img", "br"}
 
@@ -187,14 +188,14 @@ def test_a_long_table_is_cut_and_says_so():
 
 
 def test_numbers_that_are_none_or_infinite():
-    assert [report._number(value) for value in (None, float("nan"), float("inf"), -float("inf"), -1e-7)] == [
+    assert [markup.in_digits(value) for value in (None, float("nan"), float("inf"), -float("inf"), -1e-7)] == [
         "–", "–", "∞", "−∞", "−1e−07"
     ]  # fmt: skip
-    assert [report._percent(value) for value in (None, 0.0, 1e-9, 0.5, 0.9999, 1.0)] == [
+    assert [markup.in_percent(value) for value in (None, 0.0, 1e-9, 0.5, 0.9999, 1.0)] == [
         "–", "0.0 %", "<0.1 %", "50.0 %", ">99.9 %", "100.0 %"
     ]  # fmt: skip
-    assert report._value(torch.arange(9.0)) == "0 … 8 (9 values)"
-    assert report._value({"a": [1, True, None]}) == "a: 1, yes, –"
+    assert markup.in_words(torch.arange(9.0)) == "0 … 8 (9 values)"
+    assert markup.in_words({"a": [1, True, None]}) == "a: 1, yes, –"
 
 
 # --- writing ---------------------------------------------------------------------------------------------
