@@ -62,9 +62,9 @@ def calibrate_additive(
         sampler: ``"nuts"``, all chains as one batched tensor program; ``"hmc"``, the same with one trajectory length
             for all chains, faster where many draws of a few α are wanted; or ``"pyro"``, Pyro's NUTS on the Pyro
             model, chain after chain, which is the reference.
-        target_accept: Mean acceptance that the step size aims at, between 0 and 1; by default 0.8, and more where
-            trajectories diverge: draws among which more than one in 10,000 diverged are drawn anew with smaller steps,
-            up to twice (not by ``"pyro"``, nor where this is given).
+        target_accept: Mean acceptance that the step size aims at, between 0 and 1; by default 0.65 for
+            ``"nuts"``, 0.8 for the others, and more where trajectories diverge: draws among which more than one in
+            10,000 diverged are drawn anew with smaller steps, up to twice (not by ``"pyro"``, nor where this is given).
         progress: Whether to show a bar.
 
     Raises:

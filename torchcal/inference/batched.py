@@ -22,6 +22,11 @@ __all__ = ["MOST_ELEMENTS", "run_batched"]
 _WINDOWS = (0.3, 0.3, 0.4)
 """Shares of the warm-up: two windows that end in new coordinates, and one that sets the step size for good."""
 
+TARGET = {"nuts": 0.65, "hmc": 0.8}
+"""Mean acceptance that the first steps aim at. For No-U-Turn the cost of an effective draw is flat between 0.6 and 0.9
+(Betancourt, Byrne & Girolami 2014, arXiv:1411.6669); of the posteriors in ``benchmarks/sampling`` it is lowest at the
+lower end. Divergences raise it."""
+
 DIVERGING = 5e-4
 """Share of divergent transitions at the end of the warm-up from which on smaller steps are tried."""
 
@@ -178,7 +183,7 @@ def run_batched(
         seed: Of every random number.
         kernel: ``"nuts"`` or ``"hmc"``.
         cost: Numbers that one evaluation of one chain handles; dear densities warm up with fewer chains.
-        target_accept: Mean acceptance that the step size aims at; by default 0.8, and more where trajectories
+        target_accept: Mean acceptance that the step size aims at; by default `TARGET`, and more where trajectories
             diverge at the end of the warm-up, or later (then draws are drawn anew, up to twice): a curved ridge needs
             smaller steps than its width suggests.
         max_tree_depth: Largest depth of a No-U-Turn tree, 2**depth steps.
@@ -200,7 +205,10 @@ def run_batched(
         z, groups = starting_points(space, modes, crowd, generator)
         lowest = space.height(space.inner(torch.stack([mode.loc for mode in modes])))[groups]
         space, z = gathered(space, z, groups, lowest, generator)
-        space, z, averaging = _warm_up(moves, space, z, groups, num_warmup, target_accept, bar)
+        averaging = _DualAveraging(math.log(0.5), TARGET[kernel] if target_accept is None else target_accept)
+        space, z, averaging = _warm_up(
+            moves, space, z, groups, num_warmup, averaging, bar, stricter=target_accept is None
+        )
         owners = groups[:num_chains]
         for repeat in range(_REPEATS + 1):
             collector = _Collector(num_chains, len(loc), loc) if repeat else drawn
@@ -270,11 +278,12 @@ def _warm_up(
     z: Tensor,
     groups: Tensor,
     num_warmup: int,
-    target_accept: float | None,
+    averaging: _DualAveraging,
     bar: tqdm,
+    *,
+    stricter: bool,
 ) -> tuple[Whitened, Tensor, _DualAveraging]:
     """Coordinates, positions in them, and the step size."""
-    averaging = _DualAveraging(math.log(0.5), 0.8 if target_accept is None else target_accept)
     diverging, length = 0.0, 0
     for number, share in enumerate(_WINDOWS):
         length = max(4, round(share * num_warmup))
@@ -285,7 +294,7 @@ def _warm_up(
             space = other
             z = moves.tune(z, groups, space, averaging.settled)
             averaging = _DualAveraging(averaging.averaged, averaging.target)
-    while target_accept is None and diverging > DIVERGING and averaging.target < _STRICTEST:
+    while stricter and diverging > DIVERGING and averaging.target < _STRICTEST:
         averaging = averaging.stricter()
         _, _, z, diverging = _adapt(moves, space, z, averaging, length, bar)
     return space, z, averaging
