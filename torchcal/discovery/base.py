@@ -18,6 +18,8 @@ __all__ = ["calibrate_base"]
 
 #: The solver's error against the noise.
 SOLVER_SHARE = 0.05
+#: How often steps are made four times shorter where no starting value has a finite solution.
+STEEP = 3
 
 
 def calibrate_base(
@@ -45,10 +47,18 @@ def calibrate_base(
     for i, value in held.items():
         begin[:, i] = value
     found = _from_starts(problem, begin, free, rough, outputs)
+    for _ in range(STEEP):
+        simulator = problem.simulator
+        if found is not None or not isinstance(simulator, Trajectories) or simulator.ode.max_step is not None:
+            break
+        problem = dataclasses.replace(problem, simulator=simulator.refined(4))  # too stiff for steps so long
+        found = _from_starts(problem, begin, free, rough, outputs)
     if found is None:
         raise ConvergenceError(
-            "Expected finite outputs of the base at one of the starting values at least. Got none in "
-            f"{num_starts} (give initial= or bounds to the parameters)."
+            f"Expected finite outputs of the base at one of {num_starts} starting values at least. Got none, the first "
+            f"with {_point(problem, begin[0], free)}. Give initial= near the truth, or bounds, to the parameters (a "
+            "rate is about 1 over the time in which something happens); look at the runs' initial values; and of a "
+            "stiff model replace a fast state by its equilibrium, or give max_step=."
         )
     found = _sharpen(found)
     if not exact and not clean:
@@ -126,6 +136,11 @@ def _sharpen(found: Fitted) -> Fitted:
         found = found if again is None else again
     raise SimulatorError(
         "Expected the solution to settle when time steps are halved. Got a change of "
-        f"{float(error.max()):.3g} after 7 times (a stiff or discontinuous model: smooth it, give max_step=, or "
-        "rescale it)."
+        f"{float(error.max()):.3g} after 7 times, with {_point(found.problem, found.values, found.free)} (a stiff or "
+        "discontinuous model: smooth it, give max_step=, or rescale it; or a fit that an initial= far from the truth "
+        "led astray)."
     )
+
+
+def _point(problem: Problem, values: Tensor, free: list[int]) -> str:
+    return ", ".join(f"{problem.parameters[i].name} = {float(values[i]):.3g}" for i in free)

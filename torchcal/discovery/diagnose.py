@@ -321,6 +321,7 @@ def _result(
             "seed": seed,
             "withdrawn": decision.withdrawn,
             "nearly": decision.nearly,
+            "region": None if best is None else best.where,
             "solver": _solver(search.problem.simulator),
         },
         seconds=time.perf_counter() - begun,
@@ -398,7 +399,9 @@ def _ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[H
     fitted = {m.numbers for m in search.models}
     for i, candidate in enumerate(search.candidates):
         if (i,) not in fitted:
-            note = "" if candidate.blind or search.screening.best[i] >= 0 else "already in the base model"
+            seen = candidate.blind or search.screening.best[i] >= 0
+            note = "" if seen else "already in the base model"
+            note = "no fit from any starting value" if i in search.failed else note
             rows.append(Hypothesis((candidate.name,), -math.inf, 0.0, score=search.screening.score(i), note=note))
     rows.append(
         Hypothesis((), 0.0, decision.base, p_white=search.structure.p_value, refitted=True, note="the base alone")

@@ -19,6 +19,8 @@ __all__ = ["propose"]
 
 #: Distance in noise sd below which more samples are asked for, and how many times as many.
 ENOUGH, DENSER = 6.0, 4
+#: Distance below which an experiment tells nothing apart.
+LEAST = 2.0
 
 #: How much larger the distance must be for a less simple experiment.
 WORTH = 1.01
@@ -32,7 +34,7 @@ def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
     Runs are repeated with other initial states, stronger or weaker inputs, or for longer; static conditions are moved
     beyond their range or gathered in a third of it. Where none separates the models well, the best is asked for with
     more samples. The predicted distance is what is left after every model's parameters have been fitted to old and new
-    data together (linearised).
+    data together (linearised). None where no experiment separates them by `LEAST` noise sd.
     """
     if len(models) < 2:
         return None
@@ -43,7 +45,7 @@ def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
         best = _better(best, option, models, noise)
     if best is not None and best.separation < ENOUGH:
         best = _better(best, _denser(best, problem.recording), models, noise)
-    return best
+    return best if best is not None and best.separation >= LEAST else None
 
 
 def _better(best: Experiment | None, option: Option, models: Sequence[Model], noise: Noise) -> Experiment | None:
@@ -130,7 +132,10 @@ def _in_time(model: Fitted) -> list[Option]:
         name: float(states[0, 0, 0, i]) for i, name in enumerate(bound.ode.states) if name not in bound.ode.initial
     }
     options: list[tuple[str, dict[str, float], float, float]] = [("the first run again", known, 1.0, 1.0)]
-    for factor in (2.0, 0.5, 3.0, -1.0):
+    # Only what has had either sign is mirrored: an absolute temperature or an amount cannot be.
+    mirrored = all(bool((states[..., i] < 0).any() and (states[..., i] > 0).any())
+                   for i, name in enumerate(bound.ode.states) if name in known)  # fmt: skip
+    for factor in (2.0, 0.5, 3.0, -1.0) if mirrored else (2.0, 0.5, 3.0):
         options.append(
             (
                 f"a run that starts from {factor:g} times the initial states of the first",

@@ -17,6 +17,8 @@ TOLERANCE = 1e-7
 MAX_STEPS = 60
 #: Samples that the slope at the beginning is taken from.
 SLOPES = (12, 24, 48)
+#: How many times longer or shorter than 1 a run must be for rates to be guessed from it.
+LONG = 30.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +75,15 @@ class Fitted:
 
 
 def starts(problem: Problem, count: int, seed: int, fixed: dict[int, float] | None = None) -> Tensor:
-    """Starting values ``(count, P)``: first guesses, then ever wilder ones within the bounds."""
+    """Starting values ``(count, P)``: first guesses, then ever wilder ones within the bounds.
+
+    Of runs that are far from 1 long, in whatever unit, every second start guesses positive parameters of which nothing
+    is known as rates: about 1 over the length.
+    """
+    length = max((float(run.time[-1] - run.time[0]) for run in problem.recording.runs or ()), default=1.0)
+    rate = torch.ones(count, dtype=torch.float64)
+    if not 1 / LONG < length < LONG:
+        rate[1::2] = 1.0 / length
     generator = torch.Generator().manual_seed(seed)
     columns = []
     spread = torch.linspace(0.0, 1.0, count, dtype=torch.float64) if count > 1 else torch.zeros(1, dtype=torch.float64)
@@ -94,7 +104,7 @@ def starts(problem: Problem, count: int, seed: int, fixed: dict[int, float] | No
             if q.transform == "log":
                 guess = q.low * (q.high / q.low) ** at
         elif positive:
-            guess = (1.5 * noise).exp() + (q.low or 0.0)
+            guess = (1.5 * noise).exp() * rate + (q.low or 0.0)
         else:
             guess = (q.initial or 0.0) + noise
         low = -torch.inf if q.low is None else q.low

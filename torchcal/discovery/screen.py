@@ -35,9 +35,10 @@ class Screening:
         amplitude: Number of its amplitude, ``(m,)``.
         norm: ‖s⊥‖, ``(m,)``.
         z: Score statistics, one-sided where physics is, ``(m,)``.
-        best: Best column of every candidate; −1 where its tangent vanishes.
+        best: Best column of every candidate; −1 where its tangent vanishes, or the base has it already.
+        acting: The same, and where the base has all of it already some column that it acts by: in a range of something
+            it may be new.
         null: Largest score in each simulated residual, ``(draws,)``.
-        vanished: Candidates without a tangent of their own.
     """
 
     columns: Tensor
@@ -47,8 +48,8 @@ class Screening:
     norm: Tensor
     z: Tensor
     best: list[int]
+    acting: list[int]
     null: Tensor
-    vanished: list[bool]
 
     def score(self, i: int) -> float:
         """Largest score of a candidate."""
@@ -88,14 +89,14 @@ def screen(residual: Residual, candidates: Sequence[Candidate]) -> Screening:
 
     z = scores(residual.e[:, None])[:, 0]
     owners = torch.tensor(owner, dtype=torch.long)
-    best, vanished = [], []
+    best, acting = [], []
     for i in range(len(candidates)):
         mine = (owners == i).nonzero()[:, 0]
-        usable = mine[good[mine]]
-        vanished.append(len(usable) == 0)
+        usable, moving = mine[good[mine]], mine[whole[:, mine].norm(dim=0) > 0]
         best.append(int(usable[z[usable].argmax()]) if len(usable) else -1)
+        acting.append(best[-1] if len(usable) or not len(moving) else int(moving[0]))
     null = scores(residual.null).amax(0) if columns.shape[1] else torch.zeros(residual.null.shape[1])
-    return Screening(columns, owners, torch.tensor(shape), torch.tensor(amplitude), norm, z, best, null, vanished)
+    return Screening(columns, owners, torch.tensor(shape), torch.tensor(amplitude), norm, z, best, acting, null)
 
 
 @dataclass(frozen=True)
@@ -131,7 +132,7 @@ def contributions(
     bound = found.problem.simulator
     chosen, parts = [], []
     for i, candidate in enumerate(candidates):
-        column = screening.best[i]
+        column = screening.acting[i]
         if column < 0 or any(term.states or term.frees for term in candidate.terms):
             continue
         values = candidate.begin.clone()
@@ -163,7 +164,7 @@ def windows(residual: Residual, candidates: Sequence[Candidate], screening: Scre
     null = torch.zeros(residual.null.shape[1], dtype=torch.float64)
     parts, drivers = contributions(residual, candidates, screening)
     for i, response in parts.items():
-        column = screening.best[i]
+        column = screening.acting[i]
         sign = candidates[i].one_sided(candidates[i].amplitudes[int(screening.amplitude[column])])
         mine, largest = windows_of(i, residual, response, drivers, sign)
         found += mine

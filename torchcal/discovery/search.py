@@ -68,6 +68,7 @@ class Search:
     aliases: dict[int, list[str]] = field(init=False, default_factory=dict)
     twins: dict[int, int] = field(init=False, default_factory=dict)
     gone: set[int] = field(init=False, default_factory=set)
+    failed: set[int] = field(init=False, default_factory=set)
     p_detect: float = field(init=False, default=1.0)
     least: Tensor = field(init=False)
     _unknown: dict[int, tuple[Fitted, tuple[Noise, float]]] = field(init=False, default_factory=dict)
@@ -159,7 +160,9 @@ class Search:
         promising = [i for k, i in enumerate(order) if k < FEW or self.screening.score(i) >= CHANCE * top]
         chosen = promising[:MOST] if detected else order[:FEW]
         wanted = [Hypothetical((i,), self.candidates[i], self._begin(i), prior) for i in [*chosen, *blind]]
-        self.models += [model for model in self.refit_together(wanted) if model is not None]
+        found = self.refit_together(wanted)
+        self.failed = {one.numbers[0] for one, model in zip(wanted, found, strict=True) if model is None}
+        self.models += [model for model in found if model is not None]
         self.reweigh()
         self.merge()
 
@@ -215,7 +218,9 @@ class Search:
         w = self.base.whitening
         slope = w(self.base.jacobian)
         unit = slope.norm(dim=0).clamp_min(1e-300)
-        return torch.linalg.lstsq(slope / unit, w(effect[:, None]), driver="gelsd").solution[:, 0] / unit
+        # Along directions that move no datum the parameters stay where they are.
+        found = torch.linalg.lstsq(slope / unit, w(effect[:, None]), rcond=1e-7, driver="gelsd")
+        return found.solution[:, 0] / unit
 
     def _blind_begin(self, candidate: Candidate) -> Tensor:
         """Amplitudes of all magnitudes, where the tangent says nothing."""
@@ -307,7 +312,8 @@ class Search:
         best = max(self.models, key=lambda model: model.weight)
         if best.log_evidence < 3.0:
             return
-        fresh = suited(self, [m for m in self.models if m.log_evidence > HOPELESS * best.log_evidence])
+        hopeful = [m for m in self.models if m.log_evidence > HOPELESS * best.log_evidence]
+        fresh = suited(self, hopeful)
         old = self.noise
         change = float((fresh.sd / old.sd).log().abs().max()) + float((fresh.correlation - old.correlation).abs().max())
         if change < 0.05:
@@ -315,7 +321,7 @@ class Search:
         self.noise = fresh
         self.base = refit(self.base, fresh.whitening(self.base.problem))
         for model in self.models:
-            if model.log_evidence > HOPELESS * best.log_evidence:
+            if model in hopeful:
                 model.found = refit(model.found, fresh.whitening(model.found.problem))
             else:
                 model.found = weighed(model.found, fresh.whitening(model.found.problem))

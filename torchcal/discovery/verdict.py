@@ -23,6 +23,8 @@ WHITE = 0.005
 #: Structure left with at least this probability is none; and the share of its log evidence by which a linear estimate
 #: of something unknown, which is not refitted, may be too large.
 PLAINLY_WHITE, LINEAR = 0.05, 0.02
+#: By how much more than the sd that is given a named model may miss the data, beyond chance: such sd are seldom exact.
+LARGER, CHANCE = 1.25, 3.0
 #: Data a free parameter below which a fit without held-out data names nothing.
 LEAST_FITTED = 4
 #: Of the tied hypotheses, those that together have this probability are listed.
@@ -110,7 +112,7 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         decision.verdict = "consistent"
         return decision
     groups = _groups(ranked)
-    white = [m for m in ranked[:6] if search.examine(m).p_value >= WHITE]
+    white = [m for m in ranked[:6] if search.examine(m).p_value >= WHITE and _small(search, m)]
     if not white or decision.none > SURE:
         decision.verdict = "unexplained"
         _nearly(search, ranked, mask, decision)
@@ -149,6 +151,21 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     elif decision.none > 1 - SURE:
         decision.tied.append(list(NONE))
     return decision
+
+
+def _small(search: Search, model: Model) -> bool:
+    """Whether a model leaves no more than the noise that is given: correlated noise can look like what is left."""
+    noise = search.noise
+    if noise.open:
+        return True
+    problem = model.found.problem
+    standard = (model.found.residual / (noise.sd[problem.index] * noise.doubted)).square()
+    for number, rho in enumerate(noise.correlation.tolist()):
+        mine = standard[problem.output_of == number]
+        independent = len(mine) * (1 - rho**2) / (1 + rho**2)  # as many squares tell as much of their mean
+        if float(mine.mean()) > LARGER**2 * (1 + CHANCE * math.sqrt(2 / max(independent, 1.0))):
+            return False
+    return True
 
 
 def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) -> None:

@@ -103,7 +103,7 @@ def _around(search: Search, model: Model) -> list[Window]:
     bound = found.problem.simulator
     if term.states or term.frees or (term.outputs and isinstance(bound, Trajectories)):
         return []
-    column = search.screening.best[model.numbers[0]]
+    column = search.screening.acting[model.numbers[0]]
     if column < 0:
         return []
     names = [q.name for q in found.problem.parameters]
@@ -142,7 +142,7 @@ def _around(search: Search, model: Model) -> list[Window]:
 def _amplitude(search: Search, model: Model) -> tuple[int, str, float]:
     """Of a model of one term: the place of its amplitude, its name, and how far it is from neutral."""
     plain = search.candidates[model.numbers[0]]
-    column = search.screening.best[model.numbers[0]]  # local models come of candidates that have one
+    column = search.screening.acting[model.numbers[0]]  # local models come of candidates that have one
     name = plain.problem.parameters[search.amplitude(column)].name
     place = [q.name for q in model.found.problem.parameters].index(name)
     neutral = model.candidate.neutral[model.candidate.own.index(place)]
@@ -169,7 +169,7 @@ def refit_window(
         candidate = prepare(search.base.problem, search.base, [local], search.fixed, {})
     except (SimulatorError, DomainError):
         return None
-    column = search.screening.best[w.candidate]
+    column = search.screening.acting[w.candidate]
     amplitude = search.amplitude(column)
     names = [q.name for q in plain.problem.parameters]
     values = dict(zip([names[i] for i in plain.own], plain.shapes[int(search.screening.shape[column])].tolist(),

@@ -53,19 +53,27 @@ def _headline(d: Any) -> str:
     if d.verdict == "named":
         return f"Verdict: named: {_and([_with_region(d, name) for name in d.terms])}"
     if d.verdict == "ambiguous":
-        return "Verdict: ambiguous: " + ", or ".join(_hypothesis(tied) for tied in d.tied)
+        return "Verdict: ambiguous: " + ", or ".join(_hypothesis(d, tied) for tied in d.tied)
     return "Verdict: unexplained (something is missing that is not in this library)"
 
 
-def _hypothesis(terms: Sequence[str]) -> str:
-    return "something that is not in this library" if tuple(terms) == NONE else " with ".join(terms)
+def _hypothesis(d: Any, terms: Sequence[str]) -> str:
+    if tuple(terms) == NONE:
+        return "something that is not in this library"
+    rows = [row for row in d.ranking if row.refitted and set(row.terms) == set(terms)]
+    best = max(rows, key=lambda row: row.probability, default=None)
+    return " with ".join(terms) + (f" where {best.region}" if best is not None and best.region else "")
+
+
+def _accepted(d: Any) -> Any:
+    """The row of the ranking that is named."""
+    mine = [row for row in d.ranking if row.refitted and set(row.terms) == set(d.terms)]
+    return next((row for row in mine if row.region == d.settings.get("region")), mine[0] if mine else d.ranking[0])
 
 
 def _with_region(d: Any, name: str) -> str:
-    for row in d.ranking:
-        if row.refitted and set(row.terms) == set(d.terms) and row.region:
-            return f"{name}, where {row.region}"
-    return name
+    region = _accepted(d).region
+    return f"{name}, where {region}" if region else name
 
 
 def _detected(d: Any) -> str:
@@ -73,22 +81,34 @@ def _detected(d: Any) -> str:
     sd = ", ".join(f"{name} {value:.3g}" for name, value in noise.sd.items())
     if noise.source == "none":
         rmse = d.before.fitted.rmse
-        return f"The recording is declared free of noise; the calibrated base leaves an RMSE of {rmse:.4g}."
+        unit = _rmse_unit(d)
+        return f"The recording is declared free of noise; the calibrated base leaves an RMSE of {rmse:.4g}{unit}."
     text = f"Noise sd ({noise.source}): {sd}"
     correlated = [f"{name} {c:.2f}" for name, c in noise.correlation.items() if c >= 0.05]
     text += f", correlated from sample to sample ({', '.join(correlated)})" if correlated else ""
     text += f", {noise.outliers} outliers set aside" if noise.outliers else ""
-    text += f". The calibrated base leaves an RMSE of {d.before.fitted.rmse:.4g}; "
+    text += f". The calibrated base leaves an RMSE of {d.before.fitted.rmse:.4g}{_rmse_unit(d)}; "
     return text + f"noise alone would leave so much structure with probability {_probability(d.p_detect)}."
+
+
+def _rmse_unit(d: Any) -> str:
+    """What errors of several outputs are divided by."""
+    return " of each output's spread" if len(d.recording.outputs) > 1 else ""
 
 
 def _consistent(d: Any) -> list[str]:
     limits = [limit for limit in d.detection_limit if math.isfinite(limit.smallest)]
+    nothing = "There is no sign of missing physics."
+    if d.p_detect < 1 - d.confidence:
+        nothing = (
+            "Slow noise explains that structure at least as well as anything in the library, so that no physics is "
+            "called missing; a known noise sd, replicates or a repeated run would tell."
+        )
     if not limits:
-        return ["There is no sign of missing physics."]
+        return [nothing]
     shown = ", ".join(f"{limit.term} {limit.smallest:.3g} {limit.unit or ''}".rstrip() for limit in limits[:6])
     return [
-        "There is no sign of missing physics. The smallest effects that these data could have shown "
+        f"{nothing} The smallest effects that these data could have shown "
         f"(with probability {limits[0].power:.0%}): {shown}."
     ]
 
@@ -117,7 +137,7 @@ def _embedded(d: Any) -> str:
 def _proof(d: Any) -> str:
     if d.after is None:
         return ""
-    text = f"RMSE falls from {d.before.fitted.rmse:.4g} to {d.after.fitted.rmse:.4g}"
+    text = f"RMSE falls from {d.before.fitted.rmse:.4g} to {d.after.fitted.rmse:.4g}{_rmse_unit(d)}"
     if d.before.held_out is not None and d.after.held_out is not None:
         b, a = d.before.held_out, d.after.held_out
         text += (
@@ -132,10 +152,12 @@ def _proof(d: Any) -> str:
 
 
 def _named(d: Any) -> list[str]:
-    top = next((row for row in d.ranking if set(row.terms) == set(d.terms)), d.ranking[0])
+    top = _accepted(d)
     estimates = "; ".join(str(estimate) for estimate in top.estimates)
-    rival = next((row for row in d.ranking if row is not top and row.terms and row.refitted), None)
-    likely = "" if d.settings.get("nearly") else f"probability {top.probability:.3f}; "
+    others = [row for row in d.ranking if row.terms and row.refitted and set(row.terms) != set(top.terms)]
+    rival = max(others, key=lambda row: row.probability, default=None)
+    probability = sum(row.probability for row in d.ranking if set(row.terms) == set(top.terms))
+    likely = "" if d.settings.get("nearly") else f"probability {probability:.3f}; "
     parts = [
         _where(d),
         f"Adding {_and([_with_region(d, name) for name in d.terms])} and refitting everything removes "
@@ -175,6 +197,8 @@ def _ambiguous(d: Any) -> list[str]:
             f"What would tell them apart: {d.experiment.description} (predicted distance "
             f"{d.experiment.separation:.1f} noise sd)."
         )
+    elif len(known) > 1:
+        parts.append("None of the simple experiments that were tried in thought would tell them apart.")
     return parts
 
 

@@ -58,6 +58,8 @@ class ODESimulator(Simulator):
             raise DomainError(f"Expected rates as a function f(t, s, p, u). Got {type(rates).__name__}.")
         if isinstance(states, str) or not states or any(not isinstance(name, str) or not name for name in states):
             raise DomainError(f"Expected states as a dict from names to units. Got {states!r}.")
+        if len(set(states)) < len(states):
+            raise DomainError(f"Expected states of different names. Got {list(states)}.")
         if max_step is not None and not max_step > 0:
             raise DomainError(f"Expected max_step > 0 or None. Got {max_step!r}.")
         self.rates = rates

@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
-from torchcal.errors import DomainError
+from torchcal.errors import DomainError, SimulatorError, TorchcalError
 from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories
 
 __all__ = ["Term", "extend"]
@@ -133,6 +133,19 @@ class Term:
         """``p`` as the term's functions see it."""
         return {**p, **{parameter.name: p[self.full(parameter.name)] for parameter in self.parameters}}
 
+    def call(self, function: Function, *given: Any) -> Any:
+        """One of its functions on what it is given; an error in it is told as this term's."""
+        try:
+            return function(*given)
+        except TorchcalError:
+            raise
+        except Exception as error:
+            known = "; ".join(", ".join(part) for part in given if isinstance(part, Mapping) and part)
+            raise SimulatorError(
+                f"Expected a tensor from every function of the term {self.name!r}. One of them raised "
+                f"{type(error).__name__}: {error}. It was given {known}."
+            ) from error
+
     @property
     def is_sensor(self) -> bool:
         """Whether it changes what is seen and nothing else."""
@@ -205,7 +218,7 @@ def _extend_ode(simulator: ODESimulator, terms: Sequence[Term]) -> ODESimulator:
         for term in shifting:
             own = term.own(p)
             for name, function in term.shifts.items():
-                moved[name] = moved[name] + function(t, s, own, u)
+                moved[name] = moved[name] + term.call(function, t, s, own, u)
         return moved
 
     def rates(t: Any, s: dict[str, Tensor], p: dict[str, Tensor], u: dict[str, Tensor]) -> dict[str, Any]:
@@ -213,7 +226,7 @@ def _extend_ode(simulator: ODESimulator, terms: Sequence[Term]) -> ODESimulator:
         for term in terms:
             own = term.own(p)
             for state, function in term.rates.items():
-                value = function(t, s, own, u)
+                value = term.call(function, t, s, own, u)
                 found[state] = value if state in term.states else found[state] + value
         return found
 
@@ -240,7 +253,7 @@ def _sensed(name: str, function: Function, sensors: Sequence[Term], shifted: Fun
     def observe(t: Any, s: dict[str, Tensor], p: dict[str, Tensor], u: dict[str, Tensor]) -> Any:
         y = function(t, s, shifted(t, s, p, u), u)
         for term in sensors:
-            y = term.outputs[name](t, s, term.own(p), u, y)
+            y = term.call(term.outputs[name], t, s, term.own(p), u, y)
         return y
 
     return observe
@@ -265,7 +278,7 @@ def _extend_static(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
         for term in terms:
             own = term.own(p)
             for name, shift in term.shifts.items():
-                moved[name] = moved[name] + shift(x, own)
+                moved[name] = moved[name] + term.call(shift, x, own)
         result = simulator.function(x, moved)
         if not any(term.outputs for term in terms):
             return result
@@ -275,7 +288,7 @@ def _extend_static(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
                 place = name if name in found else "y" if not isinstance(result, Mapping) else name
                 if place not in found:
                     raise DomainError(f"Expected the term {term.name!r} on an output of {list(found)}. Got {name!r}.")
-                found[place] = sensor(x, term.own(p), found[place])
+                found[place] = term.call(sensor, x, term.own(p), found[place])
         return found if isinstance(result, Mapping) else found["y"]
 
     return Simulator(function, parameters)
