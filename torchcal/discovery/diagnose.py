@@ -308,7 +308,7 @@ def _result(
         ),
         shifts=explain.needed_shifts(search) if decision.verdict != "consistent" else [],
         missing=explain.missing_rate(search) if decision.verdict != "consistent" else None,
-        experiment=propose(decision.tied_models[:4], search.noise) if decision.tied_models else None,
+        experiment=propose(decision.tied_models, search.noise) if decision.tied_models else None,
         equations=explain.formulas(best) if best else [],
         identifiability=explain.identifiability(search),
         recording=recording,

@@ -19,6 +19,8 @@ __all__ = ["propose"]
 
 #: Distance in noise sd below which more samples are asked for, and how many times as many.
 ENOUGH, DENSER = 6.0, 4
+#: Models that are told apart at most.
+MOST = 4
 #: Distance below which an experiment tells nothing apart.
 LEAST = 2.0
 
@@ -36,6 +38,9 @@ def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
     more samples. The predicted distance is what is left after every model's parameters have been fitted to old and new
     data together (linearised). None where no experiment separates them by `LEAST` noise sd.
     """
+    # One with a term more than another predicts what that one does, and is told from it by its cost alone.
+    simple = [m for m in models if not any(set(other.names) < set(m.names) for other in models)]
+    models = (simple if len(simple) > 1 else models)[:MOST]
     if len(models) < 2:
         return None
     problem = models[0].found.problem

@@ -1,0 +1,210 @@
+"""What a diagnosis did wrong on recordings that others brought: each case once."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+import torchcal as tc
+from torchcal.discovery import experiment
+from torchcal.discovery.fitting import starts
+from torchcal.discovery.problem import Problem
+from torchcal.discovery.words import paragraph
+
+F64 = torch.float64
+
+
+def solve(rate, begin, t, **options):
+    """States ``(S, n)`` by SciPy."""
+    return solve_ivp(rate, (t[0], t[-1]), begin, t_eval=t, rtol=1e-9, atol=1e-10, **options).y
+
+
+def diagnose(simulator, recording, terms, **options):
+    return tc.diagnose(simulator, recording, terms, **{"seed": 0, "progress": False, **options})
+
+
+def decays(*, offset=0.06, **options):
+    """Three runs of a decay, the second with an offset."""
+    t, rng = np.linspace(0, 20, 60), np.random.default_rng(28)
+    runs = [
+        tc.Run(time=t, outputs={"A": a * np.exp(-0.2 * t) + (offset if a == 2 else 0) + 0.01 * rng.standard_normal(60)})
+        for a in (1.0, 2.0, 3.0)
+    ]
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"A": -p["k"] * s["A"]}, {"A": None}, [tc.Parameter("k", low=0.0, initial=0.1)]
+    )
+    return base, tc.Recording(runs=runs, **options)
+
+
+@pytest.fixture(scope="module")
+def heated():
+    """A thermometer that lags behind a body heated in steps, and terms for the lag of either: they do the same."""
+    t, rng, runs = np.arange(0, 240, 2.0), np.random.default_rng(20), []
+    for period in (40, 70):
+        q = ((t // period) % 2 == 0) * 1.0
+
+        def rate(at, x, q=q):
+            return [0.6 * np.interp(at, t, q) - 0.02 * (x[0] - 15), (x[0] - x[1]) * np.log(10) / 18]
+
+        y = solve(rate, [15, 15], t, max_step=0.5)[1] + 0.1 * rng.standard_normal(len(t))
+        runs.append(tc.Run(time=t, outputs={"T": y}, inputs={"q": q}, initial={"T": 15}))
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"T": p["b"] * u["q"] - p["k"] * (s["T"] - 15.0)},
+        {"T": "degC"},
+        [tc.Parameter("b", low=0.0, initial=0.4), tc.Parameter("k", low=0.0, initial=0.03)],
+    )
+    library = [*tc.terms.thermal("T", ambient=15.0, heater="q"), *tc.terms.sensor("T")]
+    return base, tc.Recording(runs=runs), [term for term in library if term.name in ("heater lag", "lag of T")]
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_what_does_the_same_is_tied_in_whatever_order_it_is_given(heated, order):
+    # The noise is estimated anew during the search, by a factor of three: all that was likely is fitted again.
+    base, recording, terms = heated
+    d = diagnose(base, recording, terms[::order])
+    assert d.verdict == "ambiguous"
+    assert sorted(d.tied) == [["heater lag"], ["lag of T"]]
+    first, second = (row for row in d.ranking if row.terms in (("heater lag",), ("lag of T",)))
+    assert first.log_evidence == pytest.approx(second.log_evidence, abs=0.1)
+
+
+def test_a_base_that_only_a_combination_of_can_be_told_still_gets_its_candidates():
+    # A rigid body of which one rotation is not seen: it and the coefficients can be scaled against each other.
+    t, rng, runs = np.linspace(0, 12, 80), np.random.default_rng(22), []
+    for begin in ([1.0, 0.1, 0.8], [0.3, 1.5, 0.2]):
+        w = solve(lambda t, w: [0.4 * w[1] * w[2], -0.7 * w[0] * w[2], 0.3 * w[0] * w[1] - 0.04 * w[2]], begin, t)
+        w = w[:2] + 0.02 * rng.standard_normal((2, 80))
+        runs.append(tc.Run(time=t, outputs={"w1": w[0], "w2": w[1]}))
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {
+            "w1": p["a"] * s["w2"] * s["w3"], "w2": -p["b"] * s["w1"] * s["w3"], "w3": p["c"] * s["w1"] * s["w2"],
+        },
+        ["w1", "w2", "w3"],
+        [tc.Parameter(name, low=0.0, initial=0.5) for name in "abc"],
+        observe=("w1", "w2"),
+    )  # fmt: skip
+    damping = tc.Term("damping", equation="w3", rate=lambda t, s, p, u: -p["d"] * s["w3"],
+                      parameters=[tc.Parameter("d", low=0.0)])  # fmt: skip
+    d = diagnose(base, tc.Recording(runs=runs), [damping])
+    assert d.terms == ["damping"]
+    assert float(d.ranking[0].estimates[0].value) == pytest.approx(0.04, abs=0.004)
+
+
+def test_what_the_base_has_everywhere_may_be_missing_in_a_window():
+    rng = np.random.default_rng(25)
+    x = torch.linspace(0, 10, 120, dtype=F64)
+    y = 1.0 + 0.5 * x - 0.4 * (x > 6) + 0.05 * torch.as_tensor(rng.standard_normal(120))
+    base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    offset = tc.Term("offset", outputs={"y": lambda x, p, y: y + p["o"]}, parameters=[tc.Parameter("o")])
+    d = diagnose(base, tc.Recording(x=x, y=y, noise=0.05), [offset])
+    assert d.terms == ["offset"]
+    best = d.ranking[0]
+    assert best.region is not None
+    assert float(best.estimates[0].value) == pytest.approx(-0.4, abs=0.08)
+    assert f"offset, where {best.region}" in str(d).splitlines()[0]
+    # Everywhere it is in the base, and said to be.
+    assert "offset cannot be told from the parameters of the base" in d.identifiability
+    # The sentence is about what was accepted.
+    words = " ".join(str(d).split())
+    assert f"offset, where {best.region}" in words
+    assert str(best.estimates[0]) in words
+
+
+def test_a_name_leaves_no_more_than_the_noise_that_is_given():
+    # An offset in one of three runs. Correlated noise of the given size can stand in for it, but not of its size.
+    base, recording = decays(noise=0.01)
+    d = diagnose(base, recording, [*tc.terms.kinetics("A"), *tc.terms.sensor("A")])
+    assert d.verdict in ("unexplained", "ambiguous")
+
+
+def test_structure_that_slow_noise_explains_is_said_to_be_there():
+    base, recording = decays()
+    d = diagnose(base, recording, list(tc.terms.sensor("A")))
+    text = " ".join(str(d).split())
+    assert d.verdict == "consistent"
+    assert d.p_detect < 0.01
+    assert "Slow noise explains that structure" in text
+    assert "no sign of missing physics" not in text
+
+
+@pytest.mark.parametrize(("shift", "mirrored"), [(0.0, True), (295.0, False)])
+def test_only_states_that_have_either_sign_are_mirrored(shift, mirrored):
+    t = torch.linspace(0, 10, 60, dtype=F64)
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * (s["x"] - shift)}, {"x": None, "v": None},
+        [tc.Parameter("k", low=0.0, initial=1.0)], initial={"v": 0.0}, observe=("x",),
+    )  # fmt: skip
+    run = tc.Run(time=t, outputs={"x": shift + t.cos()}, initial={"x": shift + 1.0})
+    problem = Problem.of(base, tc.Recording(runs=[run], noise=0.1))
+
+    class Found:
+        values, warm = torch.tensor([1.0], dtype=F64), None
+
+    Found.problem = problem
+    assert any("-1 times" in text for text, _, _ in experiment._in_time(Found)) is mirrored
+
+
+def test_no_experiment_is_proposed_that_tells_nothing_apart():
+    t, rng = np.linspace(0, 10, 80), np.random.default_rng(3)
+    y = solve(lambda t, y: [-0.5 * y[0] + 0.1], [2.0], t)[0] + 0.02 * rng.standard_normal(80)
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"y": -p["k"] * s["y"]}, {"y": None}, [tc.Parameter("k", low=0.0, initial=0.3)]
+    )
+    twins = [
+        tc.Term(name, equation="y", rate=lambda t, s, p, u, c=c: c * p["g"], parameters=[tc.Parameter("g")])
+        for name, c in (("source", 1.0), ("feed", 1.0))
+    ]
+    d = diagnose(base, tc.Recording(runs=[tc.Run(time=t, outputs={"y": y})], noise=0.02), twins)
+    assert d.verdict == "named"  # the same model under two names is one
+    assert d.ranking[0].aliases == ("feed",)
+    levels = [
+        tc.Term("source", equation="y", rate=lambda t, s, p, u: p["g"] + 0 * t, parameters=[tc.Parameter("g")]),
+        tc.Term("level", outputs={"y": lambda t, s, p, u, y: y + p["b"] * (1 - torch.exp(-0.5 * t))},
+                parameters=[tc.Parameter("b")]),
+    ]  # fmt: skip
+    d = diagnose(base, tc.Recording(runs=[tc.Run(time=t, outputs={"y": y})], noise=0.02), levels)
+    assert d.verdict == "ambiguous"
+    assert d.experiment is None
+    assert "None of the simple experiments" in " ".join(str(d).split())
+
+
+def test_errors_of_several_outputs_are_in_their_spreads_and_say_so():
+    x = torch.linspace(0, 1, 30, dtype=F64)
+    base = tc.Simulator(lambda x, p: {"u": p["a"] * x, "w": 100 * p["a"] * x}, [tc.Parameter("a")])
+    y = {"u": 2 * x + 0.1 * (7 * x).sin(), "w": 200 * x}
+    several = diagnose(base, tc.Recording(x=x, y=y, noise={"u": 0.02, "w": 2.0}), [])
+    assert "of each output's spread" in " ".join(paragraph(several).split())
+    one = tc.Simulator(lambda x, p: p["a"] * x, [tc.Parameter("a")])
+    assert "of each output's spread" not in paragraph(diagnose(one, tc.Recording(x=x, y=y["u"], noise=0.02), []))
+
+
+def test_rates_are_guessed_from_the_length_of_long_runs():
+    t, rng = np.linspace(0, 3e7, 80), np.random.default_rng(0)
+    y = np.exp(-8e-8 * t) + 0.01 * rng.standard_normal(80)
+    base = tc.ODESimulator(lambda t, s, p, u: {"y": -p["k"] * s["y"]}, {"y": None}, [tc.Parameter("k", low=0.0)])
+    recording = tc.Recording(runs=[tc.Run(time=t, outputs={"y": y})])
+    guesses = starts(Problem.of(base, recording), 12, 0)[:, 0]
+    assert bool((guesses[1::2] < 1e-5).all())
+    assert bool((guesses[::2] > 1e-3).all())
+    d = diagnose(base, recording, list(tc.terms.sensor("y", dynamic=False)))
+    assert d.verdict == "consistent"
+    assert float(d.base.estimates[0].value) == pytest.approx(8e-8, rel=0.02)
+
+
+def test_a_mistake_in_a_term_is_told_as_this_terms():
+    base, recording = decays()
+    wrong = tc.Term("wall loss", equation="A", rate=lambda t, s, p, u: -p["w"] * s["B"], parameters=[tc.Parameter("w")])
+    with pytest.raises(tc.errors.SimulatorError, match=r"'wall loss'.*KeyError: 'B'.*given A; k"):
+        diagnose(base, recording, [wrong])
+    with pytest.raises(tc.errors.DomainError, match="different names"):
+        tc.ODESimulator(lambda t, s, p, u: {"A": -s["A"]}, ["A", "A"], [tc.Parameter("k")])
+
+
+def test_a_base_without_a_finite_start_says_where_it_started():
+    t = torch.linspace(0, 10, 30, dtype=F64)
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"y": -p["k"] * s["y"] * float("inf")}, {"y": None}, [tc.Parameter("k", initial=2.0)]
+    )
+    recording = tc.Recording(runs=[tc.Run(time=t, outputs={"y": torch.exp(-t)})])
+    with pytest.raises(tc.errors.TorchcalError, match=r"k = 2, y\(0\) = 1"):
+        diagnose(base, recording, [])
