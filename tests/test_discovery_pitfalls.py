@@ -1,5 +1,7 @@
 """What a diagnosis did wrong on recordings that others brought: each case once."""
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -208,3 +210,17 @@ def test_a_base_without_a_finite_start_says_where_it_started():
     recording = tc.Recording(runs=[tc.Run(time=t, outputs={"y": torch.exp(-t)})])
     with pytest.raises(tc.errors.TorchcalError, match=r"k = 2, y\(0\) = 1"):
         diagnose(base, recording, [])
+
+
+@pytest.mark.parametrize(
+    ("state", "recorded", "warns"), [("mol/L", "kg", True), ("m/s", "m / s", False), ("mol/L", None, False)]
+)
+def test_another_unit_of_a_state_than_of_its_recording_is_noticed(state, recorded, warns):
+    t = torch.linspace(0, 10, 30, dtype=F64)
+    base = tc.ODESimulator(lambda t, s, p, u: {"y": -p["k"] * s["y"]}, {"y": state}, [tc.Parameter("k", initial=1.0)])
+    units = {} if recorded is None else {"y": recorded}
+    recording = tc.Recording(runs=[tc.Run(time=t, outputs={"y": torch.exp(-t)})], units=units)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        base.bind(recording)
+    assert [w.category for w in caught] == [tc.errors.UnitWarning] * warns

@@ -22,6 +22,7 @@ __all__ = [
     "ToleranceWarning",
     "TorchcalError",
     "TorchcalWarning",
+    "UnitWarning",
     "WorkerWarning",
 ]
 
@@ -92,6 +93,10 @@ class SurrogateWarning(TorchcalWarning):
 
 class ExtrapolationWarning(TorchcalWarning):
     """A model or surrogate is used outside the region that it was built for."""
+
+
+class UnitWarning(TorchcalWarning):
+    """A recording is in another unit than the simulator."""
 
 
 class WorkerWarning(TorchcalWarning):

@@ -16,6 +16,7 @@ __all__ = [
     "declared_units",
     "is_quantity",
     "named",
+    "same_unit",
     "sample_spread",
     "to_tensor",
     "value_range",
@@ -98,6 +99,21 @@ def _convert(value: Any, unit: str, *, difference: bool) -> tuple[Any, float]:
     source, target = str(value.units).removeprefix("delta_"), unit.removeprefix("delta_")
     zero = type(value)(0.0, source).to(target).magnitude
     return type(value)(value.magnitude, source).to(target).magnitude, float(zero)
+
+
+def same_unit(one: str, other: str) -> bool:
+    """Whether two texts are one unit: by pint where it is installed, else as they are spelled, spaces aside."""
+    if one.replace(" ", "") == other.replace(" ", ""):
+        return True
+    try:
+        import pint
+    except ImportError:
+        return False
+    registry = pint.get_application_registry()
+    try:
+        return bool(registry.Unit(one) == registry.Unit(other))
+    except Exception:  # a text that pint does not know is a unit only as it is spelled
+        return False
 
 
 def _plain(value: Any, label: str) -> Tensor:

@@ -1,13 +1,14 @@
 """Simulators in time: ordinary differential equations with inputs, several runs and unknown initial states."""
 
 import functools
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from torch import Tensor
 
-from torchcal.data import Recording
-from torchcal.errors import DomainError, SimulatorError
+from torchcal.data import Recording, same_unit
+from torchcal.errors import DomainError, SimulatorError, UnitWarning
 from torchcal.simulators.parameter import Parameter
 from torchcal.simulators.static import Conditions, Simulator, check_parameters
 from torchcal.simulators.trajectories import Trajectories
@@ -109,7 +110,21 @@ class ODESimulator(Simulator):
         Its parameters are this simulator's (one for each run where ``per_run``) and behind them the initial states
         that nobody knows, as ``"x(0)"``, or ``"x(0)[run]"`` where there are several runs.
         """
-        return Trajectories(self, recording)
+        bound = Trajectories(self, recording)
+        self._compare_units(recording)
+        return bound
+
+    def _compare_units(self, recording: Recording) -> None:
+        for name, unit in recording.units.items():
+            seen = self.observe.get(name)
+            own = self.states[seen.args[0]] if isinstance(seen, functools.partial) and seen.func is _read else None
+            if own and unit and not same_unit(own, unit):
+                warnings.warn(
+                    f"The state {name!r} is in {own} and was recorded in {unit}. Numbers are not converted: correct "
+                    "one of them, or give observe={output: function(t, s, p, u)} that converts.",
+                    UnitWarning,
+                    stacklevel=3,
+                )
 
     def at(self, x: Conditions, outputs: Sequence[str] | None = None) -> Callable[[Tensor], Tensor]:
         """Not possible without runs: bind a recording first."""
