@@ -222,7 +222,8 @@ def run_batched(
             # A lone divergence among thousands escapes the warm-up, which is shorter.
             bar.total += collector.least
             averaging = averaging.stricter()
-            _, _, z, _ = _adapt(moves, space, z, averaging, max(4, round(_WINDOWS[-1] * num_warmup)), bar)
+            length = max(4, round(_WINDOWS[-1] * num_warmup))
+            _, _, z, _ = _adapt(moves, space, z, averaging, length, bar, settle=True)
     except KeyboardInterrupt:
         if drawn.least < 4:
             raise ConvergenceError("The sampler was interrupted before it had drawn anything.") from None
@@ -287,8 +288,9 @@ def _warm_up(
     diverging, length = 0.0, 0
     for number, share in enumerate(_WINDOWS):
         length = max(4, round(share * num_warmup))
-        pooled, owners, z, diverging = _adapt(moves, space, z, averaging, length, bar)
-        if number < len(_WINDOWS) - 1:
+        last = number == len(_WINDOWS) - 1
+        pooled, owners, z, diverging = _adapt(moves, space, z, averaging, length, bar, settle=last)
+        if not last:
             other = space.refined(pooled, groups[owners])
             z = other.inner(space.outer(z))
             space = other
@@ -296,23 +298,35 @@ def _warm_up(
             averaging = _DualAveraging(averaging.averaged, averaging.target)
     while stricter and diverging > DIVERGING and averaging.target < _STRICTEST:
         averaging = averaging.stricter()
-        _, _, z, diverging = _adapt(moves, space, z, averaging, length, bar)
+        _, _, z, diverging = _adapt(moves, space, z, averaging, length, bar, settle=True)
     return space, z, averaging
 
 
 def _adapt(
-    moves: _Kernel, space: Whitened, z: Tensor, averaging: _DualAveraging, length: int, bar: tqdm
+    moves: _Kernel,
+    space: Whitened,
+    z: Tensor,
+    averaging: _DualAveraging,
+    length: int,
+    bar: tqdm,
+    *,
+    settle: bool = False,
 ) -> tuple[Tensor, Tensor, Tensor, float]:
-    """One warm-up window: draws of its second half, whose they are, where all chains end, and the share diverged."""
+    """One warm-up window: draws of its second half, whose they are, where all chains end, and the share diverged.
+
+    Where the window is to ``settle``, that half has the step size that was found, and the share is that of its steps.
+    """
     chains = len(z)
     state = moves.init(z, space, averaging.step_size)
     finished = shown = 0
     pooled: list[Tensor] = []
     owners: list[Tensor] = []
     accepted: list[Tensor] = []
-    waiting = diverged = 0
+    waiting = diverged = counted = 0
+    begun = torch.full((chains,), not settle, device=z.device)  # whose trajectory has the step size that is judged
     while finished < length * chains:
-        state, outcome = moves.step(state, space, averaging.step_size)
+        settled = settle and finished > length * chains // 2
+        state, outcome = moves.step(state, space, averaging.settled if settled else averaging.step_size)
         count = int(outcome.done.sum())
         if not count:
             continue
@@ -321,18 +335,19 @@ def _adapt(
         accepted.append(outcome.accept[outcome.done])
         # One update for every half of the crowd: a step size is judged by trajectories that used it, not by those
         # still on the way from before, and short ones do not count more than long ones.
-        if 2 * waiting >= chains:
+        if 2 * waiting >= chains and not settled:
             averaging.update(float(torch.cat(accepted).mean()))
             accepted.clear()
             waiting = 0
         if finished > length * chains // 2:
             pooled.append(outcome.position[outcome.done])
             owners.append(outcome.done.nonzero()[:, 0])
-            diverged += int(outcome.divergent.sum())
+            diverged += int((outcome.divergent & begun).sum())
+            counted += int((outcome.done & begun).sum())
+            begun = begun | outcome.done
         bar.update(finished // chains - shown)
         shown = finished // chains
-    draws = torch.cat(pooled)
-    return draws, torch.cat(owners), moves.positions(state), diverged / len(draws)
+    return torch.cat(pooled), torch.cat(owners), moves.positions(state), diverged / max(counted, 1)
 
 
 class _Collector:
