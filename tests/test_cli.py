@@ -1,0 +1,100 @@
+"""The command `torchcal`."""
+
+import subprocess
+import sys
+
+import pytest
+
+import torchcal as tc
+from torchcal import cli
+
+PROBLEM = """
+import torch
+import torchcal as tc
+
+x = torch.linspace(-1, 1, 11, dtype=torch.float64)
+simulator = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")], degree=1)
+recording = tc.Recording(x=x, y=2 + 2 * x + 3 * x**2, noise=0.01)
+candidates = [tc.Term("bend", outputs={"y": lambda x, p, y: y + p["c"] * x**2}, parameters=[tc.Parameter("c")])]
+calibrate_options = {"num_samples": 0, "likelihood": tc.likelihoods.ABC(epsilon=0.1), "seed": 3}
+"""
+
+
+@pytest.fixture
+def problem(tmp_path):
+    path = tmp_path / "bent_line.py"
+    path.write_text(PROBLEM)
+    yield path
+    sys.modules.pop("bent_line", None)
+    sys.path[:] = [entry for entry in sys.path if entry != str(tmp_path)]
+
+
+def test_calibrate_writes_a_result_that_show_prints(problem, tmp_path, capsys):
+    out = tmp_path / "result.nc"
+    assert cli.main(["calibrate", str(problem), "--out", str(out), "--quiet"]) == 0
+    told = capsys.readouterr().out
+    result = tc.results.Calibration.load(out)
+    assert result.settings["seed"] == 3  # the file's
+    assert told.strip() == str(result).strip()
+    assert cli.main(["show", str(out)]) == 0
+    assert capsys.readouterr().out == told
+    assert cli.main(["calibrate", str(problem), "--out", str(out), "--quiet", "--seed", "5"]) == 0
+    assert tc.results.Calibration.load(out).settings["seed"] == 5  # the command line's goes first
+
+
+def test_diagnose_names_what_is_missing_and_writes_a_report(problem, tmp_path, capsys):
+    page = tmp_path / "report.html"
+    assert cli.main(["diagnose", str(problem), "--report", str(page), "--quiet"]) == 0
+    assert capsys.readouterr().out.startswith("Verdict: named: bend")
+    assert "bend" in page.read_text()
+
+
+def test_show_reads_an_additive_calibration_too(tmp_path, capsys):
+    line = tc.Simulator(lambda x, p: p["a"] * x, [tc.Parameter("a")], degree=1)
+    result = tc.calibrate_additive(line, tc.Recording(x=[1.0, 2.0, 3.0], y=[1.0, 2.2, 2.9]), num_samples=0)
+    result.save(tmp_path / "additive.nc")
+    assert cli.main(["show", str(tmp_path / "additive.nc")]) == 0
+    assert "additive" in capsys.readouterr().out
+
+
+def test_mistakes_are_told_in_a_line_before_any_work(problem, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cli, "calibrate", lambda *args, **options: pytest.fail("worked before it looked"))
+    half = tmp_path / "half.py"
+    half.write_text("simulator = 1")
+    odd = tmp_path / "odd.py"
+    odd.write_text(PROBLEM + "\ncalibrate_options = [1]")
+    taken = tmp_path / "json.py"
+    taken.write_text(PROBLEM)
+    for arguments, told in [
+        (["calibrate", str(tmp_path / "nothing.py")], "which is none"),
+        (["calibrate", str(half)], "Got no recording"),
+        (["calibrate", str(odd)], "as a dict"),
+        (["calibrate", str(taken)], "rename it"),
+        (["calibrate", str(problem), "--out", str(tmp_path)], "in a folder that exists"),
+        (["calibrate", str(problem), "--out", str(tmp_path / "no" / "a.nc")], "in a folder that exists"),
+        (["show", str(problem)], "netCDF"),
+    ]:
+        assert cli.main(arguments) == 1
+        error = capsys.readouterr().err
+        assert told in error
+        assert error.startswith("torchcal: ")
+        assert "Traceback" not in error
+    for name in ("half", "odd"):
+        sys.modules.pop(name, None)
+    with pytest.raises(SystemExit) as stop:
+        cli.main([])
+    assert stop.value.code == 2
+
+
+def test_an_interruption_ends_quietly(problem, capsys, monkeypatch):
+    def interrupted(*args, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "diagnose", interrupted)
+    assert cli.main(["diagnose", str(problem)]) == 130
+    assert "interrupted" in capsys.readouterr().err
+
+
+def test_the_module_runs_as_a_command():
+    done = subprocess.run([sys.executable, "-m", "torchcal.cli", "--help"], capture_output=True, text=True, check=True)
+    assert all(command in done.stdout for command in ("calibrate", "diagnose", "show"))

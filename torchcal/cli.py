@@ -1,0 +1,135 @@
+"""The command ``torchcal``: calibrate, diagnose and show, for jobs that run without a notebook.
+
+A problem is a Python file that defines ``simulator`` and ``recording``, and where wanted ``candidates``, and dicts of
+further arguments, ``calibrate_options`` and ``diagnose_options``.
+"""
+
+import argparse
+import importlib.util
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from torchcal.discovery import diagnose
+from torchcal.errors import DomainError, TorchcalError
+from torchcal.inference import calibrate
+from torchcal.results import AdditiveCalibration, Calibration
+
+__all__ = ["main"]
+
+_MARK = "__torchcal_problem__"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command.
+
+    Args:
+        arguments: Of the command line; by default those of this process.
+
+    Returns:
+        The exit status: 0, 1 after an error of torchcal's, 2 for a wrong command line, 130 after Ctrl-C.
+    """
+    given = _parser().parse_args(arguments)
+    try:
+        given.run(given)
+    except TorchcalError as error:
+        print(f"torchcal: {type(error).__name__}: {error}", file=sys.stderr)
+        for note in getattr(error, "__notes__", ()):
+            print(f"torchcal: {note}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("torchcal: interrupted", file=sys.stderr)
+        return 130
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="torchcal", description=(__doc__ or "").split("\n")[0])
+    commands = parser.add_subparsers(required=True, metavar="command")
+    calibrating = commands.add_parser("calibrate", help="calibrate with model error embedded in the parameters")
+    calibrating.set_defaults(run=_calibrate)
+    calibrating.add_argument("--out", type=Path, metavar="RESULT.nc", help="where the result is written")
+    calibrating.add_argument("--target-ess", type=float, metavar="N", help="draw until so many effective samples")
+    diagnosing = commands.add_parser("diagnose", help="find the physics that was left out")
+    diagnosing.set_defaults(run=_diagnose)
+    diagnosing.add_argument("--report", type=Path, metavar="REPORT.html", help="where the report is written")
+    for command in (calibrating, diagnosing):
+        command.add_argument("problem", type=Path, help="a Python file that defines simulator and recording")
+        command.add_argument("--seed", type=int, help="of every random number")
+        command.add_argument("--quiet", action="store_true", help="show no progress")
+    showing = commands.add_parser("show", help="print a result that was written")
+    showing.set_defaults(run=_show)
+    showing.add_argument("result", type=Path, metavar="RESULT.nc")
+    return parser
+
+
+def _calibrate(given: argparse.Namespace) -> None:
+    problem = _problem(given.problem)
+    _check_target(given.out)
+    options = _options(problem, "calibrate_options", given, target_ess=given.target_ess)
+    result = calibrate(problem.simulator, problem.recording, **options)
+    if given.out is not None:
+        result.save(given.out)
+    print(result)
+
+
+def _diagnose(given: argparse.Namespace) -> None:
+    problem = _problem(given.problem)
+    _check_target(given.report)
+    options = _options(problem, "diagnose_options", given)
+    result = diagnose(problem.simulator, problem.recording, getattr(problem, "candidates", ()), **options)
+    print(result)
+    if given.report is not None:
+        result.report(given.report)
+
+
+def _show(given: argparse.Namespace) -> None:
+    try:
+        print(Calibration.load(given.result))
+    except TorchcalError as first:
+        try:
+            print(AdditiveCalibration.load(given.result))
+        except TorchcalError:
+            raise first from None
+
+
+def _options(problem: ModuleType, name: str, given: argparse.Namespace, **more: Any) -> dict[str, Any]:
+    """The file's options, over which go those of the command line."""
+    own = getattr(problem, name, {})
+    if not isinstance(own, dict):
+        raise DomainError(f"Expected {name} in {given.problem} as a dict of arguments. Got {type(own).__name__}.")
+    line = {"seed": given.seed, "progress": False if given.quiet else None, **more}
+    return {"progress": True, **own, **{key: value for key, value in line.items() if value is not None}}
+
+
+def _problem(path: Path) -> ModuleType:
+    """The user's file, run as a module."""
+    if not path.is_file():
+        raise DomainError(f"Expected a Python file that defines simulator and recording. Got {path}, which is none.")
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    if spec is None or spec.loader is None:
+        raise DomainError(f"Expected a Python file, such as problem.py. Got {path}.")
+    module = importlib.util.module_from_spec(spec)
+    taken = sys.modules.get(path.stem)
+    if taken is not None and not hasattr(taken, _MARK):
+        raise DomainError(f"Expected a name that is no other module's. Got {path}: rename it.")
+    setattr(module, _MARK, True)
+    sys.modules[path.stem] = module  # worker processes find its functions by this name, and in this folder
+    sys.path.insert(0, str(path.resolve().parent))
+    spec.loader.exec_module(module)
+    missing = [name for name in ("simulator", "recording") if not hasattr(module, name)]
+    if missing:
+        raise DomainError(f"Expected {path} to define simulator and recording. Got no {' and no '.join(missing)}.")
+    return module
+
+
+def _check_target(path: Path | None) -> None:
+    """Raise for a file that could not be written, before any long work."""
+    if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
+        raise DomainError(f"Expected a file in a folder that exists. Got {path}.")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
