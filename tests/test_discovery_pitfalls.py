@@ -198,6 +198,14 @@ def test_a_mistake_in_a_term_is_told_as_this_terms():
     wrong = tc.Term("wall loss", equation="A", rate=lambda t, s, p, u: -p["w"] * s["B"], parameters=[tc.Parameter("w")])
     with pytest.raises(tc.errors.SimulatorError, match=r"'wall loss'.*KeyError: 'B'.*given A; k"):
         diagnose(base, recording, [wrong])
+    sensor = tc.Term(
+        "bad sensor", outputs={"A": lambda t, s, p, u, y: y + p["b"] * u["q"]}, parameters=[tc.Parameter("b")]
+    )
+    with pytest.raises(tc.errors.SimulatorError, match=r"^Expected a tensor from every function of the term 'bad s"):
+        diagnose(base, recording, [sensor])
+    typo = tc.Term("offset", outputs={"a": lambda t, s, p, u, y: y + p["b"]}, parameters=[tc.Parameter("b")])
+    with pytest.raises(tc.errors.DomainError, match="'offset' on outputs"):
+        diagnose(base, recording, [typo])
     with pytest.raises(tc.errors.DomainError, match="different names"):
         tc.ODESimulator(lambda t, s, p, u: {"A": -s["A"]}, ["A", "A"], [tc.Parameter("k")])
 
@@ -213,7 +221,16 @@ def test_a_base_without_a_finite_start_says_where_it_started():
 
 
 @pytest.mark.parametrize(
-    ("state", "recorded", "warns"), [("mol/L", "kg", True), ("m/s", "m / s", False), ("mol/L", None, False)]
+    ("state", "recorded", "warns"),
+    [
+        ("mol/L", "kg", True),
+        ("degC", "kelvin", True),
+        ("m/s", "m / s", False),
+        ("J", "N*m", False),
+        ("m/s**2", "m/s^2", False),
+        ("widgets", "gadgets", False),  # who knows
+        ("mol/L", None, False),
+    ],
 )
 def test_another_unit_of_a_state_than_of_its_recording_is_noticed(state, recorded, warns):
     t = torch.linspace(0, 10, 30, dtype=F64)
@@ -224,3 +241,75 @@ def test_another_unit_of_a_state_than_of_its_recording_is_noticed(state, recorde
         warnings.simplefilter("always")
         base.bind(recording)
     assert [w.category for w in caught] == [tc.errors.UnitWarning] * warns
+
+
+def test_a_typo_in_the_output_of_a_static_term_is_told():
+    x = torch.linspace(0, 1, 20, dtype=F64)
+    base = tc.Simulator(lambda x, p: p["a"] * x, [tc.Parameter("a")])
+    term = tc.Term("offset", outputs={"Y": lambda x, p, y: y + p["o"]}, parameters=[tc.Parameter("o")])
+    with pytest.raises(tc.errors.DomainError, match=r"\['H'\]. Got \['Y'\]"):
+        diagnose(base, tc.Recording(x=x, y={"H": 2 * x}), [term])
+
+
+def line(n, seed, bend=1.0):
+    x = torch.linspace(-1, 1, n, dtype=F64)
+    noise = 0.01 * torch.as_tensor(np.random.default_rng(seed).standard_normal(n))
+    base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    quad = tc.Term("quad", outputs={"y": lambda x, p, y: y + p["q"] * x**2}, parameters=[tc.Parameter("q")])
+    return base, tc.Recording(x=x, y=1 + 2 * x + bend * x**2 + noise), [quad]
+
+
+@pytest.mark.parametrize("n", [9, 11, 14])
+def test_what_is_plain_to_see_in_a_few_data_is_seen(n):
+    # The sd of so few residuals of unknown noise is hardly known; the F-test of the refitted term does not need it.
+    d = diagnose(*line(n, seed=n))
+    assert d.terms == ["quad"]
+    assert d.p_detect < 1e-4
+
+
+def test_a_few_data_without_an_effect_stay_consistent():
+    verdicts = [diagnose(*line(12, seed, bend=0.0)).verdict for seed in range(30)]
+    assert verdicts.count("consistent") >= 28  # 1 % of false alarms: 3 of 30 have a probability of 0.003
+
+
+def test_what_all_likely_models_share_is_no_name_where_its_own_fit_is_bad():
+    x = torch.linspace(0.1, 6, 100, dtype=F64)
+    noise = 0.04 * torch.randn(100, generator=torch.Generator().manual_seed(1005), dtype=F64)
+    base = tc.Simulator(
+        lambda x, p: p["A"] * torch.exp(-x / p["tau"]),
+        [tc.Parameter("A", low=0.0, initial=3.0), tc.Parameter("tau", low=0.1, high=50.0, initial=2.0)],
+    )
+    terms = [
+        tc.Term("quad", outputs={"y": lambda x, p, y: y + p["q"] * x**2}, parameters=[tc.Parameter("q")]),
+        tc.Term("sat", outputs={"y": lambda x, p, y: y / (1 + p["s"] * x)}, parameters=[tc.Parameter("s", low=0.0)]),
+        tc.Term("offset", outputs={"y": lambda x, p, y: y + p["o"]}, parameters=[tc.Parameter("o")]),
+    ]
+    y = 5 * torch.exp(-x / 2) - 0.1 * x**1.5 + noise
+    d = diagnose(base, tc.Recording(x=x, y=y, noise=0.04), terms)
+    assert d.verdict == "ambiguous"
+    assert all("quad" in tied for tied in d.tied)
+
+
+def test_a_few_replicates_do_not_bound_what_a_term_may_leave():
+    named = 0
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        x = torch.cat([torch.linspace(0, 10, 100, dtype=F64), torch.full((3,), 5.0, dtype=F64)])
+        y = 1 + 0.5 * x + 0.3 * torch.sin(2 * x) + 0.05 * torch.as_tensor(rng.standard_normal(103))
+        base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+        wave = tc.Term(
+            "wave", outputs={"y": lambda x, p, y: y + p["h"] * torch.sin(2 * x)}, parameters=[tc.Parameter("h")]
+        )
+        d = diagnose(base, tc.Recording(x=x, y=y), [wave])
+        named += d.terms == ["wave"]
+    assert named >= 5
+
+
+def test_a_base_that_is_stiff_where_it_starts_is_solved_with_shorter_steps():
+    t = torch.linspace(0, 1, 30, dtype=F64)
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"y": -p["k"] * (s["y"] - torch.cos(torch.as_tensor(t)))}, {"y": None},
+        [tc.Parameter("k", low=4000.0, high=9000.0, initial=8000.0)],
+    )  # fmt: skip
+    recording = tc.Recording(runs=[tc.Run(time=t, outputs={"y": torch.cos(t)}, initial={"y": 1.0})], noise=0.01)
+    assert diagnose(base, recording, []).verdict == "consistent"

@@ -395,3 +395,13 @@ def test_starts_of_ones_own_are_where_it_begins():
         )
     assert again.diagnostics.starts == 2
     assert again.map.objective == pytest.approx(found.map.objective, rel=1e-9)
+
+
+@pytest.mark.parametrize(("n", "warns"), [(4, True), (5, False)])
+def test_an_additive_posterior_without_a_finite_variance_is_told(n, warns):
+    x = torch.linspace(-1, 1, n, dtype=torch.float64)
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")], degree=1)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        tc.calibrate_additive(line, tc.Recording(x=x, y=1 + x**2), num_samples=20, num_chains=2, num_warmup=20)
+    assert any(issubclass(w.category, tc.errors.IdentifiabilityWarning) for w in caught) == warns

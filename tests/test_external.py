@@ -363,3 +363,20 @@ def test_nisp_through_an_external_code_is_nisp_through_torch():
         moments.append(torch.stack([mean, sd]).detach())
     torch.testing.assert_close(moments[0], moments[1], rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(slopes[0], slopes[1], rtol=1e-6, atol=1e-7)
+
+
+def test_arithmetic_without_an_answer_far_away_is_no_number_and_not_the_end():
+    def decay(x, p):
+        return p["A"] * math.exp(-p["k"] * x) + 0.0 * math.log(p["A"])
+
+    def broken(x, p):
+        raise ValueError("no such file")
+
+    parameters = [Parameter("A", low=1.0, high=6.0), Parameter("k", low=0.1, high=3.0)]
+    far = torch.tensor([[2.0, 1.0], [2.0, -1e4], [-1.0, 1.0]], dtype=torch.float64)
+    x = torch.linspace(0.1, 3.0, 5, dtype=torch.float64)
+    found = ExternalSimulator(decay, parameters).at(x)(far)
+    assert torch.allclose(found[0], 2 * torch.exp(-x))
+    assert bool(found[1:].isnan().all())
+    with pytest.raises(SimulatorError, match="no such file"):
+        ExternalSimulator(broken, parameters).at(x)(far)

@@ -460,3 +460,15 @@ def test_names_with_a_slash_are_taken(tmp_path):
     result = quietly(tc.calibrate, simulator, data, num_samples=0, num_starts=4)
     result.save(tmp_path / "result.nc")
     same(Calibration.load(tmp_path / "result.nc").recording, result.recording)
+
+
+def test_another_simulator_than_the_calibrated_one_is_refused(tmp_path):
+    line, other = (tc.Simulator(lambda x, p, n=n: p["a"] + p["b"] * x**n, [tc.Parameter("a"), tc.Parameter("b")])
+                   for n in (1, 2))  # fmt: skip
+    x = torch.linspace(-1, 1, 11, dtype=torch.float64)
+    recording = tc.Recording(x=x, y=2 + x + x**3)
+    fit = tc.calibrate(line, recording, likelihood=tc.likelihoods.ABC(epsilon=0.1), num_samples=0)
+    fit.save(tmp_path / "line.nc")
+    with pytest.raises(tc.errors.DomainError, match="predicts something else"):
+        tc.results.Calibration.load(tmp_path / "line.nc", simulator=other)
+    tc.results.Calibration.load(tmp_path / "line.nc", simulator=line)

@@ -84,9 +84,9 @@ def _diagnose(given: argparse.Namespace) -> None:
     _check_target(given.report)
     options = _options(problem, "diagnose_options", given)
     result = diagnose(problem.simulator, problem.recording, getattr(problem, "candidates", ()), **options)
-    print(result)
     if given.report is not None:
         result.report(given.report)
+    print(result)
 
 
 def _show(given: argparse.Namespace) -> None:
@@ -121,7 +121,7 @@ def _problem(path: Path) -> ModuleType:
         raise DomainError(f"Expected a name that is no other module's. Got {path}: rename it.")
     setattr(module, _MARK, True)
     sys.modules[path.stem] = module  # worker processes find its functions by this name, and in this folder
-    sys.path.insert(0, str(path.resolve().parent))
+    sys.path.append(str(path.resolve().parent))
     spec.loader.exec_module(module)
     missing = [name for name in ("simulator", "recording") if not hasattr(module, name)]
     if missing:

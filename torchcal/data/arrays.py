@@ -102,18 +102,17 @@ def _convert(value: Any, unit: str, *, difference: bool) -> tuple[Any, float]:
 
 
 def same_unit(one: str, other: str) -> bool:
-    """Whether two texts are one unit: by pint where it is installed, else as they are spelled, spaces aside."""
+    """Whether two texts may be one unit: pint tells, where it is installed and knows both."""
     if one.replace(" ", "") == other.replace(" ", ""):
         return True
     try:
         import pint
-    except ImportError:
-        return False
-    registry = pint.get_application_registry()
-    try:
-        return bool(registry.Unit(one) == registry.Unit(other))
-    except Exception:  # a text that pint does not know is a unit only as it is spelled
-        return False
+
+        registry = pint.get_application_registry()
+        a, b = (registry.Quantity(1.0, text).to_base_units() for text in (one, other))
+    except Exception:  # not installed, or a text that it does not know
+        return True
+    return bool(a.units == b.units and abs(a.magnitude - b.magnitude) <= 1e-9 * abs(a.magnitude))
 
 
 def _plain(value: Any, label: str) -> Tensor:

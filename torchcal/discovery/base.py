@@ -11,7 +11,7 @@ from torchcal.discovery.candidates import base_columns
 from torchcal.discovery.fitting import Fitted, fit, follow_slopes, refit, starts
 from torchcal.discovery.noise import Noise, estimate, spikes
 from torchcal.discovery.problem import Problem
-from torchcal.errors import ConvergenceError, SimulatorError
+from torchcal.errors import ConvergenceError, DomainError, SimulatorError
 from torchcal.simulators import Trajectories
 
 __all__ = ["calibrate_base"]
@@ -51,8 +51,12 @@ def calibrate_base(
         simulator = problem.simulator
         if found is not None or not isinstance(simulator, Trajectories) or simulator.ode.max_step is not None:
             break
-        problem = dataclasses.replace(problem, simulator=simulator.refined(4))  # too stiff for steps so long
-        found = _from_starts(problem, begin, free, rough, outputs)
+        try:  # too stiff, perhaps, for steps so long
+            problem = dataclasses.replace(problem, simulator=simulator.refined(4))
+        except DomainError:  # more steps than anyone can take
+            break
+        if bool(torch.isfinite(problem.evaluate(begin[:1], free)[0]).all()):
+            found = _from_starts(problem, begin, free, rough, outputs)
     if found is None:
         raise ConvergenceError(
             f"Expected finite outputs of the base at one of {num_starts} starting values at least. Got none, the first "

@@ -20,7 +20,7 @@ from torchcal.discovery.experiment import propose
 from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.limits import limits
 from torchcal.discovery.model import PRIOR, Model
-from torchcal.discovery.own_noise import outliers
+from torchcal.discovery.own_noise import fits_by_chance, outliers
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.records import NONE, Estimate, Hypothesis, Scores, Table
 from torchcal.discovery.result import Diagnosis
@@ -37,6 +37,8 @@ __all__ = ["diagnose"]
 
 #: How often everything is fitted again because other data turned out to be outliers.
 ROUNDS = 3
+#: Share of the level at which a fit to few data counts as more than noise by itself.
+FEW_DATA = 0.1
 #: Power of the stated detection limits.
 POWER = 0.95
 
@@ -109,6 +111,9 @@ def diagnose(
             f"Expected more data than parameters to calibrate. Got {problem.n} data and {len(free)} free parameters."
         )
     for term in terms:
+        known = (*recording.outputs, *getattr(simulator, "outputs", ()))  # a state that is not recorded may be seen
+        if unknown := [name for name in term.outputs if name not in known]:
+            raise DomainError(f"Expected the term {term.name!r} on outputs of {list(known)}. Got {unknown}.")
         extend(simulator, [term])  # raises for names that do not fit, before any long work
     mask = verify.choose(recording, holdout, len(free))
     bar = tqdm(disable=not progress, desc="diagnose", unit="step", leave=False)
@@ -148,6 +153,9 @@ def _refit(search: Search, confidence: float) -> bool:
     detected = search.exact or search.p_detect < 1.0 - confidence
     if search.terms:
         search.refit_singles(detected=detected)
+        if not detected and search.few and (p := fits_by_chance(search)) < FEW_DATA * (1.0 - confidence):
+            detected, search.p_detect, search.models = True, min(p, search.p_detect), []
+            search.refit_singles()
         if detected:
             refit_local(search)
     return detected

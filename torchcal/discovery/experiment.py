@@ -27,6 +27,7 @@ LEAST = 2.0
 #: How much larger the distance must be for a less simple experiment.
 WORTH = 1.01
 
+Pair = tuple[Model, Model]
 Option = tuple[str, Recording, dict[str, Any]]
 
 
@@ -38,32 +39,38 @@ def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
     more samples. The predicted distance is what is left after every model's parameters have been fitted to old and new
     data together (linearised). None where no experiment separates them by `LEAST` noise sd.
     """
+    models = models[:MOST]
     # One with a term more than another predicts what that one does, and is told from it by its cost alone.
-    simple = [m for m in models if not any(set(other.names) < set(m.names) for other in models)]
-    models = (simple if len(simple) > 1 else models)[:MOST]
-    if len(models) < 2:
+    pairs = [(a, b) for a, b in itertools.combinations(models, 2) if not (_holds(a, b) or _holds(b, a))]
+    if not pairs:
         return None
     problem = models[0].found.problem
     options = _in_time(models[0].found) if problem.in_time else _static(problem.recording)
     best: Experiment | None = None
     for option in options:
-        best = _better(best, option, models, noise)
+        best = _better(best, option, pairs, noise)
     if best is not None and best.separation < ENOUGH:
-        best = _better(best, _denser(best, problem.recording), models, noise)
+        best = _better(best, _denser(best, problem.recording), pairs, noise)
     return best if best is not None and best.separation >= LEAST else None
 
 
-def _better(best: Experiment | None, option: Option, models: Sequence[Model], noise: Noise) -> Experiment | None:
+def _holds(model: Model, other: Model) -> bool:
+    """Whether a model has all that another one has, and more."""
+    return set(other.names) < set(model.names) and other.window is None and model.window is None
+
+
+def _better(best: Experiment | None, option: Option, pairs: Sequence[Pair], noise: Noise) -> Experiment | None:
     """The experiment with the larger predicted distance; the earlier one where it makes no difference."""
     description, recording, conditions = option
-    distance = _separation(models, recording, noise)
+    distance = _separation(pairs, recording, noise)
     if distance is None or (best is not None and distance < WORTH * best.separation):
         return best
     return Experiment(description, distance, conditions)
 
 
-def _separation(models: Sequence[Model], recording: Recording, noise: Noise) -> float | None:
-    """Smallest distance of two of the models at new conditions, in noise sd."""
+def _separation(pairs: Sequence[Pair], recording: Recording, noise: Noise) -> float | None:
+    """Smallest distance of the models of a pair at new conditions, in noise sd."""
+    models = list(dict.fromkeys(model for pair in pairs for model in pair))
     predictions, slopes = [], []
     for model in models:
         try:
@@ -78,7 +85,7 @@ def _separation(models: Sequence[Model], recording: Recording, noise: Noise) -> 
     per_output = torch.stack([part[torch.isfinite(part)].median() for part in noise.sd.chunk(outputs)])
     sd = per_output.repeat_interleave(recording.n)
     least = None
-    for a, b in itertools.combinations(range(len(models)), 2):
+    for a, b in ((models.index(one), models.index(other)) for one, other in pairs):
         gap = (predictions[a] - predictions[b]) / sd
         # Either model may move its parameters, as far as the old data allow.
         rows, targets = [], []
@@ -138,7 +145,7 @@ def _in_time(model: Fitted) -> list[Option]:
     }
     options: list[tuple[str, dict[str, float], float, float]] = [("the first run again", known, 1.0, 1.0)]
     # Only what has had either sign is mirrored: an absolute temperature or an amount cannot be.
-    mirrored = all(bool((states[..., i] < 0).any() and (states[..., i] > 0).any())
+    mirrored = bool(known) and all(bool((states[..., i] < 0).any() and (states[..., i] > 0).any())
                    for i, name in enumerate(bound.ode.states) if name in known)  # fmt: skip
     for factor in (2.0, 0.5, 3.0, -1.0) if mirrored else (2.0, 0.5, 3.0):
         options.append(

@@ -16,7 +16,7 @@ from torchcal.discovery.noise import Noise, spikes
 if TYPE_CHECKING:
     from torchcal.discovery.search import Search
 
-__all__ = ["outliers", "suited", "weigh_alone"]
+__all__ = ["fits_by_chance", "outliers", "suited", "weigh_alone"]
 
 #: Log evidence of a model from which on what sticks out of it alone are outliers, and how many these may be.
 CLEAR, MOST_OUTLIERS = 10.0, 0.1
@@ -55,6 +55,34 @@ def weigh_alone(search: "Search") -> tuple[float, float]:
     if best is not None:
         unknown.append(search.with_unknown(best.found)[1] + best.prior)
     return max(unknown) - base, min(here, 0.0)
+
+
+def fits_by_chance(search: "Search") -> float:
+    """Probability that white noise alone lets one of the candidates improve the base's fit as much as one does.
+
+    The F-test of nested least squares, times the number of candidates. Of few data the sd of the noise alone is known
+    too badly for the simulated residuals to show even what is plain to see.
+    """
+    least = 1.0
+    for model in search.models:
+        added = len(model.candidate.own)
+        freedom = search.problem.n - len(model.found.free)
+        left = model.found.chi2 / search.base.chi2
+        if freedom > 0 and model.physical and 0.0 <= left < 1.0:
+            least = min(least, _beta(left, 0.5 * freedom, 0.5 * added))
+    return min(1.0, least * len(search.candidates))
+
+
+def _beta(x: float, a: float, b: float) -> float:
+    """Regularised incomplete beta function for 0 ≤ x < 1, by the substitution t = x s^(1/a)."""
+    s = (torch.arange(4000, dtype=torch.float64) + 0.5) / 4000
+    inner = float((1.0 - x * s.pow(1.0 / a)).pow(b - 1.0).mean())
+    return math.exp(a * math.log(max(x, 1e-300)) - math.log(a) + _log_beta(a, b)) * inner
+
+
+def _log_beta(a: float, b: float) -> float:
+    """−ln B(a, b)."""
+    return math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b)
 
 
 def outliers(search: "Search", observed: Tensor) -> Tensor | None:

@@ -15,7 +15,7 @@ from torchcal.discovery.fitting import Fitted, refit, weighed
 from torchcal.discovery.likeliest import Tangents, settled, with_unknown
 from torchcal.discovery.local import ENDS, is_window
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
-from torchcal.discovery.noise import Noise
+from torchcal.discovery.noise import LEAST, Noise
 from torchcal.discovery.own_noise import suited
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.refits import Refit, refit_all
@@ -78,6 +78,12 @@ class Search:
     def exact(self) -> bool:
         """Whether the recording is declared noise-free."""
         return self.problem.recording.noise == "none"
+
+    @property
+    def few(self) -> bool:
+        """Whether noise of unknown size is taken for white, as too few data of every output cannot tell correlated."""
+        counts = torch.bincount(self.problem.output_of)
+        return self.noise.open and int(counts.max()) < LEAST
 
     def calibrate_base(self) -> None:
         """Calibrate the base, set outliers aside unless that is done, and estimate the noise."""

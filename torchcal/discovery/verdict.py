@@ -18,6 +18,8 @@ __all__ = ["Decision", "decide"]
 NAMED = 0.97
 #: And at least this among all, "none of these" and the base included.
 SURE = 0.7
+#: Log odds behind the best model up to which one with fewer terms may be named for what all share.
+BEHIND = 5.0
 #: Structure left after a hypothesis with less probability than this by noise alone speaks against it.
 WHITE = 0.005
 #: Structure left with at least this probability is none; and the share of its log evidence by which a linear estimate
@@ -119,7 +121,8 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         return decision
     for best in white:
         if (
-            set(best.names) <= set(white[0].names)
+            best.weight > white[0].weight - BEHIND  # what all likely models share is a name, but not of a bad fit
+            and set(best.names) <= set(white[0].names)
             and _certainty(groups, best) >= NAMED
             and not _other_names(search, best)
         ):
@@ -154,16 +157,22 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
 
 
 def _small(search: Search, model: Model) -> bool:
-    """Whether a model leaves no more than the noise that is given: correlated noise can look like what is left."""
+    """Whether a model leaves no more than the noise that is given: correlated noise can look like what is left.
+
+    Where the fastest part of the residual is larger than what is given, that is taken for the noise.
+    """
     noise = search.noise
-    if noise.open:
+    if noise.source != "given":
         return True
     problem = model.found.problem
-    standard = (model.found.residual / (noise.sd[problem.index] * noise.doubted)).square()
+    standard = (model.found.residual / noise.sd[problem.index]).square()
     for number, rho in enumerate(noise.correlation.tolist()):
         mine = standard[problem.output_of == number]
+        if not len(mine):
+            continue
+        size = max(float(noise.sizes[number, 0]), 1.0)
         independent = len(mine) * (1 - rho**2) / (1 + rho**2)  # as many squares tell as much of their mean
-        if float(mine.mean()) > LARGER**2 * (1 + CHANCE * math.sqrt(2 / max(independent, 1.0))):
+        if float(mine.mean()) > (LARGER * size) ** 2 * (1 + CHANCE * math.sqrt(2 / max(independent, 1.0))):
             return False
     return True
 

@@ -9,6 +9,9 @@ from torchcal.discovery.records import NONE
 
 __all__ = ["paragraph", "percent"]
 
+#: Correlation from sample to sample from which on noise is called slow.
+SLOW = 0.3
+
 
 def percent(share: float) -> str:
     """A share as text."""
@@ -100,10 +103,12 @@ def _consistent(d: Any) -> list[str]:
     limits = [limit for limit in d.detection_limit if math.isfinite(limit.smallest)]
     nothing = "There is no sign of missing physics."
     if d.p_detect < 1 - d.confidence:
-        nothing = (
-            "Slow noise explains that structure at least as well as anything in the library, so that no physics is "
-            "called missing; a known noise sd, replicates or a repeated run would tell."
-        )
+        nothing = "Yet the base alone remains likelier than all that was tried beside it."
+        if d.noise.source == "estimated" and max(d.noise.correlation.values(), default=0.0) >= SLOW:
+            nothing = (
+                "Slow noise explains that structure at least as well as anything in the library, so that no physics is "
+                "called missing; a known noise sd, replicates or a repeated run would tell."
+            )
     if not limits:
         return [nothing]
     shown = ", ".join(f"{limit.term} {limit.smallest:.3g} {limit.unit or ''}".rstrip() for limit in limits[:6])
@@ -170,9 +175,10 @@ def _named(d: Any) -> list[str]:
         )
     elif rival is not None:
         behind = top.log_evidence - rival.log_evidence
-        parts.append(
-            f"The next best, {_and(list(rival.terms))}, stands {behind:.1f} natural-log units of evidence behind."
-        )
+        stands = f"stands {behind:.1f} natural-log units of evidence behind"
+        if behind < 0:
+            stands = f"has {-behind:.1f} natural-log units more evidence, and far less probability beforehand"
+        parts.append(f"The next best, {_and(list(rival.terms))}, {stands}.")
     parts.append(_proof(d))
     if d.remaining > 0.005:
         parts.append(f"{percent(d.remaining)} of the misfit remains unexplained.")
@@ -197,7 +203,7 @@ def _ambiguous(d: Any) -> list[str]:
             f"What would tell them apart: {d.experiment.description} (predicted distance "
             f"{d.experiment.separation:.1f} noise sd)."
         )
-    elif len(known) > 1:
+    elif sum(any(row.refitted and set(row.terms) == set(tied) for row in d.ranking) for tied in known) > 1:
         parts.append("None of the simple experiments that were tried in thought would tell them apart.")
     return parts
 

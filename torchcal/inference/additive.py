@@ -1,13 +1,14 @@
 """`calibrate_additive`: the conventional calibration, which stands beside the embedded one."""
 
 import math
+import warnings
 from collections.abc import Mapping
 
 import torch
 
 from torchcal import likelihoods, models
 from torchcal.data import Recording
-from torchcal.errors import ImproperPosteriorError
+from torchcal.errors import IdentifiabilityWarning, ImproperPosteriorError
 from torchcal.inference.estimate import maximise
 from torchcal.inference.fitting import LeastSquares, least_squares, plain_propagation
 from torchcal.inference.sampling import Plan, draw
@@ -83,6 +84,14 @@ def calibrate_additive(
             f"Expected more data than parameters for the additive likelihood. Got N = {count} and d = "
             f"{len(free)}: the residuals can vanish, and the likelihood grows without limit as σ → 0. Record more, "
             "hold parameters fixed, or use torchcal.calibrate."
+        )
+    if recording.noise_sd is None and plan.samples and count - len(free) <= 2:
+        warnings.warn(
+            f"With N = {count} data and d = {len(free)} parameters the posterior has no finite variance: it is "
+            "Student's t with N − d degrees of freedom, and the sd of its draws say nothing. Record more, hold "
+            "parameters with fixed=, or give the recording's noise=.",
+            IdentifiabilityWarning,
+            stacklevel=2,
         )
     fit = least_squares(simulator, recording, fixed, seed=seed)
     simulator = fit.simulator

@@ -36,8 +36,8 @@ _WARM_UP_CHAINS = 64
 MOST_ELEMENTS = 2**22
 """Numbers that one evaluation of all chains may handle where the number of chains is ours to choose."""
 
-_STRICTEST = 0.98
-"""Mean acceptance from which on divergences are no matter of the step size."""
+_STRICT, _STRICTEST = 0.9, 0.98
+"""Mean acceptance where trajectories have diverged, at least; and from which on that is no matter of the step size."""
 
 _REPEATS = 2
 """How often draws with divergences are drawn anew with smaller steps."""
@@ -82,8 +82,8 @@ class _DualAveraging:
         return math.exp(self.averaged)
 
     def stricter(self) -> "_DualAveraging":
-        """From here, for half the rejections."""
-        return _DualAveraging(self.averaged, 0.5 * (1 + self.target))
+        """From here, for half the rejections or fewer."""
+        return _DualAveraging(self.averaged, max(0.5 * (1 + self.target), _STRICT))
 
 
 class _Kernel(Protocol):
@@ -331,8 +331,9 @@ def _adapt(
         if not count:
             continue
         finished += count
-        waiting += count
-        accepted.append(outcome.accept[outcome.done])
+        if not settled:
+            waiting += count
+            accepted.append(outcome.accept[outcome.done])
         # One update for every half of the crowd: a step size is judged by trajectories that used it, not by those
         # still on the way from before, and short ones do not count more than long ones.
         if 2 * waiting >= chains and not settled:
@@ -344,7 +345,8 @@ def _adapt(
             owners.append(outcome.done.nonzero()[:, 0])
             diverged += int((outcome.divergent & begun).sum())
             counted += int((outcome.done & begun).sum())
-            begun = begun | outcome.done
+            if settled:
+                begun = begun | outcome.done
         bar.update(finished // chains - shown)
         shown = finished // chains
     return torch.cat(pooled), torch.cat(owners), moves.positions(state), diverged / max(counted, 1)

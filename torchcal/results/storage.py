@@ -18,7 +18,7 @@ from torchcal.prediction import AdditivePrediction, Moments, Prediction
 from torchcal.propagation import NISP, PropagationCheck, RuleChoice
 from torchcal.results.diagnostics import Diagnostics, Mode, Quality
 from torchcal.results.estimate import MapEstimate
-from torchcal.simulators import ODESimulator, Scaling, Simulator, Trajectories
+from torchcal.simulators import ExternalSimulator, ODESimulator, Scaling, Simulator, Trajectories
 
 if TYPE_CHECKING:
     from torchcal.results.additive import AdditiveCalibration
@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 __all__ = ["additive_tree", "calibration_tree", "read_additive", "read_calibration", "to_arviz", "write"]
 
 FORMAT = 1
+
+SAME = 1e-6
+"""Relative difference of predictions that are still taken for the same simulator's."""
 
 _NAME = "torchcal_name"
 """Attribute of a variable that could not be stored under its own name."""
@@ -129,7 +132,7 @@ def read_calibration(
             Moments(p["mean_predictive_mean"], p["mean_predictive_sd"]) if "mean_predictive_mean" in p else None
         ),
     )
-    return cls(
+    result = cls(
         map=_map(groups, meta),
         samples=_samples(groups),
         diagnostics=_diagnostics(groups, meta),
@@ -140,6 +143,28 @@ def read_calibration(
         settings=meta["settings"],
         stored=stored,
     )
+    if not isinstance(simulator, ExternalSimulator | ODESimulator):  # which may take hours, or other time steps
+        check_simulator(result)
+    return result
+
+
+def check_simulator(result: "Calibration") -> None:
+    """Predict once more what is stored.
+
+    Raises:
+        DomainError: If the simulator predicts something else at the MAP.
+    """
+    if result.propagate is None or result.stored is None:
+        return
+    with torch.no_grad():
+        mean, variance = result.propagate.moments(result.map.alpha)
+    pair = (mean, variance.clamp_min(0).sqrt())
+    stored = (result.stored.map.mean, result.stored.map.sd)
+    allowed = SAME * (result.recording.spread + stored[0].abs())
+    if any(bool(((a - b).abs() > allowed).any()) for a, b in zip(pair, stored, strict=True)):
+        raise DomainError(
+            "Expected the simulator that was calibrated. Got one that predicts something else with the same parameters."
+        )
 
 
 def read_additive(

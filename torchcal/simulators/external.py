@@ -13,7 +13,7 @@ from torch import Tensor
 from torchcal.errors import DomainError, ShapeError, SimulatorError
 from torchcal.simulators.executor import TaskError, check_executor, run_tasks
 from torchcal.simulators.parameter import Parameter
-from torchcal.simulators.points import ArrayCall, PointCall, Value, failed_evaluation
+from torchcal.simulators.points import ArrayCall, Forgiving, PointCall, Value, failed_evaluation
 from torchcal.simulators.static import Conditions, Simulator
 
 __all__ = ["ExternalSimulator"]
@@ -203,12 +203,12 @@ class _Job:
         return result.transpose(1, 0, 2).reshape(len(values), self.width)
 
     def _run(self, call: ArrayCall | PointCall, rows: Array) -> Array | None:
-        values: list[Value | None] = [None] * len(rows)
+        values: list[Value | None] = [None] * len(rows)  # None where there is no number
         tasks = rows.tolist()
         try:
             # Thousands of calls share the executor: a pool that stands in for a broken one is not opened for each.
             run_tasks(
-                call, tasks, executor=self.simulator.executor, on_result=values.__setitem__, keep_pool=True
+                Forgiving(call), tasks, executor=self.simulator.executor, on_result=values.__setitem__, keep_pool=True
             )
         except TaskError as failure:
             raise failed_evaluation(failure, call.describe(tasks[failure.index])) from failure.error
@@ -222,7 +222,8 @@ class _Job:
                     f"Expected the same outputs from every evaluation. Got {names} and {other}, the latter in row "
                     f"{tasks[index]}."
                 )
-        stacked = np.stack([value for _, value in done], axis=1)
+        nothing = (names, np.full_like(done[0][1], np.nan))
+        stacked = np.stack([value for _, value in (one or nothing for one in values)], axis=1)
         if names is None or self.outputs is None:
             return stacked
         missing = [name for name in self.outputs if name not in names]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torchcal.errors import SimulatorError
 from torchcal.simulators.executor import TaskError, worker_died
 
-__all__ = ["ArrayCall", "PointCall", "Value", "describe_point", "failed_evaluation"]
+__all__ = ["ArrayCall", "Forgiving", "PointCall", "Value", "describe_point", "failed_evaluation"]
 
 Array = NDArray[np.float64]
 Value = tuple[tuple[str, ...] | None, Array]
@@ -75,6 +75,27 @@ class ArrayCall:
         p = dict(zip(self.parameters, map(float, row), strict=True))
         names = "" if self.conditions is None else f" of {', '.join(self.conditions)}"
         return f"{len(self.x)} conditions{names}, p = {p!r}"
+
+
+@dataclass(frozen=True)
+class Forgiving:
+    """A call that gives None where the arithmetic has no answer: searches try points far from anything physical.
+
+    Plain floats raise there (`math.exp(800)`, `1 / 0.0`, `math.log(-1)`), where arrays would give inf or NaN.
+    """
+
+    call: ArrayCall | PointCall
+
+    def __call__(self, row: Sequence[float]) -> Value | None:
+        """The call's value, or None."""
+        try:
+            return self.call(row)
+        except ArithmeticError:
+            return None
+        except ValueError as error:
+            if type(error) is ValueError and "math domain error" in str(error):
+                return None
+            raise
 
 
 def split_point(

@@ -490,6 +490,8 @@ class Trajectories(Simulator):
         for name in outputs:
             try:
                 value = self.ode.observe[name](self.grid.sample_t, s, p, self.grid.sample_u)
+            except SimulatorError:
+                raise
             except Exception as error:
                 raise SimulatorError(
                     f"Expected the output {name!r} as a tensor. Its function raised {type(error).__name__}: {error}."
