@@ -15,7 +15,9 @@ from torchcal.discovery.problem import Problem, Whitening
 from torchcal.discovery.records import NoiseModel
 from torchcal.errors import DomainError
 
-__all__ = ["GRID", "LEAST", "SHRINK", "Noise", "estimate", "least", "mine", "orthonormal", "smooth_columns", "spikes"]
+__all__ = [
+    "GRID", "LEAST", "SHRINK", "Noise", "estimate", "least", "lone", "mine", "orthonormal", "smooth_columns", "spikes",
+]  # fmt: skip
 
 #: AR(1) coefficients that are tried.
 GRID = torch.linspace(0.0, 0.95, 39, dtype=torch.float64)
@@ -23,6 +25,9 @@ GRID = torch.linspace(0.0, 0.95, 39, dtype=torch.float64)
 SMOOTH_SHARE = 1.0 / 6.0
 #: A sample that leaves its neighbours' range by more than this many robust sd, alone or with one beside it, is one.
 SPIKE = 4.5
+#: Robust sd from which on a residual of a model that explains the rest is an outlier, where its neighbours' are not
+#: half as large that way.
+LONE = 4.5
 #: By how many times the bend behind it a first or last sample must be off to be an outlier.
 BENT = 10.0
 #: Weight against correlation: log prior density of φ is −SHRINK·φ.
@@ -296,6 +301,29 @@ def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
             robust = max(robust, math.sqrt(1.3))  # what white noise gives
         if robust > 0:
             found[places] = _alone(r, _with_ends(r, off, SPIKE * robust), SPIKE * robust)
+    return found
+
+
+def lone(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
+    """Used data that a model that explains the others misses by far, bool ``(n,)``.
+
+    In an order their neighbours must not be half as far off that way; among several conditions they must not be
+    together.
+    """
+    found = torch.zeros(problem.n, dtype=torch.bool)
+    for places in problem.sequences:
+        if len(places) < 10:
+            continue
+        r = residual[places]
+        size = (1.4826 * r.abs().median()).expand(len(r))
+        if sd is not None:
+            size = size.maximum(sd[problem.index[places]])
+        far = (r.abs() > LONE * size) & (size > 0)
+        if problem.order is None:
+            found[places] = far & (not _clustered(problem, places, far))
+            continue
+        beside = torch.maximum(torch.cat([r[1:2], r[:-1]]) * r.sign(), torch.cat([r[1:], r[-2:-1]]) * r.sign())
+        found[places] = far & (beside < 0.5 * r.abs())
     return found
 
 

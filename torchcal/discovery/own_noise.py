@@ -11,7 +11,7 @@ from torch import Tensor
 from torchcal.discovery.fitting import refit
 from torchcal.discovery.likeliest import alone, log_likelihood, settled
 from torchcal.discovery.model import PRIOR, Model
-from torchcal.discovery.noise import Noise, spikes
+from torchcal.discovery.noise import Noise, lone, spikes
 
 if TYPE_CHECKING:
     from torchcal.discovery.search import Search
@@ -94,7 +94,8 @@ def outliers(search: "Search", observed: Tensor) -> Tensor | None:
     given = search.problem.recording.noise
     whole = dataclasses.replace(best.found.problem, keep=observed)
     found = refit(best.found, search.noise.whitening(whole), whole)  # what was set aside may be the effect itself
-    bad = spikes(whole, found.residual, given if isinstance(given, Tensor) else None)
+    sd = given if isinstance(given, Tensor) else None
+    bad = spikes(whole, found.residual, sd) | lone(whole, found.residual, sd)
     sticking = torch.zeros_like(observed)
     sticking[whole.index[bad]] = True
     return sticking if float(bad.double().mean()) <= MOST_OUTLIERS else None

@@ -27,6 +27,9 @@ WHITE = 0.005
 PLAINLY_WHITE, LINEAR = 0.05, 0.02
 #: By how much more than the sd that is given a named model may miss the data, beyond chance: such sd are seldom exact.
 LARGER, CHANCE = 1.25, 3.0
+#: Noise variances a datum by which held-out predictions may be worse whatever the standard error: 1 % of the RMSE of a
+#: model that leaves noise alone.
+NOTHING = 0.02
 #: Data a free parameter below which a fit without held-out data names nothing.
 LEAST_FITTED = 4
 #: Of the tied hypotheses, those that together have this probability are listed.
@@ -324,7 +327,7 @@ def _prove(search: Search, decision: Decision, mask: Tensor | None) -> None:
     if not bool(seen.any()):
         return
     gain, error = verify.compare(search.problem.recording, before, after, search.noise, seen)
-    if gain < -error:
+    if gain < -max(error, NOTHING):
         decision.withdrawn = (
             f"{' and '.join(decision.best.names)} explained the fitted data but predicted held-out data worse than the "
             f"base (by {-gain:.2g} ± {error:.1g} noise variances a datum), so the name is withdrawn."
