@@ -204,7 +204,7 @@ def test_a_mistake_in_a_term_is_told_as_this_terms():
     with pytest.raises(tc.errors.SimulatorError, match=r"^Expected a tensor from every function of the term 'bad s"):
         diagnose(base, recording, [sensor])
     typo = tc.Term("offset", outputs={"a": lambda t, s, p, u, y: y + p["b"]}, parameters=[tc.Parameter("b")])
-    with pytest.raises(tc.errors.DomainError, match="'offset' on outputs"):
+    with pytest.raises(tc.errors.DomainError, match="'offset' on an output"):
         diagnose(base, recording, [typo])
     with pytest.raises(tc.errors.DomainError, match="different names"):
         tc.ODESimulator(lambda t, s, p, u: {"A": -s["A"]}, ["A", "A"], [tc.Parameter("k")])
@@ -247,7 +247,7 @@ def test_a_typo_in_the_output_of_a_static_term_is_told():
     x = torch.linspace(0, 1, 20, dtype=F64)
     base = tc.Simulator(lambda x, p: p["a"] * x, [tc.Parameter("a")])
     term = tc.Term("offset", outputs={"Y": lambda x, p, y: y + p["o"]}, parameters=[tc.Parameter("o")])
-    with pytest.raises(tc.errors.DomainError, match=r"\['H'\]. Got \['Y'\]"):
+    with pytest.raises(tc.errors.DomainError, match=r"\('H',\). Got \['Y'\]"):
         diagnose(base, tc.Recording(x=x, y={"H": 2 * x}), [term])
 
 

@@ -29,7 +29,7 @@ from torchcal.discovery.several import refit_several
 from torchcal.discovery.verdict import PLAINLY_WHITE, Decision, decide
 from torchcal.discovery.windows import refit_local
 from torchcal.errors import ConvergenceWarning, DomainError, RecordingError
-from torchcal.simulators import Parameter, Simulator, Trajectories
+from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories
 from torchcal.simulators.executor import check_executor
 from torchcal.terms import Term, extend
 
@@ -111,9 +111,9 @@ def diagnose(
             f"Expected more data than parameters to calibrate. Got {problem.n} data and {len(free)} free parameters."
         )
     for term in terms:
-        known = (*recording.outputs, *getattr(simulator, "outputs", ()))  # a state that is not recorded may be seen
-        if unknown := [name for name in term.outputs if name not in known]:
-            raise DomainError(f"Expected the term {term.name!r} on outputs of {list(known)}. Got {unknown}.")
+        unknown = [name for name in term.outputs if name not in (*recording.outputs, "y")]  # what has no name is y
+        if unknown and not isinstance(simulator, ODESimulator):  # which knows its outputs' names itself
+            raise DomainError(f"Expected the term {term.name!r} on outputs of {recording.outputs}. Got {unknown}.")
         extend(simulator, [term])  # raises for names that do not fit, before any long work
     mask = verify.choose(recording, holdout, len(free))
     bar = tqdm(disable=not progress, desc="diagnose", unit="step", leave=False)

@@ -85,11 +85,12 @@ def calibrate_additive(
             f"{len(free)}: the residuals can vanish, and the likelihood grows without limit as σ → 0. Record more, "
             "hold parameters fixed, or use torchcal.calibrate."
         )
-    if recording.noise_sd is None and plan.samples and count - len(free) <= 2:
+    unbounded = sum(parameter.low is None or parameter.high is None for parameter in free)
+    if recording.noise_sd is None and plan.samples and count - unbounded <= 2:
         warnings.warn(
-            f"With N = {count} data and d = {len(free)} parameters the posterior has no finite variance: it is "
-            "Student's t with N − d degrees of freedom, and the sd of its draws say nothing. Record more, hold "
-            "parameters with fixed=, or give the recording's noise=.",
+            f"With N = {count} data and d = {unbounded} parameters without two bounds the posterior has no finite "
+            "variance: its tails are those of Student's t with N − d degrees of freedom, and the sd of its draws say "
+            "nothing. Record more, hold parameters with fixed=, or give the recording's noise=.",
             IdentifiabilityWarning,
             stacklevel=2,
         )
