@@ -345,14 +345,15 @@ def test_a_stricter_confidence_raises_the_limit():
     assert strict > loose
 
 
-def test_a_lone_outlier_is_one_beside_a_residual_of_the_other_sign_and_a_bump_is_none():
+def test_a_lone_outlier_is_one_beside_a_residual_of_the_other_sign_and_a_bump_or_an_end_is_none():
     t = torch.linspace(0, 10, 60, dtype=F64)
     base = tc.ODESimulator(lambda t, s, p, u: {"y": -p["k"] * s["y"]}, {"y": None}, [tc.Parameter("k", initial=0.1)])
     recording = tc.Recording(runs=[tc.Run(time=t, outputs={"y": torch.exp(-0.1 * t)})], noise=0.1)
     problem = Problem.of(base, recording)
     residual = 0.1 * torch.randn(60, generator=torch.Generator().manual_seed(0), dtype=F64).clamp(-2, 2)
     residual[20] = -0.8  # eight sd, beside nothing
-    residual[57:] = torch.tensor([-0.38, -0.35, 0.74], dtype=F64)  # a model that bends to the last sample
+    residual[50:53] = torch.tensor([-0.38, 0.74, -0.35], dtype=F64)  # a model that bends to it
+    residual[59] = -0.8  # the end of what may be physics
     residual[40:43] = torch.tensor([0.5, 0.6, 0.5], dtype=F64)  # something that lasts
-    assert lone(problem, residual, recording.noise).nonzero()[:, 0].tolist() == [20, 59]
-    assert lone(problem, residual, None).nonzero()[:, 0].tolist() == [20, 59]
+    assert lone(problem, residual, recording.noise).nonzero()[:, 0].tolist() == [20, 51]
+    assert lone(problem, residual, None).nonzero()[:, 0].tolist() == [20, 51]

@@ -307,8 +307,8 @@ def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
 def lone(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
     """Used data that a model that explains the others misses by far, bool ``(n,)``.
 
-    In an order their neighbours must not be half as far off that way; among several conditions they must not be
-    together.
+    In an order their neighbours must not be half as far off that way, and the ends are not judged: a quick beginning is
+    physics as likely as not. Among several conditions they must not be together.
     """
     found = torch.zeros(problem.n, dtype=torch.bool)
     for places in problem.sequences:
@@ -322,7 +322,8 @@ def lone(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
         if problem.order is None:
             found[places] = far & (not _clustered(problem, places, far))
             continue
-        beside = torch.maximum(torch.cat([r[1:2], r[:-1]]) * r.sign(), torch.cat([r[1:], r[-2:-1]]) * r.sign())
+        beside = torch.maximum(r.roll(1) * r.sign(), r.roll(-1) * r.sign())
+        far[[0, -1]] = False
         found[places] = far & (beside < 0.5 * r.abs())
     return found
 
