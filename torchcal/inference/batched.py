@@ -314,7 +314,8 @@ def _adapt(
 ) -> tuple[Tensor, Tensor, Tensor, float]:
     """One warm-up window: draws of its second half, whose they are, where all chains end, and the share diverged.
 
-    Where the window is to ``settle``, that half has the step size that was found, and the share is that of its steps.
+    Where the window is to ``settle``, that half has the step size that was found, and the share is that of its steps;
+    elsewhere nothing is judged, and it is 0.
     """
     chains = len(z)
     state = moves.init(z, space, averaging.step_size)
@@ -323,7 +324,7 @@ def _adapt(
     owners: list[Tensor] = []
     accepted: list[Tensor] = []
     waiting = diverged = counted = 0
-    begun = torch.full((chains,), not settle, device=z.device)  # whose trajectory has the step size that is judged
+    begun = torch.zeros(chains, dtype=torch.bool, device=z.device)  # whose trajectory has the step size that is judged
     while finished < length * chains:
         settled = settle and finished > length * chains // 2
         state, outcome = moves.step(state, space, averaging.settled if settled else averaging.step_size)
@@ -336,7 +337,7 @@ def _adapt(
             accepted.append(outcome.accept[outcome.done])
         # One update for every half of the crowd: a step size is judged by trajectories that used it, not by those
         # still on the way from before, and short ones do not count more than long ones.
-        if 2 * waiting >= chains and not settled:
+        if 2 * waiting >= chains:
             averaging.update(float(torch.cat(accepted).mean()))
             accepted.clear()
             waiting = 0

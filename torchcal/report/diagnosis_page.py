@@ -39,6 +39,7 @@ MEANING = {
     "unexplained": "something was left out that is not in this library",
 }
 
+
 def write(diagnosis: Any, path: str | os.PathLike[str]) -> Path:
     """Write a diagnosis as an HTML page that needs no other file, no network and no script.
 
