@@ -56,7 +56,7 @@ def legendre(x: Tensor, degree: int) -> list[Tensor]:
 
 
 def simulator(model: str) -> tc.Simulator:
-    """One of the `MODELS` (Eq. 34), with parameters l0, l1, … without bounds."""
+    """One of the `MODELS` (Eq. 34), linear in its parameters l0, l1, …, which have no bounds."""
     names = [f"l{k}" for k in range(MODELS[model] + 1)]
 
     def polynomial(x: Tensor, p: dict[str, Tensor]) -> Tensor:
@@ -65,7 +65,7 @@ def simulator(model: str) -> tc.Simulator:
             total = total + p[name] * value
         return total
 
-    return tc.Simulator(polynomial, parameters=[tc.Parameter(name) for name in names])
+    return tc.Simulator(polynomial, parameters=[tc.Parameter(name) for name in names], degree=1)
 
 
 def recording(n: int) -> tc.Recording:

@@ -98,6 +98,40 @@ def test_moments_gradients_and_expansion(degree, order, nodes):
     assert calls_of(function, other) > 0
 
 
+class Rows:
+    """A function that notes how many values of the parameters it was called with last."""
+
+    def __init__(self, function):
+        self.function, self.rows = function, 0
+
+    def __call__(self, x, p):
+        result = self.function(x, p)
+        self.rows = result.numel() // len(x)
+        return result
+
+
+@pytest.mark.parametrize("embedding", [Gaussian(), PolynomialChaos(germ="legendre"), PolynomialChaos(order=2)])
+def test_a_polynomial_is_interpolated_at_as_many_nodes_as_it_has_terms(embedding):
+    """Where outputs are fewer than Legendre products, the function itself is called, at few nodes."""
+    function = Rows(functools.partial(cubic, 2))
+    one, other = pair(function, embedding, X[:4], degree=2)
+    other.set_rule(one.rule_choice)
+    terms = math.comb(3 + 2 * embedding.order, 3)
+    assert one.num_evaluations == terms < one.num_nodes == other.num_evaluations
+    alpha = draw(7, one.num_alpha)
+    one.moments(alpha)
+    assert function.rows == 7 * terms
+    check_same(one, other, close={"rtol": 1e-9, "atol": 1e-9})
+    coarse = NISP(one.simulator, embedding, X[:4], rule=one.rule_choice, max_elements=50)
+    for whole, cut in zip(one.moments(alpha), coarse.moments(alpha), strict=True):
+        torch.testing.assert_close(whole, cut, rtol=1e-12, atol=1e-12)
+
+
+def test_a_degree_that_does_not_hold_takes_all_nodes():
+    bent = NISP(Simulator(lambda x, p: x * (p["a"] * p["b"] + p["c"]).abs(), PARAMETERS, degree=2), Gaussian(), X[:4])
+    assert bent.num_evaluations == bent.num_nodes == 27
+
+
 @pytest.mark.parametrize(
     ("embedding", "nodes"),
     [

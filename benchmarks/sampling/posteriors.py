@@ -177,12 +177,9 @@ def export(posterior: Posterior) -> tuple[Arrays, float]:
     seconds = time.perf_counter() - began
     propagate = problem.propagate
     pattern = propagate.pattern
-    psi = polychaos.evaluate(pattern.basis, pattern.indices, propagate.nodes)
-    projection = None
-    if propagate.order is not None:
-        terms = polychaos.multi_indices(pattern.num_germs, propagate.order)
-        values = polychaos.evaluate(pattern.basis, terms, propagate.nodes)
-        projection = values * propagate.weights[:, None] / polychaos.norms(pattern.basis, terms).sqrt()
+    # The nodes that torchcal's own moments take: for a polynomial fewer than those of a quadrature rule.
+    psi = propagate._psi if propagate._carriers is None else propagate._carriers
+    projection = propagate._projection
     model = _polynomial(propagate) if posterior.function is None else _function(propagate)
     points = _points(problem, calibration.map.alpha, loc, scale_tril)
     with torch.no_grad():

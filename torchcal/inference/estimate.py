@@ -116,7 +116,7 @@ def maximise(
     if in_time and len(begin) > 2:
         found = search(objective, problem.propagate, begin, leading, progress=show)
     else:
-        cost = problem.propagate.num_nodes * len(problem.y) * begin.numel()
+        cost = problem.propagate.num_evaluations * len(problem.y) * begin.numel()
         keep = MOST_KEPT if cost > DEAR else None
         found = minimise(lambda u: objective(problem.propagate, u), begin, keep=keep, progress=show)
     if not bool(torch.isfinite(found.values[0])):

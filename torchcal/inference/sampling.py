@@ -122,7 +122,7 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
     modes = modes_of(problem, estimate)
     _warn_of_rounding(estimate, plan.dtype)
     cast = problem.cast(plan.dtype)
-    cost = cast.propagate.num_nodes * len(cast.y)
+    cost = cast.propagate.num_evaluations * len(cast.y)
     worth = [k for k, mode in enumerate(modes) if k == 0 or (mode.weight >= WORTH_CHAINS and plan.sampler != "pyro")]
     starts = [modes[k].to(plan.dtype) for k in worth]
     begun = {worth[k] for k in dealt_out([mode.weight for mode in starts], plan.chains(cost))}

@@ -189,7 +189,7 @@ def _iterate(
     leader = torch.arange(len(points), device=points.device)
     radius = torch.ones_like(values)
     with torch.no_grad():
-        numbers = tangent.num_nodes * propagate.mean(points[:1, : propagate.num_alpha]).shape[-1]
+        numbers = tangent.num_evaluations * propagate.mean(points[:1, : propagate.num_alpha]).shape[-1]
     most = max(1, _ELEMENTS // (max(26, 2 * points.shape[1]) * numbers))
     iteration = 0
     for iteration in range(1, max_iterations + 1):

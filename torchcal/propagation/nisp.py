@@ -67,6 +67,7 @@ class NISP(nn.Module):
     nodes: Tensor
     weights: Tensor
     _psi: Tensor
+    _carriers: Tensor | None
     _projection: Tensor | None
     _template: Tensor
     _places: Tensor
@@ -125,8 +126,10 @@ class NISP(nn.Module):
         self._evaluate: Callable[[Tensor], Tensor] | None = None
         self._polynomial: Tensor | None = None
         found = polynomials.expansion(self)
-        self.register_buffer("_table", None if found is None else found[1], persistent=False)
-        self._polynomial = None if found is None else found[0]
+        self._is_polynomial = found is not None
+        found = found if found is not None and found.pays else None
+        self.register_buffer("_table", None if found is None else found.table, persistent=False)
+        self._polynomial = None if found is None else found.terms
         self._wanted_rule = rule
         self.set_rule(choice.choose(self, rule))
 
@@ -158,6 +161,11 @@ class NISP(nn.Module):
     def num_nodes(self) -> int:
         """The number of quadrature nodes."""
         return len(self.nodes)
+
+    @property
+    def num_evaluations(self) -> int:
+        """The number of nodes that moments of one α take: fewer than all of them for a polynomial of known degree."""
+        return self.num_nodes if self._carriers is None else len(self._carriers)
 
     def extra_repr(self) -> str:
         """Shown by ``print``."""
@@ -209,7 +217,7 @@ class NISP(nn.Module):
     def mean(self, alpha: Tensor) -> Tensor:
         """Mean of the outputs, ``(*batch, n)``; the outputs themselves where nothing is embedded."""
         self._check_alpha(alpha)
-        return self._in_pieces(alpha, lambda block: (self._weighted(block, self.weights[:, None])[..., 0, :],))[0]
+        return self._in_pieces(alpha, lambda block: (self._mean(block)[..., 0, :],))[0]
 
     def coefficients(self, alpha: Tensor, order: int | None = None) -> tuple[Tensor, Tensor]:
         r"""The output's expansion, :math:`c_{ik} = \langle f_i \Psi_k \rangle / \langle \Psi_k^2 \rangle`.
@@ -229,7 +237,7 @@ class NISP(nn.Module):
         indices = polychaos.multi_indices(self.pattern.num_germs, order)
         matrix = polychaos.evaluate(self.pattern.basis, indices, self.nodes) * self.weights[:, None]
         matrix = matrix / polychaos.norms(self.pattern.basis, indices).to(matrix)
-        (result,) = self._in_pieces(alpha, lambda block: (self._weighted(block, matrix).transpose(-1, -2),))
+        (result,) = self._in_pieces(alpha, lambda block: (self._weighted(block, matrix, self._psi).transpose(-1, -2),))
         return result, indices
 
     def parameters_at(self, alpha: Tensor, xi: Tensor, *, paired: bool = False) -> Tensor:
@@ -378,12 +386,18 @@ class NISP(nn.Module):
             self._evaluate = self.simulator.at(self.x, self.outputs)
         return self._evaluate(self.with_held(values))
 
-    def _weighted(self, alpha: Tensor, matrix: Tensor) -> Tensor:
+    def _mean(self, alpha: Tensor) -> Tensor:
+        """The outputs' mean ``(*batch, 1, n)``."""
+        if self._carriers is not None and self._projection is not None:
+            return self._weighted(alpha, self._projection[:, :1], self._carriers)
+        return self._weighted(alpha, self.weights[:, None], self._psi)
+
+    def _weighted(self, alpha: Tensor, matrix: Tensor, psi: Tensor) -> Tensor:
         """Σ_q matrix[q, k] f_q, shape ``(*batch, k, n)``, node piece by node piece."""
-        pieces = self._node_pieces(alpha)
+        pieces = self._node_pieces(alpha, len(psi))
 
         def part(block: Tensor, piece: slice) -> tuple[Tensor]:
-            return (matrix[piece].transpose(-1, -2) @ self._features(block, self._psi[piece]),)
+            return (matrix[piece].transpose(-1, -2) @ self._features(block, psi[piece]),)
 
         if len(pieces) == 1:
             return self._finished(part(alpha, pieces[0])[0])
@@ -402,18 +416,18 @@ class NISP(nn.Module):
     def _moments(self, alpha: Tensor) -> tuple[Tensor, Tensor]:
         if self._projection is not None:
             if self._affine is None:
-                terms = self._weighted(alpha, self._projection)
+                terms = self._weighted(alpha, self._projection, self._psi if self._carriers is None else self._carriers)
             else:
                 terms = self._linear(alpha, self._affine, self._projection.shape[1])
             return terms[..., 0, :], terms[..., 1:, :].square().sum(-2)
-        pieces = self._node_pieces(alpha)
+        pieces = self._node_pieces(alpha, self.num_nodes)
         if len(pieces) == 1:
             outputs = self._outputs(alpha, self._psi)
             mean = self.weights @ outputs
             offset = outputs - mean.unsqueeze(-2)
             return mean, self.weights @ offset.square()
         with torch.no_grad():  # a shift near the mean keeps the sum of squares from cancelling
-            shift = self._weighted(alpha.detach(), self.weights[:, None])
+            shift = self._mean(alpha.detach())
 
         def sums(block: Tensor, piece: slice) -> tuple[Tensor, Tensor]:
             offset = self._outputs(block, self._psi[piece]) - shift
@@ -425,10 +439,10 @@ class NISP(nn.Module):
             first, second = first + one, second + two
         return shift[..., 0, :] + first, (second - first.square()).clamp_min(0)
 
-    def _node_pieces(self, alpha: Tensor) -> list[slice]:
+    def _node_pieces(self, alpha: Tensor, count: int) -> list[slice]:
         rows = alpha.numel() // self.num_alpha * self._width
         size = max(1, self.max_elements // max(1, rows))
-        return [slice(i, i + size) for i in range(0, self.num_nodes, size)]
+        return [slice(i, i + size) for i in range(0, count, size)]
 
     @property
     def _width(self) -> int:
@@ -451,11 +465,25 @@ class NISP(nn.Module):
     def _whole_order(self, rule_choice: RuleChoice) -> int | None:
         """Degree of a polynomial's whole expansion in the germs, where the rule has nodes enough for it."""
         exact, degree = choice.exact_count(self), self.simulator.degree
-        if self._polynomial is None or exact is None or not degree:
+        if not self._is_polynomial or exact is None or not degree:
             return None
         if rule_choice.kind != "tensor" or rule_choice.size < exact:
             return None
         return degree * max(1, self.pattern.order)
+
+    def _interpolated(self, whole: int | None, order: int | None, rule: polychaos.Rule) -> tuple[Tensor, Tensor] | None:
+        """Few of the nodes ``(K,)`` and the projection ``(K, K)`` from them onto a polynomial's whole expansion.
+
+        None where that is not wanted, or would not be fewer than all of them.
+        """
+        germs = self.pattern.num_germs
+        if whole is None or order is None or order < whole or math.comb(germs + whole, whole) >= rule.num:
+            return None
+        terms = polychaos.multi_indices(germs, whole)
+        values = polychaos.evaluate(self.pattern.basis, terms, rule.nodes)
+        values = values / polychaos.norms(self.pattern.basis, terms).sqrt()
+        chosen = polynomials.interpolating(values, rule.weights)
+        return chosen, torch.linalg.inv(values[chosen]).T
 
     def _affine_map(self, psi: Tensor, projection: Tensor | None) -> Tensor | None:
         """Projected Legendre products of degree 1 from (1, α), ``(1 + P, k M)``; None where there are higher ones."""
@@ -477,19 +505,24 @@ class NISP(nn.Module):
         device, dtype = self._template.device, self._template.dtype
         rule = rule_choice.build(basis, self.pattern.num_germs)
         self._choice = rule_choice
-        projection = None
-        order = self.order if self.order is not None else rule_choice.carried_order or self._whole_order(rule_choice)
-        if order is not None and self.pattern.num_germs:
+        projection = carriers = None
+        whole = self._whole_order(rule_choice)
+        order = self.order if self.order is not None else rule_choice.carried_order or whole
+        psi = polychaos.evaluate(basis, indices, rule.nodes)
+        few = self._interpolated(whole, order, rule)
+        if few is not None:
+            carriers, projection = psi[few[0]], few[1]
+        elif order is not None and self.pattern.num_germs:
             terms = polychaos.multi_indices(self.pattern.num_germs, order)
             values = polychaos.evaluate(basis, terms, rule.nodes)
             projection = values * rule.weights[:, None] / polychaos.norms(basis, terms).sqrt()
-        psi = polychaos.evaluate(basis, indices, rule.nodes)
         for name, value in (
             ("nodes", rule.nodes),
             ("weights", rule.weights),
             ("_psi", psi),
+            ("_carriers", carriers),
             ("_projection", projection),
-            ("_affine", self._affine_map(psi, projection)),
+            ("_affine", self._affine_map(psi if carriers is None else carriers, projection)),
         ):
             # Built in float64 and only then cast, so that the rule is as good as the dtype allows.
             cast = None if value is None else value.to(device=device, dtype=dtype)

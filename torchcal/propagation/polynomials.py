@@ -7,6 +7,7 @@ of the many outputs:
 """
 
 import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
@@ -18,7 +19,7 @@ from torchcal.simulators import ExternalSimulator, PolynomialSurrogate
 if TYPE_CHECKING:
     from torchcal.propagation.nisp import NISP
 
-__all__ = ["expansion"]
+__all__ = ["expansion", "interpolating"]
 
 MOST_TERMS = 500
 """Terms beyond which nothing is gained."""
@@ -33,17 +34,32 @@ _SPARE = 8
 """Points to test it at."""
 
 
-def expansion(propagate: "NISP") -> tuple[Tensor, Tensor] | None:
-    """Multi-indices ``(M, d)`` and coefficients ``(M, n)`` of the outputs in Legendre products of scaled parameters.
+@dataclass(frozen=True)
+class Expansion:
+    """Outputs in Legendre products of scaled parameters.
 
-    None where the simulator says nothing of a degree, a parameter is on a logarithmic scale, what it says does not
-    hold, or there are fewer outputs than coefficients: then nodes are evaluated as of any other simulator.
+    Attributes:
+        terms: Multi-indices ``(M, d)``.
+        table: Coefficients ``(M, n)``.
+        pays: Whether products cost less than outputs: they are fewer, or the simulator is dear.
+    """
+
+    terms: Tensor
+    table: Tensor
+    pays: bool
+
+
+def expansion(propagate: "NISP") -> Expansion | None:
+    """The outputs as a polynomial, found at random points and held against others.
+
+    None where the simulator says nothing of a degree, a parameter is on a logarithmic scale, there are too many terms,
+    or what it says does not hold: then nodes are evaluated as of any other simulator.
     """
     degree, d = propagate.simulator.degree, len(propagate.free)
     if degree is None or d == 0 or bool(propagate.scaling.log.any()):
         return None
     count = math.comb(degree + d, d)
-    if count > MOST_TERMS or (count > propagate._n and not isinstance(propagate.simulator, _DEAR)):
+    if count > MOST_TERMS:
         return None
     terms = polychaos.multi_indices(d, degree)
     generator = torch.Generator().manual_seed(0)
@@ -60,4 +76,24 @@ def expansion(propagate: "NISP") -> tuple[Tensor, Tensor] | None:
     tolerance = max(TOLERANCE, 1e3 * torch.finfo(where.dtype).eps)
     if not bool((error <= tolerance * propagate.largest(values.abs().amax(0))).all()):
         return None
-    return terms, table
+    return Expansion(terms, table, count <= propagate._n or isinstance(propagate.simulator, _DEAR))
+
+
+def interpolating(values: Tensor, weights: Tensor) -> Tensor:
+    """Rows of a rule's nodes that determine an expansion by themselves, ``(K,)``, as many as it has terms.
+
+    Approximate Fekete points: the rows of the weighted matrix that pivoted orthogonalisation takes first.
+
+    Args:
+        values: Orthonormal polynomials at the nodes, ``(Q, K)``.
+        weights: Of the nodes, ``(Q,)``, positive.
+
+    Source: Bos, De Marchi, Sommariva & Vianello (2010), SIAM J. Numer. Anal. 48, 1984-1999.
+    """
+    rest = values * weights.sqrt()[:, None]
+    chosen = []
+    for _ in range(values.shape[1]):
+        chosen.append(int(rest.square().sum(1).argmax()))
+        along = rest[chosen[-1]] / rest[chosen[-1]].norm()
+        rest = rest - (rest @ along)[:, None] * along
+    return torch.tensor(chosen)
