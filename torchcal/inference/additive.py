@@ -1,5 +1,6 @@
 """`calibrate_additive`: the conventional calibration, which stands beside the embedded one."""
 
+import dataclasses
 import math
 import warnings
 from collections.abc import Mapping
@@ -124,7 +125,7 @@ def calibrate_additive(
     warn_of_chains(quality)
     warn_of_box(simulator, propagate, estimate.alpha[:-1])
     mean = propagate.scaling.physical(estimate.alpha[:-1])
-    return AdditiveCalibration(
+    result = AdditiveCalibration(
         map=MapEstimate(
             alpha=to_result(estimate.alpha),
             mean=to_result(mean),
@@ -139,6 +140,13 @@ def calibrate_additive(
         propagate=propagate,
         settings=settings_of(problem, fit, "additive", seed, plan.warmup),
     )
+    if result.noise_suffices:  # the posterior is flat in ln σ, then, which says nothing about the data
+        others = quality.null_directions.clone()
+        others[:, -1] = 0.0
+        _, size, rows = torch.linalg.svd(others, full_matrices=False)
+        quality = dataclasses.replace(quality, null_directions=rows[size > 0.1])
+        result = dataclasses.replace(result, diagnostics=quality)
+    return result
 
 
 def _additive_prior(propagate: NISP, fit: LeastSquares, recording: Recording) -> CoefficientPrior:

@@ -13,7 +13,7 @@ from torchcal.errors import ConvergenceError, ConvergenceWarning, Identifiabilit
 from torchcal.inference.coordinates import Laplace
 from torchcal.inference.newton import Minima, gradient, hessian, minimise
 from torchcal.inference.randomness import preserve_random_state
-from torchcal.inference.tangent import search
+from torchcal.inference.tangent import few_nodes, pieces, search, search_with_few_nodes
 from torchcal.models import Problem
 from torchcal.propagation import NISP
 from torchcal.results.in_time import refine_in_time
@@ -38,7 +38,8 @@ MOST_MODES = 6
 """Ends of starts, away from the maxima that are known, that are looked at."""
 
 DEAR, MOST_KEPT = 1_000_000, 8
-"""Numbers that one gradient of all starts handles from which on the worse starts are given up, and how many are not."""
+"""Numbers that one gradient of all starts handles from which on the search begins with few quadrature nodes; where it
+cannot, the worse starts are given up, and how many are not."""
 
 SAME_MEANS = 1e-3
 """Difference of scaled means up to which two starts ended at one maximum."""
@@ -111,14 +112,29 @@ def maximise(
         bar.update(1)
         bar.set_postfix(objective=f"{float(values.min()):.6g}")
 
+    def coefficients(points: Tensor) -> Tensor:
+        return transform.bound(points)[..., : problem.propagate.num_alpha]
+
     objective = _objective(problem)
     begin = transform.unbound(starts)
+    outputs = len(problem.y)
+    cost = problem.propagate.num_evaluations * outputs * begin.numel()
+    coarse = few_nodes(problem.propagate) if cost > DEAR and problem.likelihood.needs != "samples" else None
+    found: Minima | None = None
     if in_time and len(begin) > 2:
         found = search(objective, problem.propagate, begin, leading, progress=show)
-    else:
-        cost = problem.propagate.num_evaluations * len(problem.y) * begin.numel()
-        keep = MOST_KEPT if cost > DEAR else None
-        found = minimise(lambda u: objective(problem.propagate, u), begin, keep=keep, progress=show)
+    elif not in_time and coarse is not None:
+        found = search_with_few_nodes(
+            objective, problem.propagate, coarse, begin, outputs, alpha=coefficients, progress=show
+        )
+    if found is None:
+        found = minimise(
+            lambda u: objective(problem.propagate, u),
+            begin,
+            keep=MOST_KEPT if cost > DEAR else None,
+            piece=pieces(problem.propagate, outputs),
+            progress=show,
+        )
     if not bool(torch.isfinite(found.values[0])):
         raise ConvergenceError(
             f"Expected a finite posterior at some starting point. Got none at {len(starts)}. Check the "
@@ -128,11 +144,13 @@ def maximise(
     total = len(found.values)
     if problem.propagate.pattern.num_germs:
         for _ in range(4):  # a maximum found with too few nodes may move with more of them
-            best = transform.bound(found.points[:1])[..., : problem.propagate.num_alpha]
+            best = coefficients(found.points[:1])
             if not (refine_in_time(problem.propagate, best) if in_time else problem.propagate.refine(best)):
                 break
             points = found.points[: 1 if in_time else max(4, total // 4)]
-            found = minimise(lambda u: objective(problem.propagate, u), points, progress=show)
+            points = torch.cat([points[:1], points[1:][(points.diff(dim=0) != 0).any(-1)]])  # those that joined, once
+            piece = pieces(problem.propagate, outputs)
+            found = minimise(lambda u: objective(problem.propagate, u), points, piece=piece, progress=show)
     bar.close()
     best, ties = _first_of_the_tied(problem, found)
     if agreeing < 2 <= len(found.values):
@@ -142,7 +160,8 @@ def maximise(
             ConvergenceWarning,
             stacklevel=3,
         )
-    curvature = hessian(lambda a: -problem.log_prob(a), _inside(problem, best)[None])[0]
+    piece = pieces(problem.propagate, outputs)
+    curvature = hessian(lambda a: -problem.log_prob(a), _inside(problem, best)[None], piece=piece)[0]
     values, vectors = torch.linalg.eigh(torch.nan_to_num(curvature))
     top = float(values.abs().max().clamp_min(1e-300))
     # Flat beside the steepest direction and flat in itself: at a spike every other direction is only the former.
@@ -332,10 +351,11 @@ def laplace(problem: Problem, alpha: Tensor) -> tuple[Laplace, float]:
     def objective(u: Tensor) -> Tensor:
         return -problem.log_prob(transform.bound(u)) - transform.log_slope(u)
 
+    piece = pieces(problem.propagate, len(problem.y))
     if not transform.free:
         starts = torch.stack([loc, loc.clamp(-4.0, 4.0)])
-        loc = minimise(objective, starts).points[0]
-    curvature = torch.nan_to_num(hessian(objective, loc[None])[0])
+        loc = minimise(objective, starts, piece=piece).points[0]
+    curvature = torch.nan_to_num(hessian(objective, loc[None], piece=piece)[0])
     values, vectors = torch.linalg.eigh(curvature)
     values = values.abs().clamp_min(max(1.0, 1e-12 * float(values.abs().max())))
     covariance = (vectors / values) @ vectors.T

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-__all__ = ["Minima", "directions", "gradient", "hessian", "join", "minimise"]
+__all__ = ["Minima", "directions", "finite_values", "gradient", "hessian", "join", "minimise"]
 
 Objective = Callable[[Tensor], Tensor]
 
@@ -45,8 +45,11 @@ class Minima:
     iterations: int
 
 
-def gradient(objective: Objective, points: Tensor) -> tuple[Tensor, Tensor]:
-    """Values ``(B,)`` and gradients ``(B, P)``; what is not finite becomes +inf and 0."""
+def gradient(objective: Objective, points: Tensor, *, piece: int | None = None) -> tuple[Tensor, Tensor]:
+    """Values ``(B,)`` and gradients ``(B, P)``, ``piece`` points at once; what is not finite becomes +inf and 0."""
+    if piece is not None and len(points) > piece:
+        parts = [gradient(objective, block) for block in points.split(piece)]
+        return torch.cat([part[0] for part in parts]), torch.cat([part[1] for part in parts])
     leaf = points.detach().requires_grad_(True)
     with torch.enable_grad():
         values = objective(leaf)
@@ -56,16 +59,23 @@ def gradient(objective: Objective, points: Tensor) -> tuple[Tensor, Tensor]:
     return torch.where(good, values, torch.inf), torch.where(good[:, None], slope, 0.0)
 
 
-def hessian(objective: Objective, points: Tensor, *, step: float = _STEP) -> Tensor:
-    """Hessians ``(B, P, P)`` by central differences of the gradient, all of them in one batch."""
+def hessian(objective: Objective, points: Tensor, *, step: float = _STEP, piece: int | None = None) -> Tensor:
+    """Hessians ``(B, P, P)`` by central differences of the gradient, all of them in one batch or piece by piece."""
     batch, size = points.shape
     length = step * points.abs().clamp_min(1.0)  # coordinates that are not scaled yet may be large
     shift = torch.diag_embed(length)
     both = torch.stack([points[:, None] + shift, points[:, None] - shift])  # (2, B, P, P)
-    _, slopes = gradient(objective, both.reshape(-1, size))
+    _, slopes = gradient(objective, both.reshape(-1, size), piece=piece)
     slopes = slopes.reshape(2, batch, size, size)
     result = (slopes[0] - slopes[1]) / (2 * length[..., None])
     return 0.5 * (result + result.transpose(-1, -2))
+
+
+def finite_values(objective: Objective, points: Tensor, *, piece: int | None = None) -> Tensor:
+    """Values ``(B,)`` without gradients, ``piece`` points at once; what is not finite becomes +inf."""
+    with torch.no_grad():
+        values = torch.cat([objective(block) for block in points.split(piece or max(1, len(points)))])
+    return torch.nan_to_num(values, nan=torch.inf, posinf=torch.inf)
 
 
 def minimise(
@@ -75,6 +85,8 @@ def minimise(
     max_iterations: int = 200,
     tolerance: float = 1e-10,
     keep: int | None = None,
+    piece: int | None = None,
+    curvature: Objective | None = None,
     progress: Callable[[int, Tensor], None] | None = None,
 ) -> Minima:
     r"""Damped Newton steps with absolute curvatures, from every start at once.
@@ -91,12 +103,13 @@ def minimise(
             one: log-densities differ by nothing that matters then.
         keep: For dear objectives: every six iterations the worse half of the starts still under way is left where it
             is, until so many are.
+        piece: Points whose objective is taken at once; all of them by default.
+        curvature: A cheaper objective to take Hessians of, close to this one.
         progress: Called with the iteration and the values so far.
     """
     points = starts.detach().clone()
     size = points.shape[1]
-    with torch.no_grad():
-        values = torch.nan_to_num(objective(points), nan=torch.inf, posinf=torch.inf)
+    values = finite_values(objective, points, piece=piece)
     stalls = torch.zeros(len(points), dtype=torch.long, device=points.device)
     active = torch.isfinite(values)
     leader = torch.arange(len(points), device=points.device)
@@ -106,11 +119,10 @@ def minimise(
         if not len(rows):
             break
         here = points[rows]
-        _, slope = gradient(objective, here)
-        tries = here[:, None] + directions(slope, hessian(objective, here))
-        with torch.no_grad():
-            found = torch.nan_to_num(objective(tries.reshape(-1, size)), nan=torch.inf, posinf=torch.inf)
-        found = found.reshape(tries.shape[:2])
+        _, slope = gradient(objective, here, piece=piece)
+        bend = hessian(objective if curvature is None else curvature, here, piece=piece)
+        tries = here[:, None] + directions(slope, bend)
+        found = finite_values(objective, tries.reshape(-1, size), piece=piece).reshape(tries.shape[:2])
         best, which = found.min(1)
         gain = values[rows] - best
         better = gain > 0

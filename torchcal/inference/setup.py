@@ -62,15 +62,7 @@ def check_inputs(
             if parameter.initial is not None:
                 guess[simulator.names.index(parameter.name)] = parameter.initial
         simulator = _begin(simulator, guess[None], 100 * allowed_solver_error(recording))
-    try:
-        count = simulator.check(recording.x, values, recording.outputs)
-    except SimulatorError as error:
-        if recording.runs is None or isinstance(simulator, Trajectories):
-            raise
-        raise SimulatorError(
-            f"{error} The recording is one in time and the simulator static: it is called with x['time'] and "
-            "x['run']. Use torchcal.ODESimulator for a model of rates."
-        ) from error
+    count = simulator.check(recording.x, values, recording.outputs)
     if count != len(recording.y):
         raise SimulatorError(
             f"Expected {len(recording.y)} output values, as in the recording ({recording.n} conditions × "

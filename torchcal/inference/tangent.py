@@ -1,4 +1,4 @@
-"""Minimisation for simulators whose runs are dear: many steps on a model's tangents for each call of the model."""
+"""Minimisation where the model is dear: first on its tangents or with few quadrature nodes, then with all of it."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -6,11 +6,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchcal.inference.newton import Minima, directions, join, minimise
+from torchcal.inference.newton import Minima, directions, finite_values, join, minimise
 from torchcal.propagation import NISP
-from torchcal.simulators import Conditions, Simulator
+from torchcal.simulators import Conditions, ExternalSimulator, Simulator, Trajectories
 
-__all__ = ["minimise_by_tangents", "search"]
+__all__ = ["few_nodes", "minimise_by_tangents", "pieces", "search", "search_with_few_nodes"]
 
 Objective = Callable[[NISP, Tensor], Tensor]
 
@@ -37,6 +37,21 @@ _SHARES = (1.0, 0.5, 0.2, 0.05, 0.01)
 
 _ELEMENTS = 2**23
 """Numbers of outputs on tangents at once, 64 MiB."""
+
+_PIECE = 2**17
+"""Numbers of outputs at once on a CPU, whose caches hold them: larger pieces take several times longer each."""
+
+_FEWER = 4
+"""How many times fewer nodes make a search with them worth its while."""
+
+_ENDS, _FAR = 8, 100
+"""Ends of a search with few nodes that are followed with a few more, and for how many iterations."""
+
+_GAP = 15.0
+"""Objective above the best end's from which on only the `_DISTINCT` best are followed: little is to be won there."""
+
+_NEAR = 0.1
+"""Difference of scaled means from which on ends of equal objectives are followed apart: they may be two that tie."""
 
 
 class _Tangents(Simulator):
@@ -138,6 +153,95 @@ def search(
         ends[-1], results[-1] = points[-1], values[-1]
     order = results.argsort(stable=True)
     return Minima(ends[order], results[order], rough.iterations + iterations)
+
+
+def few_nodes(propagate: NISP) -> NISP | None:
+    """The same propagation with the fewest nodes that see every coefficient; None where those are hardly fewer."""
+    count, germs = max(propagate.pattern.order, propagate.order or 1) + 1, propagate.pattern.num_germs
+    if germs == 0 or _FEWER * count**germs > propagate.num_evaluations:
+        return None
+    return propagate.copy(rule=count)
+
+
+def pieces(propagate: NISP, outputs: int) -> int | None:
+    """Points whose objective is taken at once; None for all, as for simulators with much to do for each call."""
+    if propagate.nodes.device.type != "cpu" or isinstance(propagate.simulator, (ExternalSimulator, Trajectories)):
+        return None
+    return max(1, _PIECE // (propagate.num_evaluations * outputs))
+
+
+def search_with_few_nodes(
+    objective: Objective,
+    propagate: NISP,
+    coarse: NISP,
+    starts: Tensor,
+    outputs: int,
+    *,
+    alpha: Callable[[Tensor], Tensor],
+    progress: Callable[[int, Tensor], None] | None = None,
+) -> Minima | None:
+    """Minimise with few nodes from every start, then with more of them from the best of where those ended.
+
+    Near a minimum the densities are narrow, and one node more for each germ than the coarse rule has all but settles
+    the moments there. On the whole rule, the objective of interest, the Hessians with few nodes serve again for the
+    step or two that are left.
+
+    Args:
+        objective: Of a propagation and points ``(*batch, P)``, ``(*batch,)``.
+        propagate: The propagation.
+        coarse: The same with fewer nodes.
+        starts: ``(S, P)``.
+        outputs: Number of outputs n.
+        alpha: From points ``(S, P)`` to coefficients ``(S, num_alpha)``.
+        progress: Called with the iteration and the values so far.
+
+    Returns:
+        One row for each start: those that end in one point with few nodes end in one point with all of them. None where
+        few nodes lead astray: the outermost of all of them reach values that the model does not bear.
+    """
+
+    def of(model: NISP) -> Callable[[Tensor], Tensor]:
+        return lambda u: objective(model, u)
+
+    rough = minimise(
+        of(coarse),
+        starts,
+        max_iterations=30,
+        tolerance=1e-6,
+        piece=pieces(coarse, outputs),
+        progress=progress,
+    )
+    if not bool(torch.isfinite(rough.values[0])):
+        return None
+    group = _told_apart(rough.values, alpha(rough.points)[:, propagate.pattern.leading])
+    first = torch.stack([(group == number).nonzero()[0, 0] for number in range(int(group.max()) + 1)])
+    points = rough.points[first]
+    middle = coarse.copy(rule=coarse.rule_choice.size + 1)
+    piece = pieces(middle, outputs)
+    values = finite_values(of(middle), points, piece=piece)
+    order = values.argsort(stable=True)
+    near = values[order] <= values[order[0]] + _GAP
+    near[:_DISTINCT] = True
+    iterations = rough.iterations
+    for row in order[near & torch.isfinite(values[order])][:_ENDS].tolist():
+        end = minimise(of(middle), points[row : row + 1], max_iterations=_FAR, piece=piece, progress=progress)
+        points[row], values[row] = end.points[0], end.values[0]
+        iterations = max(iterations, rough.iterations + end.iterations)
+    piece, promised = pieces(propagate, outputs), values.argmin()
+    values = finite_values(of(propagate), points, piece=piece)
+    if not bool(torch.isfinite(values[promised])):
+        return None
+    order = values.argsort(stable=True)
+    best = order[values[order] <= values[order[0]] + _SAME * (1 + values[order[0]].abs())]
+    same = _told_apart(values[best], alpha(points[best])[:, propagate.pattern.leading])
+    for number in range(int(same.max()) + 1):  # several only where densities tie
+        rows = best[same == number]
+        end = minimise(of(propagate), points[rows[:1]], piece=piece, curvature=of(middle), progress=progress)
+        end = minimise(of(propagate), end.points, piece=piece, progress=progress)  # most often one step, of no gain
+        points[rows], values[rows] = end.points[0], end.values[0]
+    ends, results = points[group], torch.where(torch.isfinite(rough.values), values[group], torch.inf)
+    order = results.argsort(stable=True)
+    return Minima(ends[order], results[order], iterations)
 
 
 def minimise_by_tangents(
@@ -252,6 +356,17 @@ def _descend(objective: Callable[[Tensor], Tensor], here: Tensor, radius: Tensor
         if bool((gain <= 0.1 * total + 1e-13 * (1 + value.abs())).all()):
             break
     return at
+
+
+def _told_apart(values: Tensor, means: Tensor) -> Tensor:
+    """The group of each of sorted values ``(S,)``: of those before it that are equal and whose means are near."""
+    group = torch.arange(len(values), device=values.device)
+    for i in range(1, len(values)):
+        same = values[i] - values[:i] <= _SAME * (1 + values[i].abs())
+        same = same & ((means[i] - means[:i]).abs() <= _NEAR).all(-1)
+        if bool(same.any()):
+            group[i] = group[same.nonzero()[0, 0]]
+    return group.unique(return_inverse=True)[1]
 
 
 def _gradient(objective: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:

@@ -335,7 +335,11 @@ class NISP(nn.Module):
         return result
 
     def refine(self, alpha: Tensor, *, tolerance: float = 1e-7) -> bool:
-        """Take more nodes until the moments at α settle. Returns whether the rule has changed."""
+        """Take more nodes until the moments at α settle, or the outermost of more are values that f does not bear.
+
+        Returns:
+            Whether the rule has changed.
+        """
         changed = False
         germs = self.pattern.num_germs
         while germs and self._choice.kind == "tensor" and choice.exact_count(self) is None:
@@ -343,7 +347,8 @@ class NISP(nn.Module):
             if finer.size**germs > self.max_nodes:
                 break
             result = self.check(alpha, warn=False)
-            if max(result.mean_change, result.sd_change) <= tolerance:
+            changes = (result.mean_change, result.sd_change)
+            if max(changes) <= tolerance or not all(map(math.isfinite, changes)):
                 break
             self.set_rule(finer)
             changed = True

@@ -23,6 +23,9 @@ from torchcal.simulators import Simulator, Trajectories
 
 __all__ = ["AdditiveCalibration", "sigma_unit"]
 
+NEGLIGIBLE = 0.05
+"""Share of the noise sd up to which σ adds nothing that could be seen: 0.1 % to its size."""
+
 
 @dataclasses.dataclass(frozen=True, repr=False, eq=False)
 class AdditiveCalibration(Result):
@@ -54,6 +57,15 @@ class AdditiveCalibration(Result):
     def sigma(self) -> Tensor:
         """Draws of σ in the output's unit, ``(S,)``."""
         return self._needed_draws()[:, -1].exp()
+
+    @property
+    def noise_suffices(self) -> bool:
+        """Whether σ at the maximum is at most `NEGLIGIBLE` times the known noise sd of every datum."""
+        noise = self.recording.noise_sd
+        if noise is None:
+            return False
+        size = self.map.alpha[-1].exp() * sigma_unit(self.recording)
+        return bool((size <= NEGLIGIBLE * noise)[self.recording.observed].all())
 
     def predict(
         self,
@@ -124,6 +136,8 @@ class AdditiveCalibration(Result):
         sd = "" if self.draws is None else f"{float(self.sigma.std()):.3g}"
         rows.append(("sigma", f"{float(self.map.alpha[-1].exp()):.6g}", sd))
         lines.append(indent(table(("parameter", "MAP", "posterior sd"), rows)))
+        if self.noise_suffices:
+            lines.append("  sigma is at zero: the noise that was given suffices for what the model leaves of the data")
         lines.append(indent(str(self.diagnostics)))
         return "\n".join(lines)
 
