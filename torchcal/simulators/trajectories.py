@@ -26,8 +26,9 @@ __all__ = ["Trajectories"]
 
 #: Gaps in a trajectory, relative to the state's size, below which Newton's method stops.
 GAP = 1e-9
-#: Gaps whose square is below `GAP`: after one more correction nothing is left to check.
-QUADRATIC = 1e-5
+#: Gaps whose square is below `GAP`, and corrections that are small enough for this to hold: after one more of them
+#: nothing is left to check. A larger one may cross a kink, such as a clamp at zero.
+QUADRATIC, SMALL = 1e-5, 1e-4
 #: Gaps, relative to the state's size, from which Newton's method is not tried.
 WILD = 1e3
 #: Newton passes before the trajectory is solved step by step instead.
@@ -398,8 +399,10 @@ class Trajectories(Simulator):
             moved = torch.cat([now[:, :, :1], now[:, :, 1:] + change], dim=2)
             good &= torch.isfinite(moved).flatten(1).all(-1)
             states[rows] = torch.where((good & (worst >= GAP))[:, None, None, None], moved, now)
-            settled[rows] = good & (worst < QUADRATIC)
-            active[rows] = good & (worst >= QUADRATIC)
+            step = (change.abs() / size[rows]).flatten(1).amax(-1)
+            last_one = (worst < GAP) | ((worst < QUADRATIC) & (step < SMALL))
+            settled[rows] = good & last_one
+            active[rows] = good & ~last_one
         return states, settled
 
     def step_derivatives(
