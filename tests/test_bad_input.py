@@ -287,3 +287,65 @@ def test_errors_have_one_base_and_fit_pythons():
         assert issubclass(kind, TorchcalError | tc.TorchcalWarning)
     assert issubclass(DomainError, ValueError)
     assert issubclass(SimulatorError, RuntimeError)
+
+
+# --- terms and conditions -------------------------------------------------------------------------
+
+
+def test_terms_say_what_they_need():
+    bend = {"outputs": {"y": lambda x, p, y: y + p["q"]}}
+    for parameters in (["q"], "q", [AB[0], None]):
+        with pytest.raises(DomainError, match=r"Expected torchcal\.Parameter .* 'bend'\. Got (str|NoneType)"):
+            tc.Term("bend", parameters=parameters, **bend)
+    push = {"equation": "v", "rate": lambda t, s, p, u: p["q"], "parameters": [tc.Parameter("q")]}
+    with pytest.raises(DomainError, match=r"hidden states \[\] of the term 'push'\. Got 'w'"):
+        tc.Term("push", initial={"w": 0.0}, **push)
+
+
+IN_TIME = tc.Recording(runs=[tc.Run(time=X + 1, outputs={"y": Y})])
+
+
+@pytest.mark.parametrize("run", [tc.diagnose, tc.calibrate_additive])
+@pytest.mark.parametrize(
+    ("function", "recording", "message"),
+    [
+        pytest.param(
+            lambda x, p: p["a"] + p["b"] * x["d"], tc.Recording(x={"T": X}, y=Y),
+            r"KeyError: 'd'.*x holds \['T'\], the recording's conditions, and p holds \['a', 'b'\]", id="name",
+        ),
+        pytest.param(
+            lambda x, p: p["a"] + p["A"] * x, tc.Recording(x=X, y=Y), r"p holds \['a', 'b'\] \(check", id="parameter"
+        ),
+        pytest.param(
+            lambda x, p: p["a"] + p["b"] * x["d"], tc.Recording(x=X, y=Y), r"x is a tensor.*x=\{name: values\}",
+            id="plain", marks=pytest.mark.filterwarnings("ignore:Using a non-tuple sequence"),
+        ),
+        pytest.param(line, tc.Recording(x={"T": X, "d": X}, y=Y), r"x is a dict.*use x\['T'\], x\['d'\]", id="dict"),
+        pytest.param(line, IN_TIME, r"recording is one in time.*x\['time'\].*ODESimulator", id="in time"),
+    ],
+)  # fmt: skip
+def test_conditions_of_another_kind_are_explained(run, function, recording, message):
+    with pytest.raises(SimulatorError, match=message) as caught:
+        run(tc.Simulator(function, AB), recording)
+    says_what_to_do(caught.value)
+
+
+# --- an answer on a bound -------------------------------------------------------------------------
+
+
+def test_known_noise_that_suffices_is_no_direction_that_the_data_do_not_see(tmp_path):
+    x = torch.linspace(-1.0, 1.0, 40, dtype=torch.float64)
+    wiggle = 0.01 * torch.cos(9 * x)
+    simulator = tc.Simulator(line, AB, degree=1)
+    enough, short = (
+        tc.calibrate_additive(simulator, tc.Recording(x=x, y=1 + x + wiggle, noise=sd), num_samples=0)
+        for sd in (0.02, 0.003)
+    )
+    assert (enough.noise_suffices, short.noise_suffices) == (True, False)
+    assert "sigma is at zero: the noise that was given suffices" in str(enough)
+    assert "sigma is at zero" not in str(short)
+    assert len(enough.diagnostics.null_directions) == 0
+    enough.save(tmp_path / "enough.nc")
+    assert "sigma is at zero" in str(tc.results.AdditiveCalibration.load(tmp_path / "enough.nc"))
+    unknown = tc.calibrate_additive(simulator, tc.Recording(x=x, y=1 + x + wiggle), num_samples=0)
+    assert not unknown.noise_suffices

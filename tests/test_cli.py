@@ -1,5 +1,6 @@
 """The command `torchcal`."""
 
+import importlib.metadata
 import subprocess
 import sys
 
@@ -84,6 +85,62 @@ def test_mistakes_are_told_in_a_line_before_any_work(problem, tmp_path, capsys, 
     with pytest.raises(SystemExit) as stop:
         cli.main([])
     assert stop.value.code == 2
+
+
+@pytest.fixture
+def few_modules(monkeypatch):
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    before = set(sys.modules)
+    yield
+    for name in set(sys.modules) - before:
+        if hasattr(sys.modules[name], cli._MARK):
+            del sys.modules[name]
+
+
+@pytest.mark.usefixtures("few_modules")
+def test_a_misspelt_option_is_told_before_any_work(tmp_path, capsys):
+    for command, key in (("diagnose", "confidance"), ("calibrate", "num_sample"), ("diagnose", "recording")):
+        path = tmp_path / f"slip_{command}_{key}.py"
+        path.write_text(PROBLEM + f"\n{command}_options = {{{key!r}: 1}}")
+        assert cli.main([command, str(path), "--quiet"]) == 1
+        told = capsys.readouterr().err
+        assert f"Expected {command}_options in {path} with keys among" in told
+        assert f"Got ['{key}']" in told
+        assert told.count("\n") == 1
+
+
+FAILING = {
+    "raises": ("x = 1\nraise ValueError('boo')", "line 2: ValueError: boo"),
+    "imports": ("import no_such_module", "line 1: ModuleNotFoundError: No module named 'no_such_module'"),
+    "syntax": ("x = 1\n\ndef (:", "line 3: SyntaxError: invalid syntax"),
+    "recording": (PROBLEM.replace("x=x, y", "x=x[1:], y"), "line 7: RecordingError: Expected arrays of one length"),
+    "calls": (PROBLEM.replace('p["a"] +', "nothing +"), "line 6: SimulatorError: Expected the simulator to return"),
+}
+
+
+@pytest.mark.usefixtures("few_modules")
+@pytest.mark.parametrize("case", FAILING)
+def test_an_error_in_the_file_is_told_with_its_line(case, tmp_path, capsys):
+    source, told = FAILING[case]
+    path = tmp_path / f"failing_{case}.py"
+    path.write_text(source)
+    assert cli.main(["diagnose", str(path), "--quiet"]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith(f"torchcal: {path}, {told}")
+    assert error.count("\n") == 1
+
+
+def test_a_mistake_of_its_own_keeps_its_traceback(problem, monkeypatch):
+    monkeypatch.setattr(cli, "diagnose", lambda *args, **options: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        cli.main(["diagnose", str(problem), "--quiet"])
+
+
+def test_it_tells_its_version(capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out == f"torchcal {importlib.metadata.version('torchcal')}\n"
 
 
 def test_an_interruption_ends_quietly(problem, capsys, monkeypatch):

@@ -11,6 +11,7 @@ import torch
 
 from torchcal import plots
 from torchcal.data import Recording, Run
+from torchcal.discovery import local
 from torchcal.discovery.records import (
     Estimate,
     Experiment,
@@ -337,6 +338,46 @@ def test_a_detailed_simulation_has_no_noise_band():
     assert "±2 noise sd" not in labels(none)
 
 
+def test_the_noise_band_is_as_wide_as_the_noise_of_each_datum():
+    x = torch.logspace(-1, 2.5, 30, dtype=F64)
+    sd = 0.02 * x**0.6
+    recording = Recording(x={"g": x}, y={"tau": x**0.6}, noise=sd)
+    model = NoiseModel({"tau": float(sd.median())}, {"tau": 0.0}, "given")
+    for options in ({"noise": model}, {}, {"noise": NoiseModel({"tau": sd}, {"tau": 0.0}, "estimated")}):
+        ax = plots.residual_map(recording, 1.1 * recording.y, **options)
+        (band,) = [item for item in ax.collections if item.get_label() == "±2 noise sd"]
+        edge = {round(float(a), 9): float(b) for a, b in band.get_paths()[0].vertices if b > 0}
+        assert edge == pytest.approx({round(float(a), 9): 2 * float(b) for a, b in zip(x, sd, strict=True)})
+    twice = Recording(x=torch.tensor([1.0, 1.0, 2.0]), y=[0.0, 0.1, 0.2], noise=[0.3, 0.4, 0.1])
+    ax = plots.residual_map(twice, torch.zeros(3))  # of data at one place the root mean square
+    assert ax.collections[0].get_datalim(ax.transData).y1 == pytest.approx(2 * math.sqrt((0.09 + 0.16) / 2))
+
+
+def test_a_driver_over_decades_has_a_logarithmic_axis():
+    even = torch.linspace(0.1, 316, 40, dtype=F64)
+    for x, scale in (
+        (torch.logspace(-1, 2.5, 40, dtype=F64), "log"),
+        (torch.logspace(0, 1.4, 40, dtype=F64), "linear"),  # no decades
+        (torch.cat([torch.zeros(1, dtype=F64), torch.logspace(-1, 2.5, 39, dtype=F64)]), "linear"),
+        (even, "linear"),  # decades, but spread evenly as it is
+    ):
+        recording = Recording(x={"g": x}, y={"tau": x + 1}, noise=0.1)
+        shift = NeededShift("K", None, "g", x, x, torch.ones(40), 0.1)
+        missing = MissingRate("output", "tau", "g", x, x, torch.ones(40), "Pa", x, x)
+        late = x > x.quantile(0.75)
+        axes = [
+            plots.both_fits(recording, x),
+            plots.residual_map(recording, x, spans=[(float(x[20]), float(x[30]))]),
+            plots.held_out(recording, x, None, late),
+            plots.needed_shift(shift),
+            plots.missing_rate(missing),
+        ]
+        assert {ax.get_xscale() for ax in axes} == {scale}
+        for ax in axes:
+            ax.figure.canvas.draw()
+    assert discovery.pieces.DECADES == local.DECADES
+
+
 def test_a_dense_map_draws_local_means():
     d = ignition()
     ax = plots.residual_map(d.recording, d.base, driver="phi")
@@ -489,6 +530,25 @@ def test_detection_limits_are_ratios():
     assert {"0.006 1/m", "already in the base model"} <= {text.get_text() for text in ax.texts}
     with pytest.raises(DomainError, match="at least one candidate"):
         plots.detection_limits([])
+
+
+def test_detection_limits_show_the_number_beside_what_there_is_to_say():
+    rows = [
+        Limit("yield stress", "tau0", 0.283, "Pa", 0.9, 1.5, "also: offset of tau"),
+        Limit("hidden", "a", math.inf, "Pa", 0.9, None, "calibration hides effects of any size"),
+        Limit("lag", "a", math.inf, "s", 0.9),
+        Limit("loss", "h", 2.83e-5, "W/(m^2 K)", 0.9, None, "also: some other loss of heat"),
+        Limit("price", "c", 2.0, "$", 0.9),
+    ]
+    ax = plots.detection_limits(rows)
+    told = dict(zip([name.get_text() for name in ax.get_yticklabels()], ax.texts, strict=False))
+    assert {name: text.get_text() for name, text in told.items()} == {
+        "yield stress": "0.28 Pa, also: offset of tau",
+        "hidden": "calibration hides effects of…",
+        "lag": "∞",
+        "loss": "2.8e−05 W/(m^2 K), also: some…",
+        "price": r"2 \$",
+    }
 
 
 # --- overview --------------------------------------------------------------------------------------------

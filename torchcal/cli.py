@@ -5,10 +5,13 @@ further arguments, ``calibrate_options`` and ``diagnose_options``.
 """
 
 import argparse
+import importlib.metadata
 import importlib.util
+import inspect
 import os
 import sys
-from collections.abc import Sequence
+import traceback
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -30,27 +33,47 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Of the command line; by default those of this process.
 
     Returns:
-        The exit status: 0, 1 after an error of torchcal's, 2 for a wrong command line, 130 after Ctrl-C.
+        The exit status: 0, 1 after an error of torchcal's or of the problem's file, 2 for a wrong command line, 130
+        after Ctrl-C.
     """
     given = _parser().parse_args(arguments)
     try:
         given.run(given)
         sys.stdout.flush()
-    except TorchcalError as error:
-        print(f"torchcal: {type(error).__name__}: {error}", file=sys.stderr)
-        for note in getattr(error, "__notes__", ()):
-            print(f"torchcal: {note}", file=sys.stderr)
-        return 1
     except BrokenPipeError:  # whoever reads has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except KeyboardInterrupt:
         print("torchcal: interrupted", file=sys.stderr)
         return 130
+    except Exception as error:
+        line = _line(error, getattr(given, "problem", None))
+        if line is None and not isinstance(error, TorchcalError):  # a mistake of torchcal's own
+            raise
+        where = "" if line is None else f"{given.problem}, line {line}: "
+        text = error.msg if isinstance(error, SyntaxError) else error
+        print(f"torchcal: {where}{type(error).__name__}: {text}", file=sys.stderr)
+        for note in getattr(error, "__notes__", ()):
+            print(f"torchcal: {note}", file=sys.stderr)
+        return 1
     return 0
+
+
+def _line(error: BaseException | None, path: Path | None) -> int | None:
+    """The last line of the user's file that an error, or what caused it, came from."""
+    found = None
+    file = "" if path is None else os.path.abspath(path)
+    while error is not None:
+        if isinstance(error, SyntaxError) and error.filename == file:
+            return error.lineno
+        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == file]
+        found = lines[-1] if lines else found
+        error = error.__cause__
+    return found
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="torchcal", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--version", action="version", version=f"torchcal {_version()}")
     commands = parser.add_subparsers(required=True, metavar="command")
     calibrating = commands.add_parser("calibrate", help="calibrate with model error embedded in the parameters")
     calibrating.set_defaults(run=_calibrate)
@@ -69,10 +92,17 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
+def _version() -> str:
+    try:
+        return importlib.metadata.version("torchcal")
+    except importlib.metadata.PackageNotFoundError:  # run from its sources
+        return "(not installed)"
+
+
 def _calibrate(given: argparse.Namespace) -> None:
     problem = _problem(given.problem)
     _check_target(given.out)
-    options = _options(problem, "calibrate_options", given, target_ess=given.target_ess)
+    options = _options(problem, "calibrate_options", calibrate, given, target_ess=given.target_ess)
     result = calibrate(problem.simulator, problem.recording, **options)
     if given.out is not None:
         result.save(given.out)
@@ -82,7 +112,7 @@ def _calibrate(given: argparse.Namespace) -> None:
 def _diagnose(given: argparse.Namespace) -> None:
     problem = _problem(given.problem)
     _check_target(given.report)
-    options = _options(problem, "diagnose_options", given)
+    options = _options(problem, "diagnose_options", diagnose, given)
     result = diagnose(problem.simulator, problem.recording, getattr(problem, "candidates", ()), **options)
     if given.report is not None:
         result.report(given.report)
@@ -99,11 +129,19 @@ def _show(given: argparse.Namespace) -> None:
             raise first from None
 
 
-def _options(problem: ModuleType, name: str, given: argparse.Namespace, **more: Any) -> dict[str, Any]:
+def _options(
+    problem: ModuleType, name: str, function: Callable[..., Any], given: argparse.Namespace, **more: Any
+) -> dict[str, Any]:
     """The file's options, over which go those of the command line."""
     own = getattr(problem, name, {})
     if not isinstance(own, dict):
         raise DomainError(f"Expected {name} in {given.problem} as a dict of arguments. Got {type(own).__name__}.")
+    known = [p.name for p in inspect.signature(function).parameters.values() if p.kind is p.KEYWORD_ONLY]
+    unknown = [key for key in own if key not in known]
+    if unknown:
+        raise DomainError(
+            f"Expected {name} in {given.problem} with keys among {known}. Got {unknown} (check the spelling)."
+        )
     line = {"seed": given.seed, "progress": False if given.quiet else None, **more}
     return {"progress": True, **own, **{key: value for key, value in line.items() if value is not None}}
 

@@ -121,7 +121,7 @@ class Simulator:
                 raise SimulatorError(
                     f"Expected the simulator to return a tensor. It raised {type(error).__name__}: {error}. "
                     f"It was called with conditions {_describe(x)} and parameters of shape "
-                    f"{(*values.shape[:-1], 1)} ({', '.join(self.names)})."
+                    f"{(*values.shape[:-1], 1)} ({', '.join(self.names)}).{_advice(error, x, self.names)}"
                 ) from error
             return self._flatten(result, values, n, outputs)
 
@@ -240,6 +240,28 @@ def _describe(x: Conditions) -> str:
     if isinstance(x, Mapping):
         return "{" + ", ".join(f"{name}: {tuple(value.shape)}" for name, value in x.items()) + "}"
     return str(tuple(x.shape))
+
+
+def _advice(error: Exception, x: Conditions, parameters: Sequence[str]) -> str:
+    """What to do where a function took x, or what x or p hold, for something else than they are."""
+    named = isinstance(x, Mapping)
+    if named and set(x) == {"time", "run"}:
+        return (
+            " The recording is one in time and the simulator static: it is called with x['time'] and x['run']. Use "
+            "torchcal.ODESimulator for a model of rates."
+        )
+    if isinstance(error, KeyError):
+        if not isinstance(x, Mapping):
+            return f" Here p holds {list(parameters)} (check the spelling)."
+        return (
+            f" Here x holds {list(x)}, the recording's conditions, and p holds {list(parameters)}: names in "
+            "the recording and in the simulator must agree."
+        )
+    if named and "dict" in str(error):
+        return f" Here x is a dict, as in the recording: use {', '.join(f'x[{name!r}]' for name in x)}."
+    if not named and isinstance(error, TypeError | IndexError) and "str" in str(error):
+        return " Here x is a tensor, as in the recording: name its condition there, x={name: values}, or use x itself."
+    return ""
 
 
 def _output(result: Any, values: Tensor, n: int, what: str) -> Tensor:

@@ -100,15 +100,28 @@ class Term:
                 f"Expected parameters=[Parameter(...)] for the term {name!r}. Got none, so that nothing could be "
                 "fitted; an effect needs a coefficient that is 0 where it is absent."
             )
+        for parameter in parameters:
+            if not isinstance(parameter, Parameter):
+                raise DomainError(
+                    f"Expected torchcal.Parameter objects as parameters of the term {name!r}. Got "
+                    f"{type(parameter).__name__}: {parameter!r} (write parameters=[Parameter(...), ...])."
+                )
         names = [parameter.name for parameter in parameters]
         if len(set(names)) < len(names):
             raise DomainError(f"Expected every parameter of the term {name!r} named once. Got {names}.")
         for state in states or {}:
             if state not in every:
                 raise DomainError(f"Expected a rate for the hidden state {state!r} of the term {name!r}. Got none.")
-        for parameter in scales or {}:
-            if parameter not in names:
-                raise DomainError(f"Expected scales of parameters {names} of the term {name!r}. Got {parameter!r}.")
+        for state in initial or {}:
+            if state not in (states or {}):
+                raise DomainError(
+                    f"Expected initial values of the hidden states {list(states or {})} of the term {name!r}. Got "
+                    f"{state!r} (give states={{{state!r}: unit}} and its rate; a state of the simulator begins as its "
+                    "run says)."
+                )
+        for measured in scales or {}:
+            if measured not in names:
+                raise DomainError(f"Expected scales of parameters {names} of the term {name!r}. Got {measured!r}.")
         put = object.__setattr__
         put(self, "name", name)
         put(self, "rates", every)

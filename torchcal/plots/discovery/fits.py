@@ -16,6 +16,7 @@ from torchcal.plots.discovery.pieces import (
     draw_figure_key,
     draw_key,
     finish,
+    is_log,
     take_axes,
     thinned,
 )
@@ -94,6 +95,8 @@ def draw_panel(
         finish(ax, f"measured {look.axis(panel.output)}", f"fitted {look.axis(panel.output)}", panel.title)
         return
     spans = held_spans(panel.x[seen], held[seen])
+    if is_log(panel.x):
+        ax.set_xscale("log")
     for i, (low, high) in enumerate(spans):
         ax.axvspan(low, high, color=HELD_OUT, lw=0, zorder=0, label="held out" if i == 0 else "_held out")
     keep = np.flatnonzero(seen)

@@ -60,11 +60,11 @@ def detection_limits(limits: Iterable[Any], *, most: int = 16, ax: "Axes | None"
                 [place], [i], "o" if value > low else "<", ms=5.5, mfc=ACCEPTED if seen else "white", mec=ACCEPTED,
                 mew=1.1, zorder=4,
             )  # fmt: skip
-        unit = f" {plain(item.unit)}" if item.unit not in (None, "", "1") else ""
-        smallest = f"{style.number(float(f'{item.smallest:.2g}'))}{unit}" if math.isfinite(item.smallest) else "∞"
+        unit = f" {item.unit}" if item.unit not in (None, "", "1") else ""
+        smallest = f"{style.number(float(f'{item.smallest:.2g}'))}{unit}" if math.isfinite(item.smallest) else ""
         note = str(getattr(item, "note", "") or "")
-        text = smallest if not note else plain(note, 30)
-        beside(ax, i, 6, text, "left")
+        text = ", ".join(part for part in (smallest, note) if part)
+        beside(ax, i, 6, plain(text or "∞", 30), "left")  # more would leave no room for the axes
     beside(ax, None, 6, "smallest", "left")
     ax.plot([], [], "o", ms=5.5, mfc=ACCEPTED, mec=ACCEPTED, label="estimate, where fitted")
     ax.set_yticks(range(len(rows)), names)

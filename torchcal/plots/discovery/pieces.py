@@ -24,6 +24,7 @@ LOCATED, EDGE = style.ADDITIVE_BAND, style.ADDITIVE
 NONE = ("none of these",)
 DENSE = 80  # data in one panel above which each is a dot instead of a circle
 MOST_POINTS = 2000  # drawn in one panel; more cannot be told apart
+DECADES = 30.0  # ratio of the ends of a positive driver's range from which on windows are laid out in its logarithm
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,17 @@ def take_axes(
     if not given:
         raise ShapeError("Expected ax: at least one axes. Got none.")
     return [style.new_axes(place) for place in given[:count]], False
+
+
+def is_log(values: np.ndarray) -> bool:
+    """Whether values belong on a logarithmic axis: positive, over decades, and spread more evenly there."""
+    seen = values[np.isfinite(values)]
+    if not len(seen) or not 0 < DECADES * seen.min() < seen.max():
+        return False
+    middle = []
+    for v in (seen, np.log(seen)):
+        middle.append(abs((np.median(v) - v.min()) / (v.max() - v.min()) - 0.5))
+    return bool(middle[1] < middle[0])
 
 
 def finish(ax: "Axes", x_label: str, y_label: str, title: str) -> None:

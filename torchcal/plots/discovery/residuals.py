@@ -1,6 +1,5 @@
 """Where the mismatch sits: residuals against what they vary with."""
 
-import math
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +19,7 @@ from torchcal.plots.discovery.pieces import (
     as_numbers,
     draw_key,
     finish,
+    is_log,
     places_of,
     rms,
     thinned,
@@ -82,8 +82,8 @@ def residual_map(
         values: The driver's values ``(n,)``, where the recording does not hold them.
         spans: Ranges of the driver in which the mismatch sits, shaded.
         share: Share of the misfit that sits there.
-        noise: Noise sd of the output, in its unit, or anything with a dict ``sd`` by output; by default the
-            recording's. Drawn as a band of ±2 sd.
+        noise: Noise sd of the output, in its unit, a number or one for each condition ``(n,)``; or anything with a
+            dict ``sd`` of them by output; where it is known, and by default, the recording's. Drawn as a band of ±2 sd.
         output: By default the output that the base fits worst.
         ax: Where to draw; a new figure by default.
         names: What to call the two models.
@@ -120,6 +120,8 @@ def residual_map(
     ax = style.new_axes(ax)
     located = f"mismatch located here ({100 * share:.0f} % of it)" if share is not None else "mismatch located here"
     shown = np.isfinite(y[part]) & np.isfinite(x)
+    if is_log(x[shown]):
+        ax.set_xscale("log")
     low, high = float(x[shown].min()), float(x[shown].max())
     inside = [(start, end) for start, end in spans if end >= low and start <= high]
     for i, (start, end) in enumerate(inside):
@@ -128,8 +130,14 @@ def residual_map(
             label=located if i == 0 else "_located",
         )  # fmt: skip
     sd = _noise_of(noise, recording, output)
-    if sd:
-        ax.axhspan(-2 * sd, 2 * sd, facecolor=NOISE, lw=0, zorder=1, label="±2 noise sd", alpha=0.75)
+    if sd is not None:
+        band: dict[str, Any] = {"facecolor": NOISE, "lw": 0, "zorder": 1, "label": "±2 noise sd", "alpha": 0.75}
+        levels, which = np.unique(x[shown], return_inverse=True)
+        if np.ptp(sd[shown]) <= 1e-6 * sd[shown].max() or len(levels) < 2:
+            ax.axhspan(-2 * sd[shown].max(), 2 * sd[shown].max(), **band)
+        else:
+            size = np.sqrt(np.bincount(which, sd[shown] ** 2) / np.bincount(which))
+            ax.fill_between(levels, -2 * size, 2 * size, **band)
     ax.axhline(0.0, color="0.35", lw=0.7, zorder=2)
     keep = np.flatnonzero(shown)
     keep = keep[np.argsort(x[keep], kind="stable")]
@@ -148,7 +156,7 @@ def residual_map(
                 bins = [keep[x[keep] == level] for level in levels]
             else:
                 bins = np.array_split(keep, min(30, len(keep) // 8))
-            centers = [x[rows].mean() for rows in bins]
+            centers = [np.median(x[rows]) for rows in bins]
             means = [np.nanmean(residual[rows]) for rows in bins]
             ax.plot(
                 centers, means, color=fit.color, ls=fit.line, lw=1.7, label=fit.name + ", local mean",
@@ -160,13 +168,19 @@ def residual_map(
     return ax
 
 
-def _noise_of(noise: Any, recording: Recording, output: str) -> float | None:
-    if noise is None:
-        given = recording.noise_sd
-        return None if given is None else float(given[places_of(recording, output)].median())
-    if getattr(noise, "source", None) == "none":
-        return None  # a detailed simulation: what it counts as noise is no one's
+def _noise_of(noise: Any, recording: Recording, output: str) -> np.ndarray | None:
+    """Noise sd of each datum of the output, ``(n,)``; None where it is unknown."""
+    source = getattr(noise, "source", None)
+    given = recording.noise_sd
+    if (noise is None or source == "given") and given is not None:
+        return given.cpu().numpy()[places_of(recording, output)]
+    if noise is None or source == "none":  # a detailed simulation: what it counts as noise is no one's
+        return None
     sd = getattr(noise, "sd", noise)
     if isinstance(sd, Mapping):
         sd = sd.get(output)
-    return float(sd) if sd is not None and math.isfinite(float(sd)) else None
+    if sd is None:
+        return None
+    numbers = np.asarray(sd, dtype=np.float64)
+    every = as_numbers(np.full(recording.n, numbers) if numbers.ndim == 0 else numbers, "noise", recording.n)
+    return every if np.isfinite(every).all() and every.max() > 0 else None

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from torchcal.plots import style
-from torchcal.plots.discovery.pieces import ACCEPTED, Look, as_numbers, draw_key, finish, finite, plain
+from torchcal.plots.discovery.pieces import ACCEPTED, Look, as_numbers, draw_key, finish, finite, is_log, plain
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,6 +40,8 @@ def needed_shift(
     shift, sd = as_numbers(needed.shift, "shift", len(x)), as_numbers(needed.sd, "sd", len(x))
     ax = style.new_axes(ax)
     ax.axhline(0.0, color="0.35", lw=0.7, zorder=1)
+    if is_log(x):
+        ax.set_xscale("log")
     seen = np.isfinite(x) & np.isfinite(shift) & np.isfinite(sd)
     ax.errorbar(
         x[seen], shift[seen], sd[seen], fmt="o", ms=4, mfc=ACCEPTED, mec=ACCEPTED, ecolor="0.35", elinewidth=0.9,
@@ -88,6 +90,8 @@ def missing_rate(
     rate, sd = as_numbers(missing.rate, "rate", len(x)), as_numbers(missing.sd, "sd", len(x))
     ax = style.new_axes(ax)
     ax.axhline(0.0, color="0.35", lw=0.7, zorder=1)
+    if is_log(x):
+        ax.set_xscale("log")
     ax.fill_between(x, rate - 2 * sd, rate + 2 * sd, color=style.MODEL_ERROR_BAND, lw=0, label="±2 sd", zorder=2)
     ax.plot(x, rate, color=ACCEPTED, lw=1.5, label="estimate", zorder=3)
     target = look.shown(missing.target)

@@ -1,0 +1,119 @@
+"""What `diagnose` makes of data without noise, numbers of other packages, and simulators or terms that misbehave."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import torchcal as tc
+from torchcal.errors import DomainError, SimulatorError
+
+X = torch.linspace(0.1, 2.0, 30, dtype=torch.float64)
+AB = [tc.Parameter("a"), tc.Parameter("b")]
+LINE = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, AB)
+
+
+def noise(*shape, seed=1):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def term(name, function):
+    return tc.Term(name, outputs={"y": function}, parameters=[tc.Parameter("q")])
+
+
+def bend():
+    return term("bend", lambda x, p, y: y + p["q"] * x**2)
+
+
+# --- exact data ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [12, 30, 100])
+@pytest.mark.parametrize("law", ["line", "constant", "rounding", "power"])
+def test_exactly_fitted_data_leave_nothing_to_explain(law, count):
+    x = torch.linspace(0.1, 2.0, count, dtype=torch.float64)
+    rounded = 1 / 3 + x / 7 + 1e-12 * noise(count)
+    y = {"line": 1 + 2 * x, "constant": 0 * x + 3, "rounding": rounded, "power": 2 * x**0.37}
+    power = tc.Simulator(lambda x, p: p["a"] * x ** p["b"], [tc.Parameter("a", initial=1.0), tc.Parameter("b")])
+    inverse = term("inverse", lambda x, p, y: y + p["q"] / x)
+    d = tc.diagnose(
+        power if law == "power" else LINE, tc.Recording(x=x, y=y[law]), [bend(), inverse], progress=False
+    )
+    assert (d.verdict, d.terms) == ("consistent", [])
+    assert "nothing is missing" in str(d)
+
+
+# --- numbers ---------------------------------------------------------------------------------------------
+
+
+def test_integers_of_numpy_are_integers():
+    data = tc.Recording(x=X, y=1 + 2 * X + 0.5 * X**2 + 0.05 * noise(30), noise=0.05)
+    numbers = {"seed": np.int64(3), "max_terms": np.int64(2), "num_starts": np.uint8(5)}
+    given, plain = (
+        tc.diagnose(LINE, data, [bend()], progress=False, **{key: kind(value) for key, value in numbers.items()})
+        for kind in (lambda v: v, int)
+    )
+    assert str(given) == str(plain)
+    assert type(given.settings["seed"]) is int
+    for key, value in (("seed", 1.5), ("seed", True), ("seed", "1"), ("max_terms", np.float64(2)), ("num_starts", 0)):
+        with pytest.raises(DomainError, match=f"Expected {key}"):
+            tc.diagnose(LINE, data, [bend()], progress=False, **{key: value})
+
+
+# --- simulators and terms that misbehave -----------------------------------------------------------------
+
+
+def pendulum(rate=lambda s, p: -p["k"] * s["x"]):
+    body = tc.ODESimulator(
+        lambda t, s, p, u: {"x": s["v"], "v": rate(s, p)}, {"x": "m", "v": "m/s"},
+        [tc.Parameter("k", low=0.0, initial=4.0)], observe=("x",),
+    )  # fmt: skip
+    t = torch.linspace(0, 3, 40, dtype=torch.float64)
+    runs = [tc.Run(t, {"x": a * torch.cos(2 * t) + 0.01 * noise(40)}, initial={"x": a, "v": 0.0}) for a in (1.0, 2.0)]
+    return body, tc.Recording(runs=runs, noise=0.01)
+
+
+@pytest.mark.parametrize("candidates", [[], [bend()]])
+def test_a_simulator_with_random_numbers_is_refused_as_that(candidates):
+    def noisy(x, p):
+        return p["a"] + p["b"] * x + 0.01 * torch.randn(x.shape, dtype=torch.float64)
+
+    data = tc.Recording(x=X, y=1 + 2 * X, noise=0.05)
+    with pytest.raises(SimulatorError, match=r"whenever the simulator is called.*output 'y' at x = .*random numbers"):
+        tc.diagnose(tc.Simulator(noisy, AB), data, candidates, progress=False)
+
+
+def test_random_rates_are_refused_too():
+    body, motion = pendulum(lambda s, p: -p["k"] * s["x"] + 0.1 * torch.randn_like(s["x"]))
+    with pytest.raises(SimulatorError, match=r"the simulator is called.*output 'x' at time = .*, run = [01]\."):
+        tc.diagnose(body, motion, progress=False)
+
+
+def test_a_term_with_random_numbers_is_told_from_the_simulator():
+    shaky = term("shaky", lambda x, p, y: y + p["q"] + 0.01 * torch.randn_like(y))
+    with pytest.raises(SimulatorError, match="whenever the simulator with the term 'shaky' is called"):
+        tc.diagnose(LINE, tc.Recording(x=X, y=1 + 2 * X, noise=0.05), [shaky], progress=False)
+
+
+@pytest.mark.parametrize(
+    ("function", "got"),
+    [
+        (lambda x, p, y: y + p["q"] * torch.log(x - 0.1), "nan for 1 of 30 data, first output 'y' at x = 0.1 "),
+        (lambda x, p, y: torch.where(x > 1.7, math.inf, y), "inf for 5 of 30 data, first output 'y' at x = 1.7"),
+    ],
+)
+def test_a_term_without_finite_outputs_at_neutral_says_where(function, got):
+    data = tc.Recording(x=X, y=1 + 2 * X + 0.05 * noise(30), noise=0.05)
+    with pytest.raises(SimulatorError) as caught:
+        tc.diagnose(LINE, data, [bend(), term("edge", function)], progress=False)
+    assert "Expected finite outputs with the term 'edge' at its neutral values {'edge.q': 0.0}" in str(caught.value)
+    assert f"Got {got}" in str(caught.value)
+
+
+def test_a_rate_that_is_not_finite_is_told_with_its_run():
+    body, motion = pendulum()
+    push = {"equation": "v", "rate": lambda t, s, p, u: p["q"] / (s["x"].abs() < 1.5)}
+    heavy = tc.Term("heavy", parameters=[tc.Parameter("q")], **push)
+    with pytest.raises(SimulatorError, match=r"term 'heavy' at its neutral.*Got inf.*output 'x' at time = .*, run = 1"):
+        tc.diagnose(body, motion, [heavy], progress=False)
