@@ -550,18 +550,40 @@ def test_a_hidden_state_is_named():
     assert len(d.improved.states) == 3
 
 
-def test_another_name_for_the_same_is_an_alias():
+def test_two_causes_with_one_formula_are_tied():
     first, *rest = named(tc.terms.mechanics(), "bias force", "quadratic drag", "cubic stiffness")
     tilt = tc.Term("tilt", equation="v", rate=lambda t, s, p, u: -9.81 * p["slope"], parameters=[tc.Parameter("slope")])
     body, motion, _ = pushed(0.1)
-    d = quiet(body, motion, [first, *rest, tilt])
-    assert d.verdict == "named"
-    assert d.terms == ["bias force"]
-    assert d.ranking[0].aliases == ("tilt",)
-    assert next(r for r in d.detection_limit if r.term == "bias force").note == "also: tilt"
-    swapped = quiet(body, motion, [tilt, first, *rest])
-    assert swapped.terms == ["tilt"]
-    assert swapped.ranking[0].aliases == ("bias force",)
+    for candidates in ([first, *rest, tilt], [tilt, first, *rest]):
+        d = quiet(body, motion, candidates)
+        one, other = (term.name for term in candidates if term in (first, tilt))
+        assert (d.verdict, d.terms, d.tied) == ("ambiguous", [], [[one], [other]])
+        rows = {row.terms: row for row in d.ranking}
+        assert rows[one,].aliases == (other,)
+        assert rows[other,].note == f"the same as {one} here"
+        assert rows[one,].probability == rows[other,].probability > 0.4
+        assert next(r for r in d.detection_limit if r.term == one).note == f"also: {other}"
+        assert d.experiment is None  # nothing would tell them apart
+
+
+def test_equal_tangents_are_not_equal_models():
+    # Stern and Volmer's quenching and Perrin's sphere of action agree to first order, wherever they are measured.
+    q = torch.linspace(0, 2, 40, dtype=F64)
+    laws = {
+        "dynamic quenching": lambda x, p, y: y / (1 + p["k"] * x),
+        "sphere of action": lambda x, p, y: y * torch.exp(-p["k"] * x),
+        "dimer loss": lambda x, p, y: y * (1 - p["k"] * x),
+    }
+    lamp = tc.Simulator(lambda x, p: p["F"] + 0 * x, [tc.Parameter("F", low=0.1, high=10.0, initial=1.0)])
+    noise = 0.005 * torch.randn(40, generator=torch.Generator().manual_seed(4), dtype=F64)
+    for size, verdict in ((0.05, "ambiguous"), (0.5, "named")):
+        light = tc.Recording(x=q, y=torch.exp(-size * q) + noise, noise=0.005)
+        for order in (laws, dict(reversed(laws.items()))):
+            terms = [tc.Term(name, outputs={"y": law}, parameters=[tc.Parameter("k", low=0.0)])
+                     for name, law in order.items()]  # fmt: skip
+            d = quiet(lamp, light, terms)
+            assert d.verdict == verdict
+            assert ["sphere of action"] in [*d.tied, d.terms]
 
 
 def test_other_physics_with_the_same_tangent_is_told_as_ambiguous():
@@ -574,6 +596,7 @@ def test_other_physics_with_the_same_tangent_is_told_as_ambiguous():
     assert d.tied == [["curvature"], ["curvature about -3"]]
     assert d.terms == []
     assert d.ranking[0].aliases == ("curvature about -3",)
+    assert d.experiment is None  # beside a line parabolas about any centre are the same
 
 
 def test_what_the_base_holds_already_is_never_named():

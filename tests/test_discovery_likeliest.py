@@ -93,7 +93,7 @@ def test_noise_alone_is_not_taken_for_something_unknown(size):
     for seed in range(40):
         rng = np.random.default_rng(100 + seed)
         found, noise, tangents = curve(2 + 0.3 * correlated(rng, 90, (0.0, 0.9, 0.7, 0.9)[seed % 4]), size)
-        odds.append(with_unknown(found, None, tangents)[1] - settled(found, noise, tangents)[1])
+        odds.append(with_unknown(found, None, tangents, noise.unit)[1] - settled(found, noise, tangents)[1])
     assert sum(value > 4.6 for value in odds) <= 2
 
 
@@ -102,7 +102,7 @@ def test_a_ripple_in_white_noise_is_no_correlated_noise():
     for seed in range(5):
         rng = np.random.default_rng(seed)
         found, noise, tangents = curve(2 + 0.3 * np.sin(2 * np.pi * 5 * x) + 0.05 * rng.standard_normal(90))
-        unknown, evidence = with_unknown(found, None, tangents)
+        unknown, evidence = with_unknown(found, None, tangents, noise.unit)
         assert evidence > settled(found, noise, tangents)[1] + 10
         # What noise alone gives is simulated with the correlation in use.
         assert float((unknown.posterior[0] * GRID).sum()) == pytest.approx(float(unknown.correlation[0]), abs=0.1)

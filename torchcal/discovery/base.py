@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchcal.discovery.candidates import base_columns
 from torchcal.discovery.fitting import Fitted, fit, follow_slopes, refit, starts
-from torchcal.discovery.noise import Noise, estimate, spikes
+from torchcal.discovery.noise import Noise, estimate, growth, spikes
 from torchcal.discovery.problem import Problem
 from torchcal.errors import ConvergenceError, DomainError, SimulatorError
 from torchcal.simulators import Trajectories
@@ -68,17 +68,19 @@ def calibrate_base(
     if not exact and not clean:
         for _ in range(3):
             given = recording.noise if isinstance(recording.noise, Tensor) else None
-            sd = given
-            bad = spikes(found.problem, found.residual, sd)
+            unit = growth(found.problem, found.residual, found.jacobian, given)[found.problem.index]
+            bad = spikes(found.problem, found.residual / unit, given)
             if not bool(bad.any()) or float(bad.double().mean()) > 0.2:
                 break
             keep = found.problem.keep.clone()
             keep[found.problem.index[bad]] = False
             found = _again(found, keep)
-    noise = estimate(found.problem, found.residual, found.jacobian, recording.noise)
+    unit = growth(found.problem, found.residual, found.jacobian, recording.noise)
+    noise = estimate(found.problem, found.residual, found.jacobian, recording.noise, unit)
     base = refit(found, noise.whitening(found.problem))
     if not exact:
-        noise = estimate(base.problem, base.residual, base.jacobian, recording.noise)
+        unit = growth(base.problem, base.residual, base.jacobian, recording.noise)
+        noise = estimate(base.problem, base.residual, base.jacobian, recording.noise, unit)
         base = _sharpen(refit(base, noise.whitening(base.problem)))
     return base, noise
 

@@ -16,7 +16,7 @@ from torchcal.simulators import Parameter, Trajectories
 from torchcal.terms import Term, extend
 from torchcal.terms.term import neutral_of
 
-__all__ = ["Candidate", "base_columns", "drivers_scale", "prepare", "spread_values"]
+__all__ = ["Candidate", "base_columns", "check_repeats", "drivers_scale", "prepare", "spread_values"]
 
 #: Points of a grid of shape parameters: along one, two, three and more of them.
 GRID_POINTS = (1, 9, 5, 4)
@@ -24,6 +24,8 @@ GRID_POINTS = (1, 9, 5, 4)
 DRIVER_POINTS = (0, 7, 3, 2)
 #: Range of a shape parameter measured on a driver's scale.
 SCALE_RANGE = (0.02, 1.0)
+#: Change of the outputs, relative to their size, that counts as none.
+UNCHANGED = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +86,30 @@ def base_columns(problem: Problem, fixed: Mapping[str, float]) -> tuple[list[int
         else:
             free.append(i)
     return free, held
+
+
+def check_repeats(problem: Problem, values: Tensor, what: str = "the simulator") -> None:
+    """Raise if the outputs at parameter values ``(P,)`` are others when they are computed again.
+
+    Raises:
+        SimulatorError: If they are.
+    """
+    once, again = (torch.nan_to_num(problem.evaluate(values[None], [])[0][0]) for _ in range(2))
+    moved = (again - once).abs()
+    if bool((moved > UNCHANGED * once.abs().max()).any()):
+        k = int(moved.argmax())
+        raise SimulatorError(
+            f"Expected the same outputs whenever {what} is called with the same parameters. Got {float(once[k]):.6g} "
+            f"and then {float(again[k]):.6g}: {_place(problem, k)}. Leave random numbers out of it, or draw them once, "
+            "before."
+        )
+
+
+def _place(problem: Problem, k: int) -> str:
+    """Which output a used datum is, and at which condition or time, in words."""
+    x, row = problem.recording.x, int(problem.condition_of[k])
+    at = ", ".join(f"{n} = {float(v[row]):.4g}" for n, v in (x if isinstance(x, Mapping) else {"x": x}).items())
+    return f"output {problem.recording.outputs[int(problem.output_of[k])]!r} at {at}"
 
 
 def drivers_scale(problem: Problem, found: Fitted) -> dict[str, float]:
@@ -150,7 +176,7 @@ def prepare(
     """Extend the simulator by terms and take the tangents of their amplitudes at the base's fit.
 
     Raises:
-        SimulatorError: If the terms change the simulator at their neutral values.
+        SimulatorError: If the terms change the simulator at their neutral values, or give no finite outputs there.
     """
     terms = tuple(sized(term, scale) for term in terms)
     extended = base.with_simulator(extend(base.simulator, terms))
@@ -184,15 +210,25 @@ def prepare(
         return y, jacobian
 
     y, jacobian = linear(begin[None], own)
+    name = " + ".join(term.name for term in terms)
+    values = dict(zip([problem.parameters[i].name for i in own], neutral, strict=True))
+    if not bool(torch.isfinite(y).all()):
+        bad = (~torch.isfinite(y[0])).nonzero()[:, 0]
+        raise SimulatorError(
+            f"Expected finite outputs with the term {name!r} at its neutral values {values}. Got {float(y[0, bad[0]])} "
+            f"for {len(bad)} of {problem.n} data, first {_place(problem, int(bad[0]))} (no coefficient switches off "
+            "what is infinite: keep logarithms, roots and quotients finite at every datum)."
+        )
     size = torch.maximum(found.whitening.sd, base.recording.spread[base.index])
     moved = (y[0] - found.y).abs()
     change = float((moved / torch.maximum(size, found.y.abs())).max())
     # Far below the noise a long trajectory may differ by what its solver leaves.
-    if not (change <= 1e-6 or (change <= 1e-4 and bool((moved <= 0.01 * found.whitening.sd).all()))):
+    if not (change <= UNCHANGED or (change <= 1e-4 and bool((moved <= 0.01 * found.whitening.sd).all()))):
+        check_repeats(base, found.values)
+        check_repeats(problem, begin, f"the simulator with the term {name!r}")
         raise SimulatorError(
-            f"Expected the term {' + '.join(t.name for t in terms)!r} to leave the simulator unchanged at its neutral "
-            f"values {dict(zip([problem.parameters[i].name for i in own], neutral, strict=True))}. Got a relative "
-            f"change of {change:.3g} (give neutral= the value at which it has no effect)."
+            f"Expected the term {name!r} to leave the simulator unchanged at its neutral values {values}. Got a "
+            f"relative change of {change:.3g} (give neutral= the value at which it has no effect)."
         )
     moves = torch.nan_to_num(jacobian[0], nan=1.0, posinf=1.0, neginf=1.0).abs().amax(0) > 0
     amplitudes = [place for place, sure, m in zip(own, certain, moves.tolist(), strict=True) if sure and m]

@@ -15,10 +15,13 @@ from torchcal.discovery.local import is_window
 from torchcal.discovery.problem import Problem
 from torchcal.simulators import Trajectories
 
-__all__ = ["Channel", "channels", "responses"]
+__all__ = ["RUN", "Channel", "channels", "responses"]
 
 #: Moments that a trajectory is cut into, over all runs.
 BINS = 150
+
+#: The driver of what differs from run to run.
+RUN = "run"
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +114,13 @@ def responses(problem: Problem, found: Fitted, forcing: Tensor) -> tuple[Tensor,
     return result, drivers, drivers["t"]
 
 
+def _by_run(problem: Problem, drivers: dict[str, Tensor], runs: Tensor) -> dict[str, Tensor]:
+    """With the number of the run among the drivers, where there are several: what differs between runs alone."""
+    if len(problem.recording.runs or ()) < 2 or RUN in drivers:
+        return drivers
+    return {**drivers, RUN: runs.to(torch.float64)}
+
+
 def _bin_means(bins: Tensor, count: int, steps: Tensor) -> Tensor:
     """Means over the steps ``(R, K, ...)`` of each bin, ``(bins, ...)``."""
     real = bins >= 0
@@ -168,13 +178,16 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
         kicks = torch.diag_embed(bound.grid.h[..., None].expand(-1, -1, size))
         forcing = torch.cat([kicks, by_parameter[0]], dim=-1)
         response, drivers, time = responses(problem, found, forcing)
+        bins, count = _binning(bound)
+        run = torch.arange(len(bins), dtype=torch.float64)[:, None].expand(bins.shape)
+        drivers = _by_run(problem, drivers, _bin_means(bins, count, run))
         labels = [
             ("equation", state, _rate_unit(unit, problem.recording.units.get("time", "s")))
             for state, unit in bound.ode.states.items()
         ]
         labels += [("parameter", names[i], problem.parameters[i].unit) for i in own]
         given = definitions(bound, found.values, states)
-        rates = _bin_means(*_binning(bound), bound.rates_by(found.values[None], states, own)[0])
+        rates = _bin_means(bins, count, bound.rates_by(found.values[None], states, own)[0])
         for m, (kind, target, unit) in enumerate(labels):
             if kind == "equation" and target in given:
                 continue
@@ -184,6 +197,7 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
                 moved = {name: rate for name, rate in changes if name not in given and bool((rate != 0).any())}
             list_.append(Channel(kind, target, unit, drivers, time, response[:, :, m], moved))
         at_data = problem.drivers_at_data(found.values[None], states)
+        at_data = _by_run(problem, at_data, bound.grid.run_of[problem.condition_of])
     else:
         at_data = problem.drivers_at_data(found.values[None], None)
         time = problem.order[problem.condition_of] if problem.order is not None else torch.arange(problem.n).double()

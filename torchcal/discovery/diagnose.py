@@ -14,10 +14,10 @@ from tqdm.auto import tqdm
 
 from torchcal.data import Recording
 from torchcal.discovery import explain, verify
-from torchcal.discovery.candidates import base_columns
+from torchcal.discovery.candidates import base_columns, check_repeats
 from torchcal.discovery.embedded import embed_each, model_error_sd
 from torchcal.discovery.experiment import propose
-from torchcal.discovery.fitting import Fitted
+from torchcal.discovery.fitting import Fitted, starts
 from torchcal.discovery.limits import limits
 from torchcal.discovery.model import PRIOR, Model
 from torchcal.discovery.own_noise import fits_by_chance, outliers
@@ -29,6 +29,7 @@ from torchcal.discovery.several import refit_several
 from torchcal.discovery.verdict import PLAINLY_WHITE, Decision, decide
 from torchcal.discovery.windows import refit_local
 from torchcal.errors import ConvergenceWarning, DomainError, RecordingError
+from torchcal.polychaos._checks import whole
 from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories
 from torchcal.simulators.executor import check_executor
 from torchcal.terms import Term, extend
@@ -92,18 +93,19 @@ def diagnose(
     Raises:
         DomainError: If an argument is not as described.
         RecordingError: If simulator and recording do not belong together.
+        SimulatorError: If the simulator or a term raises, or gives other outputs when it is called again.
         ConvergenceError: If the base cannot be calibrated at all.
     """
     begun = time.perf_counter()
-    terms = _check(simulator, recording, candidates, confidence, max_terms, num_starts)
-    if isinstance(seed, bool) or not isinstance(seed, int):
-        raise DomainError(f"Expected seed as an integer. Got {seed!r}.")
+    terms = _check(simulator, recording, candidates, confidence)
+    max_terms, num_starts = whole("max_terms", max_terms, 1), whole("num_starts", num_starts, 1)
+    seed = whole("seed", seed, 0)
     check_executor(executor, diagnose)
     given = terms
     terms = [term for term in given if not _contains(simulator, term)]
     problem = Problem.of(simulator, recording)
     _check_fixed(problem, fixed or {})
-    free, _ = base_columns(problem, fixed or {})
+    free, held = base_columns(problem, fixed or {})
     if not free:
         raise DomainError("Expected at least one parameter to calibrate. Got all of them fixed or dormant.")
     if problem.n <= len(free):
@@ -116,6 +118,7 @@ def diagnose(
             raise DomainError(f"Expected the term {term.name!r} on outputs of {recording.outputs}. Got {unknown}.")
         extend(simulator, [term])  # raises for names that do not fit, before any long work
     mask = verify.choose(recording, holdout, len(free))
+    check_repeats(problem, starts(problem, 1, seed, held)[0])
     bar = tqdm(disable=not progress, desc="diagnose", unit="step", leave=False)
 
     def tick(text: str) -> None:
@@ -161,9 +164,7 @@ def _refit(search: Search, confidence: float) -> bool:
     return detected
 
 
-def _check(
-    simulator: Any, recording: Any, candidates: Any, confidence: float, max_terms: int, num_starts: int
-) -> list[Term]:
+def _check(simulator: Any, recording: Any, candidates: Any, confidence: float) -> list[Term]:
     if not isinstance(simulator, Simulator):
         raise DomainError(f"Expected a Simulator or an ODESimulator. Got {type(simulator).__name__}.")
     if not isinstance(recording, Recording):
@@ -190,9 +191,6 @@ def _check(
             "Expected confidence above 0.5 and at most 0.998, which 1000 simulated residuals can resolve. "
             f"Got {confidence!r}."
         )
-    for name, value in (("max_terms", max_terms), ("num_starts", num_starts)):
-        if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-            raise DomainError(f"Expected {name} as a positive integer. Got {value!r}.")
     return list(by_name.values())
 
 
@@ -376,6 +374,7 @@ def _warn(search: Search) -> None:
 
 def _ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[Hypothesis]:
     rows = []
+    alike: dict[int, tuple[Model, float]] = {}
     ordered = sorted(search.models, key=lambda m: -decision.probability.get(id(m), 0.0))
     for place, model in enumerate(ordered[:60]):
         held = None
@@ -387,11 +386,15 @@ def _ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[H
                 ).rmse
         names = [q.name for q in model.candidate.problem.parameters]
         own: tuple[Estimate, ...] = explain.estimates(model.found, [i for i in model.candidate.own if names[i]])
+        others = search.aliases.get(model.numbers[0], []) if model in search.plain.values() else []
+        share = decision.probability.get(id(model), 0.0) / (1 + len(others))  # nothing tells which of them it is
+        for j in others:
+            alike[j] = (model, share)
         rows.append(
             Hypothesis(
                 terms=model.names,
                 log_evidence=model.log_evidence,
-                probability=decision.probability.get(id(model), 0.0),
+                probability=share,
                 estimates=own,
                 physical=model.physical,
                 misfit_removed=explain.removed(search, model),
@@ -400,13 +403,20 @@ def _ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[H
                 score=search.screening.score(model.numbers[0]) if len(model.numbers) == 1 else None,
                 refitted=True,
                 region=model.where,
-                aliases=tuple(search.aliases.get(model.numbers[0], ())) if len(model.numbers) == 1 else (),
+                aliases=tuple(search.candidates[j].name for j in others),
                 note=model.note,
             )
         )
     fitted = {m.numbers for m in search.models}
     for i, candidate in enumerate(search.candidates):
-        if (i,) not in fitted:
+        if i in alike:
+            model, share = alike[i]
+            note = f"the same as {model.names[0]} here"
+            removed = explain.removed(search, model)
+            row = Hypothesis((candidate.name,), model.log_evidence, share, physical=model.physical,
+                             misfit_removed=removed, score=search.screening.score(i), note=note)  # fmt: skip
+            rows.append(row)
+        elif (i,) not in fitted:
             seen = candidate.blind or search.screening.best[i] >= 0
             note = "" if seen else "already in the base model"
             note = "no fit from any starting value" if i in search.failed else note

@@ -10,6 +10,7 @@ from torchcal.discovery.channels import Channel
 from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.local import region_text
 from torchcal.discovery.model import Model
+from torchcal.discovery.noise import estimate
 from torchcal.discovery.records import Estimate, Fit, Location, MissingRate, NeededShift, Table
 from torchcal.discovery.search import Search
 from torchcal.discovery.structure import Place, Structure
@@ -26,6 +27,12 @@ __all__ = [
 
 #: Share of an output's evidence that counts beside an equation's.
 OUTPUT_SHARE = 0.9
+
+#: Share of the largest part of a direction that the data do not see from which on a parameter belongs to it.
+MIXED = 0.02
+
+#: Log evidence between two candidates that are told apart.
+APART = 5.0
 
 #: A span begins where the estimated change exceeds this share of its largest magnitude.
 SPAN_LEVEL = 0.3
@@ -202,13 +209,16 @@ def symptoms(search: Search, best: Model | None) -> list[str]:
             q = search.base.problem.parameters[i]
             a, b = float(search.base.values[i]), float(best.found.values[places[q.name]])
             moved = abs(b - a) / max(float(sd[i]), 1e-300)
-            if moved > BENT and abs(b - a) > 0.01 * abs(a):
+            if moved > BENT and abs(b - a) > 0.001 * abs(a):
                 rows.append(
                     f"{q.name} was bent: {a:.4g} ± {float(sd[i]):.2g}{_unit(q.unit)} in the calibrated base, "
                     f"{b:.4g}{_unit(q.unit)} with {' and '.join(best.names)}"
                 )
     if search.noise.doubted > 1:
-        rows.append(f"the residual's fastest part is {search.noise.doubted:.1f} times the noise sd that was given")
+        left = search.base if best is None else best.found
+        doubted = estimate(left.problem, left.residual, left.jacobian, search.problem.recording.noise).doubted
+        if doubted > 1:
+            rows.append(f"the residual's fastest part is {doubted:.1f} times the noise sd that was given")
     return rows
 
 
@@ -232,20 +242,27 @@ def identifiability(search: Search) -> list[str]:
         values, vectors = torch.linalg.eigh(unit.T @ unit)
         for k in range(len(values)):
             if float(values[k]) < 1e-6:
-                mixed = [kept[j] for j in range(len(kept)) if abs(float(vectors[j, k])) > 0.2]
+                parts = vectors[:, k].abs()
+                mixed = [kept[j] for j in range(len(kept)) if float(parts[j]) > MIXED * float(parts.max())]
                 if len(mixed) > 1:
-                    rows.append(f"only a combination of {', '.join(mixed)} can be told")
+                    rows.append(f"a common change of {', '.join(mixed)} moves no datum: only combinations can be told")
     screening = search.screening
     for i, candidate in enumerate(search.candidates):
         if screening.best[i] < 0 and not candidate.blind:
             rows.append(f"{candidate.name} cannot be told from the parameters of the base")
         for j in range(i):
             c = abs(screening.correlation(i, j))
-            if c > 0.99:
+            if c > 0.99 and not _told_apart(search, i, j):
                 rows.append(
                     f"{search.candidates[j].name} and {candidate.name} are nearly the same here (correlation {c:.3f})"
                 )
     return rows[:12]
+
+
+def _told_apart(search: Search, i: int, j: int) -> bool:
+    """Whether refits of two candidates differ by far, whatever their tangents say."""
+    a, b = (search.plain.get(k) for k in (i, j))
+    return a is not None and b is not None and abs(a.log_evidence - b.log_evidence) > APART
 
 
 def formulas(model: Model) -> list[str]:

@@ -64,7 +64,7 @@ class Tangents:
 
 
 def _unit(noise: Noise) -> Tensor:
-    return torch.ones_like(noise.sd) if noise.open else noise.sd
+    return noise.unit if noise.open else noise.sd
 
 
 def log_likelihood(found: Fitted, noise: Noise, tangents: Tangents) -> float:
@@ -114,7 +114,7 @@ def alone(found: Fitted, noise: Noise, tangents: Tangents) -> tuple[Noise, float
             others = others + blocks[j, best[j]] if j != k else others
         like = -tangents.logs[k] - 0.5 * count[k] * sizes[k].log() - 0.5 * square[k] / sizes[k] - SHRINK * GRID
         like = like - 0.5 * torch.linalg.slogdet(others + blocks[k])[1]
-        if count[k] < LEAST:
+        if count[k] < LEAST or not problem.follows:
             like[1:] = -math.inf
         best[k] = int(like.argmax())
         posterior[k] = (like - like[best[k]]).exp() / (like - like[best[k]]).exp().sum()
@@ -123,7 +123,8 @@ def alone(found: Fitted, noise: Noise, tangents: Tangents) -> tuple[Noise, float
         if count[k]:
             correlation[k] = GRID[best[k]]
             if noise.open:
-                sd[mine(problem, k)] = sizes[k, best[k]].sqrt()
+                here = mine(problem, k)
+                sd[here] = sizes[k, best[k]].sqrt() * unit[here]
     if noise.open:
         sd = torch.maximum(sd, least(problem, noise.step))
         noise = dataclasses.replace(noise, freedom=float(freedom[count > 0].min()))
@@ -137,15 +138,18 @@ def settled(found: Fitted, noise: Noise, tangents: Tangents) -> tuple[Noise, flo
     return alone(refit(found, fresh.whitening(found.problem)), noise, tangents)
 
 
-def with_unknown(model: Fitted, given: Tensor | str | None, tangents: Tangents) -> tuple[Noise, float]:
+def with_unknown(
+    model: Fitted, given: Tensor | str | None, tangents: Tangents, unit: Tensor
+) -> tuple[Noise, float]:
     """The likeliest noise beside a model and something smooth and unknown, and the log evidence of the two.
 
     Args:
         model: The model's fit.
         given: As ``recording.noise``.
         tangents: The base's.
+        unit: Of unknown noise, as in `Noise`.
     """
-    noise = estimate(model.problem, model.residual, model.jacobian, given)
+    noise = estimate(model.problem, model.residual, model.jacobian, given, unit)
     problem = model.problem
     looks = responses_of(problem, [c for c in channels(problem, model) if c.kind in problem.kinds])
     found: dict[_Places, tuple[Noise, float]] = {}
@@ -166,7 +170,7 @@ def with_unknown(model: Fitted, given: Tensor | str | None, tangents: Tangents) 
     for _ in range(ROUNDS if noise.source != "replicates" else 0):
         before = best
         for k, n in enumerate(torch.bincount(problem.output_of, minlength=len(places)).tolist()):
-            rhos = {best[0][k], *TRIED} if n >= LEAST else {best[0][k]}
+            rhos = {best[0][k], *TRIED} if n >= LEAST and problem.follows else {best[0][k]}
             wanted = itertools.product(rhos, factors if n else (0,))
             best = max((_with(best, k, *one) for one in wanted), key=evidence)
         if best == before:
@@ -188,7 +192,7 @@ def _at(model: Fitted, noise: Noise, places: tuple[int, ...], smaller: tuple[int
         if other:
             posterior[output] = (torch.arange(len(GRID)) == place).to(posterior)
         if noise.open:
-            sd[here] = SMALLER[factor] * (noise.sizes[output, place] if other else sd[here])
+            sd[here] = SMALLER[factor] * (noise.sizes[output, place] * noise.unit[here] if other else sd[here])
     if noise.open:
         sd = torch.maximum(sd, least(model.problem, noise.step))
     return dataclasses.replace(noise, sd=sd, correlation=correlation, posterior=posterior)

@@ -67,7 +67,8 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
             note = "tangent vanishes: only large effects can tell" if candidate.blind else "already in the base model"
             rows.append(Limit(candidate.name, q.name, math.inf, q.unit, power, estimate, note))
             continue
-        note = f"also: {', '.join(search.aliases[i])}" if search.aliases.get(i) else ""
+        others = [search.candidates[j].name for j in search.aliases.get(i, ())]
+        note = f"also: {', '.join(others)}" if others else ""
         if math.isinf(sizes[i]):
             note = "calibration hides effects of any size"
         rows.append(Limit(candidate.name, q.name, sizes[i], q.unit, power, estimate, note))

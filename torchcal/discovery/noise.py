@@ -16,7 +16,7 @@ from torchcal.discovery.records import NoiseModel
 from torchcal.errors import DomainError
 
 __all__ = [
-    "GRID", "LEAST", "SHRINK", "Noise", "estimate", "least", "lone", "mine", "orthonormal", "smooth_columns", "spikes",
+    "GRID", "LEAST", "SHRINK", "Noise", "estimate", "growth", "least", "lone", "mine", "orthonormal", "smooth_columns", "spikes",
 ]  # fmt: skip
 
 #: AR(1) coefficients that are tried.
@@ -40,6 +40,12 @@ CAUTION = 0.6
 FLOOR = 1e-7
 #: Share of supposed outliers with another one as nearest neighbour above which they are no outliers.
 TOGETHER = 0.4
+#: Fewest data of an output whose noise may grow with it, the log-likelihood that this must gain, and the sd at zero that
+#: are tried, in those at the largest output; the ratio of the largest sd to the smallest below which nothing is gained;
+#: and as how many independent data differences of neighbours count.
+FEWEST, GROWS, OFFSETS, LITTLE, INDEPENDENT = 20, 3.0, (0.003, 0.01, 0.03, 0.1, 0.3), 4.0, 0.6
+#: Ratio of the largest to the smallest sd of an output from which on both are told.
+VARIES = 1.05
 #: How much larger the noise found may be than the noise given before the given one is doubted.
 EXCESS = 1.5
 
@@ -54,8 +60,11 @@ class Noise:
         freedom: Degrees of freedom that the size was estimated with; infinite where it is known.
         posterior: Probability of each coefficient in `GRID`, by output, ``(outputs, grid)``.
         source: As in `NoiseModel`.
-        sizes: Noise sd at each coefficient in `GRID`, by output, ``(outputs, grid)``; of a known noise, in its sd.
+        sizes: Noise sd at each coefficient in `GRID`, by output, ``(outputs, grid)``; of a known noise, in its sd; of
+            an unknown one, in `unit`.
         doubted: By how much the residual's fastest part exceeds the noise given, where that is a contradiction; else 1.
+        step: As in `NoiseModel`.
+        unit: Of unknown noise, its sd in units of its median, ``(n_total,)``; see `growth`.
     """
 
     sd: Tensor
@@ -66,6 +75,7 @@ class Noise:
     sizes: Tensor
     doubted: float = 1.0
     step: dict[str, float] = dataclasses.field(default_factory=dict)
+    unit: Tensor = dataclasses.field(default_factory=lambda: torch.ones(()))
 
     @property
     def open(self) -> bool:
@@ -79,10 +89,12 @@ class Noise:
     def record(self, problem: Problem) -> NoiseModel:
         """For the result."""
         names = problem.recording.outputs
-        sd = {name: float(values[torch.isfinite(values)].median())
-              for name, values in problem.recording.split(self.sd).items()}  # fmt: skip
+        used = problem.recording.split(torch.where(problem.recording.observed, self.sd, math.nan))
+        used = {name: values[torch.isfinite(values)] for name, values in used.items()}
+        ends = {name: (float(values.min()), float(values.max())) for name, values in used.items() if len(values)}
         return NoiseModel(
-            sd=sd,
+            sd={name: float(values.median()) if len(values) else math.nan for name, values in used.items()},
+            range={name: (low, high) for name, (low, high) in ends.items() if high > VARIES * low},
             correlation={name: float(c) for name, c in zip(names, self.correlation, strict=True)},
             source=self.source,
             outliers=int((problem.recording.observed & ~problem.keep).sum()),
@@ -90,8 +102,11 @@ class Noise:
         )
 
 
-def smooth_columns(problem: Problem, places: Tensor) -> Tensor:
-    """Smooth curves over one sequence, ``(len(places), m)``, m about a sixth of its length."""
+def smooth_columns(problem: Problem, places: Tensor, *, ends: bool = False) -> Tensor:
+    """Smooth curves over one sequence, ``(len(places), m)``, m about a sixth of its length.
+
+    Cosines are flat at both ends; with ``ends`` come two powers that are not.
+    """
     n = len(places)
     count = int(n * SMOOTH_SHARE)
     if problem.order is not None:
@@ -101,7 +116,8 @@ def smooth_columns(problem: Problem, places: Tensor) -> Tensor:
         # Equal steps where sampling is even; ranks where it is not, so that curves bend where there are data.
         uneven = float(at.diff().max()) > 3 * float(at.diff().median()) if n > 2 else False
         along = rank if uneven or span <= 0 else (at - at.min()) / span
-        return torch.cos(math.pi * along[:, None] * torch.arange(count, dtype=torch.float64))
+        waves = torch.cos(math.pi * along[:, None] * torch.arange(count, dtype=torch.float64))
+        return torch.cat([waves, along[:, None], along[:, None].square()], dim=1) if ends else waves
     x = problem.recording.x
     columns = torch.stack([c[problem.condition_of[places]] for c in x.values()], dim=-1)  # type: ignore[union-attr]
     columns = (columns - columns.mean(0)) / columns.std(0).clamp_min(1e-300)
@@ -132,7 +148,9 @@ def orthonormal(columns: Tensor, *, most: int | None = None, cut: float = 1e-8) 
     return u[:, s > cut * s[0]][:, :most]
 
 
-def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor | str | None) -> Noise:
+def estimate(
+    problem: Problem, residual: Tensor, design: Tensor, given: Tensor | str | None, unit: Tensor | None = None
+) -> Noise:
     """The noise model from the residual of a fitted model.
 
     Args:
@@ -140,6 +158,7 @@ def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor |
         residual: ``(n,)``.
         design: Tangents that a further refit could use, ``(n, k)``; what they explain is not noise.
         given: As ``recording.noise``.
+        unit: As `growth` found it, where the size is unknown; 1 by default.
 
     Raises:
         DomainError: If there are too few data to tell noise from anything else.
@@ -152,8 +171,9 @@ def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor |
     table = torch.ones(outputs, len(GRID), dtype=torch.float64)
     if isinstance(given, str):  # a detailed simulation: what counts is the misfit in units of the spread
         sd = recording.spread * 1e-3
-        return Noise(sd, correlation, math.inf, posterior, "none", table)
-    known = given if isinstance(given, Tensor) else torch.ones_like(recording.y)
+        return Noise(sd, correlation, math.inf, posterior, "none", table, unit=torch.ones_like(sd))
+    unit = torch.ones_like(recording.y) if unit is None else unit
+    known = given if isinstance(given, Tensor) else unit
     replicated = _pure_error(problem) if given is None else None
     sd = known.clone()
     freedom, doubted = math.inf, 1.0
@@ -163,13 +183,8 @@ def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor |
         if n == 0:
             continue
         scaled = [residual[places] / known[problem.index[places]] for places in parts]
-        bases, usable = [], 0
-        for places in parts:
-            own = design[places] / known[problem.index[places]][:, None]
-            share = max(int(len(places) * SMOOTH_SHARE), min(design.shape[1], len(places) // 2))
-            wide = torch.cat([smooth_columns(problem, places), orthonormal(own, most=share)], dim=1)
-            bases.append(orthonormal(wide, most=int(0.6 * len(places))))
-            usable += len(places) - bases[-1].shape[1]
+        bases = [_beyond(problem, places, design, known, ends=isinstance(given, Tensor)) for places in parts]
+        usable = sum(len(basis) - basis.shape[1] for basis in bases)
         if usable < 2 and given is not None:
             continue
         if usable < 2:
@@ -177,7 +192,7 @@ def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor |
                 f"Expected enough data to tell noise from misfit. Got {n} of output {recording.outputs[output]!r}. "
                 "Give noise= its standard deviation."
             )
-        correlated = n >= LEAST and replicated is None
+        correlated = n >= LEAST and problem.follows and replicated is None
         logs, sizes = [], []
         for rho in GRID if correlated else GRID[:1]:
             square, log_det, count = 0.0, 0.0, 0
@@ -207,14 +222,78 @@ def estimate(problem: Problem, residual: Tensor, design: Tensor, given: Tensor |
             if replicated is not None and replicated[1][output] >= 3:
                 sd[mask], freedom = replicated[0][output], min(freedom, float(replicated[1][output]))
             else:
-                sd[mask], freedom = scale, min(freedom, usable)
+                sd[mask], freedom = scale * unit[mask], min(freedom, usable)
         elif scale > EXCESS * (1 + 2 / math.sqrt(2 * usable)):
             doubted = max(doubted, scale)
     step = _quantisation(problem) if given is None else {}
     if given is None:
         sd = torch.maximum(sd, least(problem, step))
     source = "given" if isinstance(given, Tensor) else "replicates" if replicated is not None else "estimated"
-    return Noise(sd, correlation, freedom, posterior, source, table, doubted, step)
+    return Noise(sd, correlation, freedom, posterior, source, table, doubted, step, unit)
+
+
+def _beyond(problem: Problem, places: Tensor, design: Tensor, unit: Tensor, *, ends: bool = False) -> Tensor:
+    """Orthonormal directions of one sequence that noise is looked for beyond, ``(len(places), m)``: smooth curves, and
+    tangents in units of the noise."""
+    own = design[places] / unit[problem.index[places]][:, None]
+    share = max(int(len(places) * SMOOTH_SHARE), min(design.shape[1], len(places) // 2))
+    wide = torch.cat([smooth_columns(problem, places, ends=ends), orthonormal(own, most=share)], dim=1)
+    return orthonormal(wide, most=int(0.6 * len(places)))
+
+
+def growth(problem: Problem, residual: Tensor, design: Tensor, given: Tensor | str | None) -> Tensor:
+    """Noise sd in units of its median, ``(n_total,)``: 1, or growing with the model's output where the scatter does.
+
+    An sd of a + |f| / max |f| is taken for the best of a few a where it makes the fastest part of the residual much
+    likelier (by `GROWS`; Laplace's distribution, whose scale a few outliers move little). Only noise of unknown size
+    is looked at, and not where replicates tell it.
+    """
+    unit = torch.ones_like(problem.recording.y)
+    if given is not None or _pure_error(problem) is not None:
+        return unit
+    f = problem.y - residual
+    for output in range(len(problem.recording.outputs)):
+        parts = [places for places in problem.recorded if int(problem.output_of[places[0]]) == output]
+        n = sum(len(places) for places in parts)
+        largest = max((float(f[places].abs().max()) for places in parts), default=0.0)
+        if n < FEWEST or not largest > 0:
+            continue
+        left, size = [], []
+        for places in parts:
+            kept, inside = _fastest(problem, places, residual, design)
+            left.append(kept)
+            size.append(f[places][inside].abs() / largest)
+        e, size_of = torch.cat(left).abs(), torch.cat(size)
+        told = INDEPENDENT * len(e) if problem.order is not None else len(e)
+        best = GROWS - told * math.log(max(float(e.sum()), 1e-300))
+        for offset in OFFSETS:
+            shape = offset + size_of
+            if float(shape.max()) < LITTLE * float(shape.min()):
+                continue
+            like = -told * (math.log(max(float((e / shape).sum()), 1e-300)) + float(shape.log().mean()))
+            if like > best:
+                best, mask = like, mine(problem, output)
+                everywhere = torch.full_like(unit, float(shape.median()))
+                everywhere[problem.index] = offset + f.abs() / largest
+                unit[mask] = everywhere[mask] / float(shape.median())
+    return unit
+
+
+def _fastest(problem: Problem, places: Tensor, residual: Tensor, design: Tensor) -> tuple[Tensor, slice]:
+    """What a sequence has that no smooth curve has, and at which of its data.
+
+    In an order by how much data are off the line between their neighbours, which hardly any misfit moves; elsewhere
+    what is left beyond smooth curves.
+    """
+    r = residual[places]
+    if problem.order is None:
+        basis = _beyond(problem, places, design, torch.ones_like(problem.recording.y))
+        return r - basis @ (basis.T @ r), slice(None)
+    at = problem.order[problem.condition_of[places]]
+    at = at if bool((at.diff() > 0).all()) else torch.arange(len(r), dtype=torch.float64)
+    share = (at[1:-1] - at[:-2]) / (at[2:] - at[:-2])
+    off = r[1:-1] - (1 - share) * r[:-2] - share * r[2:]
+    return off / (1 + share.square() + (1 - share).square()).sqrt(), slice(1, -1)
 
 
 def mine(problem: Problem, output: int) -> Tensor:

@@ -22,6 +22,8 @@ __all__ = ["fits_by_chance", "outliers", "suited", "weigh_alone"]
 CLEAR, MOST_OUTLIERS = 10.0, 0.1
 #: Log odds from which on something unknown is clearly likelier than the best model.
 LIKELIER = 3.0
+#: χ² a datum below which the noise estimated is its least, not the misfit's size: a residual so far below is rounding.
+ROUNDING = 0.01
 
 
 def suited(search: "Search", models: Sequence[Model]) -> Noise:
@@ -61,8 +63,11 @@ def fits_by_chance(search: "Search") -> float:
     """Probability that white noise alone lets one of the candidates improve the base's fit as much as one does.
 
     The F-test of nested least squares, times the number of candidates. Of few data the sd of the noise alone is known
-    too badly for the simulated residuals to show even what is plain to see.
+    too badly for the simulated residuals to show even what is plain to see. A base that fits exactly, up to rounding,
+    leaves nothing to improve.
     """
+    if search.base.chi2 <= ROUNDING * search.problem.n:
+        return 1.0
     least = 1.0
     for model in search.models:
         added = len(model.candidate.own)
@@ -95,7 +100,8 @@ def outliers(search: "Search", observed: Tensor) -> Tensor | None:
     whole = dataclasses.replace(best.found.problem, keep=observed)
     found = refit(best.found, search.noise.whitening(whole), whole)  # what was set aside may be the effect itself
     sd = given if isinstance(given, Tensor) else None
-    bad = spikes(whole, found.residual, sd) | lone(whole, found.residual, sd)
+    residual = found.residual / search.noise.unit[whole.index] if search.noise.open else found.residual
+    bad = spikes(whole, residual, sd) | lone(whole, residual, sd)
     sticking = torch.zeros_like(observed)
     sticking[whole.index[bad]] = True
     return sticking if float(bad.double().mean()) <= MOST_OUTLIERS else None

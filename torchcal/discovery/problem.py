@@ -118,6 +118,17 @@ class Problem:
         return x
 
     @cached_property
+    def follows(self) -> bool:
+        """Whether rows follow one another, so that noise can be correlated along them: in time, along the only
+        condition, or along one that grows or falls from row to row. The rows of a grid of conditions do not."""
+        if self.order is not None:
+            return True
+        x = self.recording.x
+        return isinstance(x, dict) and any(
+            bool((c.diff() > 0).all()) or bool((c.diff() < 0).all()) for c in x.values()
+        )
+
+    @cached_property
     def sequences(self) -> list[Tensor]:
         """Places (among the used data) of each output of each run, in order."""
         run = self.recording.x["run"] if self.in_time else torch.zeros(self.recording.n)  # type: ignore[index]

@@ -108,11 +108,12 @@ class NoiseModel:
     """What is taken for noise, by output.
 
     Attributes:
-        sd: Standard deviation of the noise by output, in its unit.
+        sd: Standard deviation of the noise by output, in its unit; the median where it varies from datum to datum.
         correlation: Correlation of neighbouring samples (AR(1) coefficient) by output; 0 is white.
         source: ``"given"``, ``"replicates"``, ``"estimated"`` or ``"none"`` (a detailed simulation).
         outliers: Number of samples that were set aside as outliers.
         quantisation: Step by output where the recording is quantised.
+        range: Smallest and largest sd by output, where it varies.
     """
 
     sd: dict[str, float]
@@ -120,6 +121,7 @@ class NoiseModel:
     source: str
     outliers: int = 0
     quantisation: dict[str, float] = dataclasses.field(default_factory=dict)
+    range: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

@@ -65,7 +65,8 @@ class Search:
     screening: Screening = field(init=False)
     local: list[Window] = field(init=False, default_factory=list)
     models: list[Model] = field(init=False, default_factory=list)
-    aliases: dict[int, list[str]] = field(init=False, default_factory=dict)
+    aliases: dict[int, list[int]] = field(init=False, default_factory=dict)
+    merged: dict[int, Model] = field(init=False, default_factory=dict)
     twins: dict[int, int] = field(init=False, default_factory=dict)
     gone: set[int] = field(init=False, default_factory=set)
     failed: set[int] = field(init=False, default_factory=set)
@@ -134,26 +135,23 @@ class Search:
         return {m.numbers[0]: m for m in self.models if len(m.numbers) == 1 and m.window is None}
 
     def merge(self) -> None:
-        """Candidates whose tangents and refits cannot be told apart become one, under the first name."""
+        """Candidates whose tangents and refits cannot be told apart become one hypothesis, under the first name."""
         plain = self.plain
-        self.aliases = {}
-        gone: set[int] = set()
+        self.aliases, self.merged = {}, {}
         for i, k in self.twins.items():
             a, b = plain.get(i), plain.get(k)
-            if a is not None and b is None:
+            if i in self.failed or (a is not None and b is None):
                 continue
             if a is not None and b is not None and (a.physical != b.physical or abs(a.found.chi2 - b.found.chi2) > 0.5):
                 continue
-            self.aliases.setdefault(k, []).append(self.candidates[i].name)
-            gone.add(i)
-        self.models = [m for m in self.models if not gone & set(m.numbers)]
-        self.gone = gone
+            self.aliases.setdefault(k, []).append(i)
+            self.merged |= {i: a} if a is not None else {}
+        self.gone = {i for alike in self.aliases.values() for i in alike}
+        self.models = [m for m in self.models if not self.gone & set(m.numbers)]
 
-    def duplicate(self, i: int, name: str) -> bool:
-        """Whether an alias does the same whatever is calibrated beside it: the same model under another name."""
-        j = next(k for k, c in enumerate(self.candidates) if c.name == name)
-        a, b = self.candidates[i], self.candidates[j]
-        u, v = a.tangents[0, :, 0], b.tangents[0, :, 0]
+    def duplicate(self, i: int, j: int) -> bool:
+        """Whether two candidates do the same whatever is calibrated beside them, to first order."""
+        u, v = (self.candidates[k].tangents[0, :, 0] for k in (i, j))
         return float((u @ v).abs()) >= (1 - 1e-9) * float(u.norm() * v.norm())
 
     def refit_singles(self, *, detected: bool = True) -> None:
@@ -339,7 +337,7 @@ class Search:
     def with_unknown(self, found: Fitted) -> tuple[Noise, float]:
         """Noise and log evidence of something unknown beside a fit; computed once."""
         if id(found) not in self._unknown:  # the fit is kept beside it, so that its id stays its own
-            self._unknown[id(found)] = found, with_unknown(found, self.problem.recording.noise, self.tangents)
+            self._unknown[id(found)] = found, with_unknown(found, self.problem.recording.noise, self.tangents, self.noise.unit)
         return self._unknown[id(found)][1]
 
     def examine(self, model: Model) -> Structure:

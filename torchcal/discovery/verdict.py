@@ -147,10 +147,7 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         covered += groups[names]
         decision.tied.append(list(model.names))
         decision.tied_models.append(model)
-        for other in _other_names(search, model):
-            decision.tied.append(
-                [other if name == search.candidates[model.numbers[0]].name else name for name in model.names]
-            )
+        _tie_other_names(search, model, decision)
     if len(decision.tied) < 2:
         decision.tied, decision.tied_models = [], []
         _name(search, decision, best, mask)
@@ -192,12 +189,27 @@ def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) 
     _prove(search, decision, mask)
 
 
-def _other_names(search: Search, model: Model) -> list[str]:
-    """Aliases of a single term that are different physics: these data cannot tell which it is."""
-    if len(model.numbers) != 1 or model.window is not None:
-        return []
-    i = model.numbers[0]
-    return [name for name in search.aliases.get(i, []) if not search.duplicate(i, name)]
+def _other_names(search: Search, model: Model) -> list[tuple[int, str, str]]:
+    """Names that the model could as well have: for each the candidate's number, its name, and the one it replaces.
+
+    A model of a window goes by another name only where that does the same everywhere.
+    """
+    found = []
+    for i in model.numbers:
+        own = search.candidates[i].name
+        for j in search.aliases.get(i, []):
+            if model.window is None or search.duplicate(i, j):
+                found.append((j, search.candidates[j].name, own))
+    return found
+
+
+def _tie_other_names(search: Search, model: Model, decision: Decision) -> None:
+    """Add what a model could as well be called to the tied hypotheses, with its own fit where there is one."""
+    for number, name, own in _other_names(search, model):
+        decision.tied.append([name if term == own else term for term in model.names])
+        other = search.merged.get(number)
+        if other is not None and len(model.numbers) == 1 and model.window is None:
+            decision.tied_models.append(other)
 
 
 def _groups(models: Sequence[Model]) -> dict[frozenset[str], float]:
@@ -298,9 +310,8 @@ def _decide_exact(search: Search, ranked: list[Model], mask: Tensor | None, deci
             if accepted is None:
                 decision.verdict = "ambiguous"
                 decision.tied_models = [good[0], *rivals]
-                decision.tied = [list(m.names) for m in decision.tied_models] + [
-                    [n] for n in _other_names(search, good[0])
-                ]
+                decision.tied = [list(m.names) for m in decision.tied_models]
+                _tie_other_names(search, good[0], decision)
             break
         accepted = good[0]
     if accepted is not None:

@@ -19,12 +19,15 @@ from torchcal.simulators import Trajectories
 
 __all__ = ["refit_local", "refit_window"]
 
-#: Refits at most; of one candidate; around one refitted term; and how many of those.
-MOST, MOST_EACH, MOST_AROUND, LEADING = 10, 2, 2, 3
+#: Refits at most; of one candidate; around one refitted term; how many of those, and how many more of terms that the
+#: base has everywhere.
+MOST, MOST_EACH, MOST_AROUND, LEADING, HELD = 10, 2, 2, 3, 1
 #: How often windows are sought anew around the leading terms.
 ROUNDS = 2
 #: Log evidence below the best up to which a local model's edges are made sharp.
 CLOSE = 10.0
+#: Share of a window within another one along the same driver from which on they are one start.
+ALIKE = 0.7
 #: Relative difference of χ² up to which two windows of one term and driver are one.
 SAME = 1e-4
 #: How far ends are moved for other starts, as a share of the driver's range: where they are sought, and sharpened.
@@ -41,21 +44,24 @@ def refit_local(search: Search) -> None:
         return
     gains = {model.numbers[0]: 2 * model.log_evidence + math.log(search.problem.n) for model in search.models}
     highest = 2 * max((model.log_evidence for model in search.models if model.physical), default=0.0)
-    same = {i for i in search.gone if search.duplicate(search.twins[i], search.candidates[i].name)}
+    same = {i for i in search.gone if search.duplicate(search.twins[i], i)}
     promising: dict[int, list[Window]] = {}
     for w in sorted(search.local, key=lambda w: -w.z):
         plain = max(gains.get(w.candidate, 0.0), search.screening.score(w.candidate) ** 2)
         if w.candidate not in same and w.z > 3.5 and w.z**2 > max(plain + 6.0, highest - 10.0):
             promising.setdefault(w.candidate, []).append(w)
     prior = math.log(PRIOR["local"] / max(len(search.candidates), 1))
-    chosen = sorted((w for each in promising.values() for w in each[:MOST_EACH]), key=lambda w: -w.z)
+    chosen = sorted((w for each in promising.values() for w in _different(search, each)), key=lambda w: -w.z)
     for w in chosen[:MOST]:
         _keep(search, refit_window(search, w, prior))
     search.reweigh()
     seen: set[int] = set()
     for _ in range(ROUNDS):
         singles = sorted((m for m in search.models if len(m.numbers) == 1), key=lambda m: m.log_evidence)
-        leading = sorted({m.numbers: m for m in singles}.values(), key=lambda m: -m.log_evidence)[:LEADING]
+        ranked = sorted({m.numbers: m for m in singles}.values(), key=lambda m: -m.log_evidence)
+        # What the base has everywhere has no fit of its own that its windows could be sought around.
+        held = [m for m in ranked if search.screening.best[m.numbers[0]] < 0]
+        leading = [*ranked[:LEADING], *(m for m in held[:HELD] if m not in ranked[:LEADING])]
         fresh = [m for m in leading if id(m) not in seen and search.examine(m).p_value < PLAINLY_WHITE]
         seen |= {id(m) for m in fresh}
         for model in fresh:
@@ -63,6 +69,24 @@ def refit_local(search: Search) -> None:
                 _keep(search, refit_window(search, w, prior, model))
     search.reweigh()
     _refine_edges(search, prior)
+
+
+def _different(search: Search, ranked: list[Window]) -> list[Window]:
+    """The best windows of a candidate, no two of them along one driver with most of the one within the other."""
+    kept: list[Window] = []
+    for w in ranked:
+        span = Span.of(search._drivers()[w.driver])
+        low, high = max(w.low, span.low), min(w.high, span.high)
+        covered = 0.0
+        for other in (o for o in kept if o.driver == w.driver):
+            a, b = max(low, other.low), min(high, other.high)
+            if b > a and high > low:
+                covered = max(covered, Span(a, b, span.log).size / Span(low, high, span.log).size)
+        if covered < ALIKE:
+            kept.append(w)
+        if len(kept) == MOST_EACH:
+            break
+    return kept
 
 
 def _refine_edges(search: Search, prior: float) -> None:
@@ -197,7 +221,5 @@ def refit_window(
     )
     if model is None or model.window is None:
         return None
-    low, high = model.window.low, model.window.high
-    if math.isfinite(low) and math.isfinite(high) and span.moved(low, SHORT * span.size) > high:
-        return None
-    return model
+    low, high = max(model.window.low, span.low), min(model.window.high, span.high)
+    return model if high > low and Span(low, high, span.log).size >= SHORT * span.size else None

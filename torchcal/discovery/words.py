@@ -5,6 +5,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any
 
+from torchcal.discovery.channels import RUN
 from torchcal.discovery.records import NONE
 
 __all__ = ["paragraph", "percent"]
@@ -81,7 +82,7 @@ def _with_region(d: Any, name: str) -> str:
 
 def _detected(d: Any) -> str:
     noise = d.noise
-    sd = ", ".join(f"{name} {value:.3g}" for name, value in noise.sd.items())
+    sd = ", ".join(f"{name} {value:.3g}{_varying(noise, name)}" for name, value in noise.sd.items())
     if noise.source == "none":
         rmse = d.before.fitted.rmse
         unit = _rmse_unit(d)
@@ -92,6 +93,14 @@ def _detected(d: Any) -> str:
     text += f", {noise.outliers} outliers set aside" if noise.outliers else ""
     text += f". The calibrated base leaves an RMSE of {d.before.fitted.rmse:.4g}{_rmse_unit(d)}; "
     return text + f"noise alone would leave so much structure with probability {_probability(d.p_detect)}."
+
+
+def _varying(noise: Any, name: str) -> str:
+    """The range of an sd that is not the same for all data."""
+    if name not in noise.range:
+        return ""
+    low, high = noise.range[name]
+    return f" ({low:.3g} to {high:.3g}, {'growing with it' if noise.source == 'estimated' else 'this being the median'})"
 
 
 def _rmse_unit(d: Any) -> str:
@@ -123,6 +132,12 @@ def _where(d: Any) -> str:
         return ""
     place = d.where[0]
     spans = ", ".join(f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}" for low, high in place.spans[:3])
+    if place.driver == RUN:
+        return (
+            f"The mismatch sits in the {place.kind} {place.target} and differs from run to run (largest in {spans}, "
+            f"counted from 0): one change for each run removes {percent(place.share)} of the misfit beyond noise. A "
+            f"parameter of the simulator with per_run=True would take it up.{_embedded(d)}"
+        )
     return (
         f"The mismatch sits in the {place.kind} {place.target} and varies with {place.driver} (largest at {spans}): a "
         f"smooth change there removes {percent(place.share)} of the misfit beyond noise.{_embedded(d)}"
@@ -195,7 +210,7 @@ def _ambiguous(d: Any) -> list[str]:
             f"{_and(known[0])}, the best explanation in the library, has a probability of {sure:.2f} only, which is too"
             f" little for a name, against {unknown:.2f} for something else: more data, or less noise, would tell.",
         ]
-    parts = [_where(d), f"{len(known)} hypotheses explain it equally well and these data cannot tell them apart."]
+    parts = [_where(d), f"{len(known)} hypotheses explain it about as well, and these data cannot exclude any of them."]
     if len(known) < len(d.tied):
         parts.append(f"Nor can they exclude something that is not in the library (probability {unknown:.2f}).")
     if d.experiment is not None:
@@ -221,5 +236,6 @@ def _unexplained(d: Any) -> list[str]:
     if d.missing is not None:
         size = float(d.missing.rate.abs().max())
         unit = f" {d.missing.unit}" if d.missing.unit else ""
-        parts.append(f"The missing change of {d.missing.target} against {d.missing.driver} reaches {size:.3g}{unit}.")
+        along = "from run to run" if d.missing.driver == RUN else f"against {d.missing.driver}"
+        parts.append(f"The missing change of {d.missing.target} {along} reaches {size:.3g}{unit}.")
     return parts
