@@ -368,10 +368,12 @@ def test_rows_of_a_grid_of_conditions_do_not_follow_one_another():
          tc.Parameter("c", low=0.0, initial=2.0)],
     )  # fmt: skip
     terms = [
-        tc.Term("pumping loss", outputs={"T": lambda x, p, y: y - p["k"] * x["n"] ** 2}, parameters=[tc.Parameter("k")]),
+        tc.Term("pumping loss", outputs={"T": lambda x, p, y: y - p["k"] * x["n"] ** 2},
+                parameters=[tc.Parameter("k")]),
         tc.Term("enrichment", outputs={"m": lambda x, p, y: y + p["e"] * torch.relu(x["load"] - 0.7) * x["n"]},
                 parameters=[tc.Parameter("e")]),
-        tc.Term("rich line", outputs={"m": lambda x, p, y: y + p["r"] * x["load"] ** 2}, parameters=[tc.Parameter("r")]),
+        tc.Term("rich line", outputs={"m": lambda x, p, y: y + p["r"] * x["load"] ** 2},
+                parameters=[tc.Parameter("r")]),
     ]  # fmt: skip
     d = diagnose(engine, tc.Recording(x={"load": load, "n": n}, y={"T": torque, "m": fuel}), terms)
     assert sorted(d.terms) == ["enrichment", "pumping loss"]

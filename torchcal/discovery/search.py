@@ -337,7 +337,8 @@ class Search:
     def with_unknown(self, found: Fitted) -> tuple[Noise, float]:
         """Noise and log evidence of something unknown beside a fit; computed once."""
         if id(found) not in self._unknown:  # the fit is kept beside it, so that its id stays its own
-            self._unknown[id(found)] = found, with_unknown(found, self.problem.recording.noise, self.tangents, self.noise.unit)
+            seen = with_unknown(found, self.problem.recording.noise, self.tangents, self.noise.unit)
+            self._unknown[id(found)] = found, seen
         return self._unknown[id(found)][1]
 
     def examine(self, model: Model) -> Structure:

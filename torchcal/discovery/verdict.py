@@ -32,6 +32,8 @@ LARGER, CHANCE = 1.25, 3.0
 NOTHING = 0.02
 #: Data a free parameter below which a fit without held-out data names nothing.
 LEAST_FITTED = 4
+#: Correlation from sample to sample from which on noise of unknown size may be physics that a window has left.
+SLOWEST = 0.85
 #: Of the tied hypotheses, those that together have this probability are listed.
 TIED = 0.98
 #: Of a recording without noise, the share of the held-out misfit that a named term must remove.
@@ -181,7 +183,8 @@ def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) 
     """Name what a model adds, if it is probable enough and the held-out data do not object."""
     names = set(best.names)
     sure = sum(decision.probability[id(m)] for m in search.models if names <= set(m.names))
-    if sure < SURE:
+    slow = search.noise.open and float(search.noise.correlation.max()) >= SLOWEST
+    if sure < SURE or (slow and best.window is not None):
         decision.verdict = "ambiguous"
         decision.tied, decision.tied_models = [list(best.names), list(NONE)], [best]
         return

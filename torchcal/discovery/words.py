@@ -7,6 +7,7 @@ from typing import Any
 
 from torchcal.discovery.channels import RUN
 from torchcal.discovery.records import NONE
+from torchcal.discovery.verdict import SURE
 
 __all__ = ["paragraph", "percent"]
 
@@ -100,7 +101,8 @@ def _varying(noise: Any, name: str) -> str:
     if name not in noise.range:
         return ""
     low, high = noise.range[name]
-    return f" ({low:.3g} to {high:.3g}, {'growing with it' if noise.source == 'estimated' else 'this being the median'})"
+    told = "growing with it" if noise.source == "estimated" else "this being the median"
+    return f" ({low:.3g} to {high:.3g}, {told})"
 
 
 def _rmse_unit(d: Any) -> str:
@@ -205,6 +207,12 @@ def _ambiguous(d: Any) -> list[str]:
     known = [tied for tied in d.tied if tuple(tied) != NONE]
     if len(known) == 1:
         sure = sum(row.probability for row in d.ranking if set(known[0]) <= set(row.terms))
+        if sure >= SURE:
+            return [
+                _where(d),
+                f"{_and(known[0])} explains it best, in a window, but what that leaves is so slow that it may as well "
+                "be physics as noise: a known noise sd, replicates or a repeated run would tell.",
+            ]
         return [
             _where(d),
             f"{_and(known[0])}, the best explanation in the library, has a probability of {sure:.2f} only, which is too"
