@@ -41,9 +41,9 @@ CAUTION = 0.6
 FLOOR = 1e-7
 #: Share of supposed outliers with another one as nearest neighbour above which they are no outliers.
 TOGETHER = 0.4
-#: Fewest data of an output whose noise may grow with it; the log-likelihood that this must gain; the sd at zero that are
-#: tried, in those at the largest output; the ratio of the largest sd to the smallest below which nothing is gained; and
-#: as how many independent data differences of neighbours count.
+#: Fewest data of an output whose noise may grow with it; the log-likelihood that this must gain; the sd at zero that
+#: are tried, in those at the largest output; the ratio of the largest sd to the smallest below which nothing is gained;
+#: and as how many independent data differences of neighbours count.
 FEWEST, GROWS, OFFSETS, LITTLE, INDEPENDENT = 20, 3.0, (0.003, 0.01, 0.03, 0.1, 0.3), 4.0, 0.6
 #: Ratio of the largest to the smallest sd of an output from which on both are told.
 VARIES = 1.05

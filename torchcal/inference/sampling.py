@@ -17,6 +17,7 @@ from torchcal.inference.draws import WORTH_CHAINS, Draws
 from torchcal.inference.estimate import Estimate, modes_of
 from torchcal.inference.nuts import run_nuts
 from torchcal.models import Problem
+from torchcal.polychaos._checks import whole
 from torchcal.results.diagnostics import R_HAT_THRESHOLD, Mode
 
 __all__ = ["Plan", "draw"]
@@ -59,10 +60,8 @@ class Plan:
             raise DomainError(f"Expected sampler 'nuts', 'hmc' or 'pyro'. Got {self.sampler!r}.")
         for name, least in (("num_samples", 0), ("num_chains", 1), ("num_warmup", 1), ("seed", 0)):
             value = getattr(self, name)
-            if name != "seed" and value is None:
-                continue
-            if isinstance(value, bool) or not isinstance(value, int) or value < least:
-                raise DomainError(f"Expected {name} as an integer of at least {least}. Got {value!r}.")
+            if name == "seed" or value is not None:
+                object.__setattr__(self, name, whole(name, value, least))  # an integer of NumPy's is one too
         if self.dtype not in (torch.float32, torch.float64):
             raise DomainError(f"Expected dtype torch.float64 or torch.float32. Got {self.dtype!r}.")
         accept = self.target_accept

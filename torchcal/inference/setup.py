@@ -12,6 +12,7 @@ from torchcal.embeddings import Embedding
 from torchcal.errors import DomainError, EmbeddingError, ImproperPosteriorError, RecordingError, SimulatorError
 from torchcal.inference.fitting import allowed_solver_error
 from torchcal.models import Problem
+from torchcal.polychaos._checks import whole
 from torchcal.priors import CoefficientPrior
 from torchcal.propagation import NISP
 from torchcal.simulators import Parameter, Scaling, Simulator, Trajectories, free_parameters
@@ -88,8 +89,7 @@ def _begin(simulator: Trajectories, guess: Tensor, allowed: Tensor) -> Trajector
 
 def check_run(num_starts: int, device: torch.device | str | None) -> None:
     """Raise for a number of starts or a device that cannot be used."""
-    if isinstance(num_starts, bool) or not isinstance(num_starts, int) or num_starts < 1:
-        raise DomainError(f"Expected num_starts as an integer of at least 1. Got {num_starts!r}.")
+    whole("num_starts", num_starts, 1)
     if device is None:
         return
     try:
