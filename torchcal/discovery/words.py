@@ -7,7 +7,7 @@ from typing import Any
 
 from torchcal.discovery.channels import RUN
 from torchcal.discovery.records import NONE
-from torchcal.discovery.verdict import SURE
+from torchcal.discovery.verdict import SLOWEST
 
 __all__ = ["paragraph", "percent"]
 
@@ -207,7 +207,9 @@ def _ambiguous(d: Any) -> list[str]:
     known = [tied for tied in d.tied if tuple(tied) != NONE]
     if len(known) == 1:
         sure = sum(row.probability for row in d.ranking if set(known[0]) <= set(row.terms))
-        if sure >= SURE:
+        best = max((row for row in d.ranking if set(row.terms) == set(known[0])), key=lambda row: row.probability)
+        slowest = max(d.noise.correlation.values(), default=0.0)
+        if best.region and d.noise.source == "estimated" and slowest >= SLOWEST:
             return [
                 _where(d),
                 f"{_and(known[0])} explains it best, in a window, but what that leaves is so slow that it may as well "
