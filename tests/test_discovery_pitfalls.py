@@ -411,3 +411,52 @@ def test_a_correction_across_a_kink_is_checked():
     other = first * (1 + 10 ** (-4 * draw(2000, 1)) * (draw(2000, 2) - 0.5))
     off = (bound.solve(other, bound.solve(first)) - bound.solve(other)).abs()
     assert float(off.max()) < 1e-3
+
+
+def test_a_misfit_that_grows_with_the_value_is_not_noise_that_does():
+    # A peak's missing asymmetry, coarsely sampled: most where the peak is high. Once it is named, its noise is even.
+    x = torch.linspace(-5, 5, 30, dtype=F64)
+    found = []
+    for seed in range(5, 11):
+        noise = 0.005 * torch.randn(30, generator=torch.Generator().manual_seed(seed), dtype=F64)
+        peak = tc.Simulator(
+            lambda x, p: p["a"] / (1 + (x / p["w"]) ** 2)
+            + p["c"] * x / (1 + (x / p["w"]) ** 2) ** 2 + p["d"] + p["e"] * x,
+            [tc.Parameter("a", low=0.1, high=10.0, initial=1.0), tc.Parameter("w", low=0.1, high=3.0, initial=1.0),
+             *(tc.Parameter(name, neutral=0.0) for name in "cde")],
+        )  # fmt: skip
+        terms = [tc.Term(name, frees=(q,)) for name, q in (("asymmetry", "c"), ("offset", "d"), ("drift", "e"))]
+        y = 1 / (1 + x**2) + 0.3 * x / (1 + x**2) ** 2 + noise
+        d = diagnose(peak, tc.Recording(x=x, y=y), terms)
+        found.append((d.verdict, tuple(d.terms), dict(d.noise.range)))
+    assert found.count(("named", ("asymmetry",), {})) >= 5
+
+
+def test_an_outlier_among_small_values_of_growing_noise_stays_out():
+    for seed in range(3):
+        scatter = torch.randn(80, generator=torch.Generator().manual_seed(seed), dtype=F64)
+        x = torch.linspace(0, 4, 80, dtype=F64)
+        clean = 10 * torch.exp(-1.2 * x)
+        y = clean * (1 + 0.5 * torch.sin(3 * x) + 0.03 * scatter)
+        y[70] += 0.08  # 16 sd there, a quarter of one where x is small
+        decay = tc.Simulator(
+            lambda x, p: p["A"] * torch.exp(-p["k"] * x) * (1 + p["c"] * torch.sin(3 * x)),
+            [tc.Parameter("A", low=0.1, high=50.0, initial=8.0), tc.Parameter("k", low=0.1, high=5.0, initial=1.0),
+             tc.Parameter("c", neutral=0.0)],
+        )  # fmt: skip
+        d = diagnose(decay, tc.Recording(x=x, y=y), [tc.Term("ripple", frees=("c",))])
+        assert (d.terms, d.noise.outliers) == (["ripple"], 1)
+        assert d.noise.range["y"][0] < 0.005
+
+
+def test_runs_of_two_samples_tell_nothing_of_growing_noise():
+    generator = torch.Generator().manual_seed(0)
+    runs = []
+    for i in range(24):
+        t = torch.tensor([0.5 + 0.05 * i, 1.5 + 0.02 * i], dtype=F64)
+        y = (1 + i / 3) * torch.exp(-0.5 * t) + 0.01 * torch.randn(2, generator=generator, dtype=F64)
+        runs.append(tc.Run(time=t, outputs={"A": y}, initial={"A": 1 + i / 3}))
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"A": -p["k"] * s["A"]}, {"A": None}, [tc.Parameter("k", low=0.0, initial=0.3)]
+    )
+    assert diagnose(base, tc.Recording(runs=runs), tc.terms.kinetics("A")).verdict == "consistent"

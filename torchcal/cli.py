@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _line(error: BaseException | None, path: Path | None) -> int | None:
     """The last line of the user's file that an error, or what caused it, came from."""
     found = None
-    file = "" if path is None else os.path.abspath(path)
+    file = "" if path is None else str(path.resolve())
     while error is not None:
         if isinstance(error, SyntaxError) and error.filename == file:
             return error.lineno
@@ -150,7 +150,7 @@ def _problem(path: Path) -> ModuleType:
     """The user's file, run as a module."""
     if not path.is_file():
         raise DomainError(f"Expected a Python file that defines simulator and recording. Got {path}, which is none.")
-    spec = importlib.util.spec_from_file_location(path.stem, path)
+    spec = importlib.util.spec_from_file_location(path.stem, path.resolve())
     if spec is None or spec.loader is None:
         raise DomainError(f"Expected a Python file, such as problem.py. Got {path}.")
     module = importlib.util.module_from_spec(spec)

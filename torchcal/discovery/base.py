@@ -14,7 +14,7 @@ from torchcal.discovery.problem import Problem
 from torchcal.errors import ConvergenceError, DomainError, SimulatorError
 from torchcal.simulators import Trajectories
 
-__all__ = ["calibrate_base"]
+__all__ = ["calibrate_base", "growing"]
 
 #: The solver's error against the noise.
 SOLVER_SHARE = 0.05
@@ -23,7 +23,13 @@ STEEP = 3
 
 
 def calibrate_base(
-    problem: Problem, fixed: Mapping[str, float], num_starts: int, seed: int, *, clean: bool = False
+    problem: Problem,
+    fixed: Mapping[str, float],
+    num_starts: int,
+    seed: int,
+    *,
+    clean: bool = False,
+    unit: Tensor | None = None,
 ) -> tuple[Fitted, Noise]:
     """Fit the base, set outliers aside, estimate the noise, shorten the solver's steps where they matter.
 
@@ -33,6 +39,7 @@ def calibrate_base(
         num_starts: Starting values.
         seed: Of these.
         clean: Whether outliers are set aside already.
+        unit: How unknown noise grows with the outputs, where that is known better than from the base's residual.
 
     Raises:
         ConvergenceError: If no starting value gives finite outputs.
@@ -68,21 +75,28 @@ def calibrate_base(
     if not exact and not clean:
         for _ in range(3):
             given = recording.noise if isinstance(recording.noise, Tensor) else None
-            unit = growth(found.problem, found.residual, found.jacobian, given)[found.problem.index]
-            bad = spikes(found.problem, found.residual / unit, given)
+            units = (growing(found) if unit is None else unit)[found.problem.index]
+            bad = spikes(found.problem, found.residual / units, given)
             if not bool(bad.any()) or float(bad.double().mean()) > 0.2:
                 break
             keep = found.problem.keep.clone()
             keep[found.problem.index[bad]] = False
             found = _again(found, keep)
-    unit = growth(found.problem, found.residual, found.jacobian, recording.noise)
-    noise = estimate(found.problem, found.residual, found.jacobian, recording.noise, unit)
+    units = growing(found) if unit is None else unit
+    noise = estimate(found.problem, found.residual, found.jacobian, recording.noise, units)
     base = refit(found, noise.whitening(found.problem))
     if not exact:
-        unit = growth(base.problem, base.residual, base.jacobian, recording.noise)
-        noise = estimate(base.problem, base.residual, base.jacobian, recording.noise, unit)
+        units = growing(base) if unit is None else unit
+        noise = estimate(base.problem, base.residual, base.jacobian, recording.noise, units)
         base = _sharpen(refit(base, noise.whitening(base.problem)))
     return base, noise
+
+
+def growing(found: Fitted) -> Tensor:
+    """How unknown noise grows with the outputs, by the residual of a fit; see `growth`."""
+    whole = dataclasses.replace(found.problem, keep=torch.ones_like(found.problem.keep))
+    f = whole.evaluate(found.values[None], [], found.warm)[0][0]
+    return growth(found.problem, found.residual, found.jacobian, found.problem.recording.noise, f)
 
 
 def _from_starts(problem: Problem, begin: Tensor, free: list[int], rough: Tensor, outputs: Tensor) -> Fitted | None:

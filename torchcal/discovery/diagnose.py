@@ -20,7 +20,7 @@ from torchcal.discovery.experiment import propose
 from torchcal.discovery.fitting import Fitted, starts
 from torchcal.discovery.limits import limits
 from torchcal.discovery.model import PRIOR, Model
-from torchcal.discovery.own_noise import fits_by_chance, outliers
+from torchcal.discovery.own_noise import fits_by_chance, other_growth, outliers
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.records import NONE, Estimate, Hypothesis, Scores, Table
 from torchcal.discovery.result import Diagnosis
@@ -118,7 +118,8 @@ def diagnose(
             raise DomainError(f"Expected the term {term.name!r} on outputs of {recording.outputs}. Got {unknown}.")
         extend(simulator, [term])  # raises for names that do not fit, before any long work
     mask = verify.choose(recording, holdout, len(free))
-    check_repeats(problem, starts(problem, 1, seed, held)[0])
+    for values in starts(problem, 2, seed, held):  # at zero nothing may move
+        check_repeats(problem, values)
     bar = tqdm(disable=not progress, desc="diagnose", unit="step", leave=False)
 
     def tick(text: str) -> None:
@@ -135,10 +136,13 @@ def diagnose(
         seen = [search.problem.keep]
         for _ in range(ROUNDS):
             sticking = outliers(search, problem.keep) if detected else None
-            if sticking is None or any(torch.equal(keep, problem.keep & ~sticking) for keep in seen):
+            unit = other_growth(search) if detected else None
+            others = sticking is not None and not any(torch.equal(keep, problem.keep & ~sticking) for keep in seen)
+            if not others and unit is None:
                 break
-            # Others than at the base, whose misfit hides them and looks like some.
-            search = dataclasses.replace(search, problem=problem.keeping(~sticking), clean=True)
+            # Others than at the base, whose misfit hides them and looks like some; and noise that grows, or does not.
+            kept = problem.keeping(~sticking) if others and sticking is not None else search.problem
+            search = dataclasses.replace(search, problem=kept, clean=True, unit=search.unit if unit is None else unit)
             seen.append(search.problem.keep)
             search.calibrate_base()
             detected = _refit(search, confidence)
@@ -411,11 +415,20 @@ def _ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[H
     for i, candidate in enumerate(search.candidates):
         if i in alike:
             model, share = alike[i]
-            note = f"the same as {model.names[0]} here"
-            removed = explain.removed(search, model)
-            row = Hypothesis((candidate.name,), model.log_evidence, share, physical=model.physical,
-                             misfit_removed=removed, score=search.screening.score(i), note=note)  # fmt: skip
-            rows.append(row)
+            own_fit = search.merged.get(i)
+            rows.append(
+                Hypothesis(
+                    (candidate.name,),
+                    model.log_evidence,
+                    share,
+                    estimates=() if own_fit is None else explain.estimates(own_fit.found, own_fit.candidate.own),
+                    physical=model.physical,
+                    misfit_removed=explain.removed(search, model),
+                    score=search.screening.score(i),
+                    refitted=own_fit is not None,
+                    note=f"the same as {model.names[0]} here",
+                )
+            )
         elif (i,) not in fitted:
             seen = candidate.blind or search.screening.best[i] >= 0
             note = "" if seen else "already in the base model"

@@ -242,42 +242,41 @@ def _beyond(problem: Problem, places: Tensor, design: Tensor, unit: Tensor, *, e
     return orthonormal(wide, most=int(0.6 * len(places)))
 
 
-def growth(problem: Problem, residual: Tensor, design: Tensor, given: Tensor | str | None) -> Tensor:
+def growth(problem: Problem, residual: Tensor, design: Tensor, given: Tensor | str | None, f: Tensor) -> Tensor:
     """Noise sd in units of its median, ``(n_total,)``: 1, or growing with the model's output where the scatter does.
 
     An sd of a + |f| / max |f| is taken for the best of a few a where it makes the fastest part of the residual much
     likelier (by `GROWS`; Laplace's distribution, whose scale a few outliers move little). Only noise of unknown size
-    is looked at, and not where replicates tell it.
+    is looked at, and not where replicates tell it. Outputs ``f`` are those of all data, used or not, ``(n_total,)``.
     """
     unit = torch.ones_like(problem.recording.y)
     if given is not None or _pure_error(problem) is not None:
         return unit
-    f = problem.y - residual
+    f = f.abs()
     for output in range(len(problem.recording.outputs)):
         parts = [places for places in problem.recorded if int(problem.output_of[places[0]]) == output]
-        n = sum(len(places) for places in parts)
-        largest = max((float(f[places].abs().max()) for places in parts), default=0.0)
-        if n < FEWEST or not largest > 0:
+        if not parts:
             continue
+        used = f[problem.index[torch.cat(parts)]]
         left, size = [], []
         for places in parts:
             kept, inside = _fastest(problem, places, residual, design)
             left.append(kept)
-            size.append(f[places][inside].abs() / largest)
+            size.append(f[problem.index[places]][inside] / used.max())
         e, size_of = torch.cat(left).abs(), torch.cat(size)
+        if len(e) < FEWEST or not float(used.max()) > 0 or not float(e.sum()) > 0:
+            continue
         told = INDEPENDENT * len(e) if problem.order is not None else len(e)
-        best = GROWS - told * math.log(max(float(e.sum()), 1e-300))
+        best = GROWS - told * math.log(float(e.sum()))
         for offset in OFFSETS:
             shape = offset + size_of
             if float(shape.max()) < LITTLE * float(shape.min()):
                 continue
-            like = -told * (math.log(max(float((e / shape).sum()), 1e-300)) + float(shape.log().mean()))
+            like = -told * (math.log(float((e / shape).sum())) + float(shape.log().mean()))
             if like > best:
-                best, mask = like, mine(problem, output)
-                everywhere = torch.full_like(unit, float(shape.median()))
-                everywhere[problem.index] = offset + f.abs() / largest
-                unit[mask] = everywhere[mask] / float(shape.median())
-    return unit
+                best, here = like, mine(problem, output)
+                unit[here] = (offset + f[here] / used.max()) / (offset + float(used.median() / used.max()))
+    return torch.where(torch.isfinite(unit), unit, 1.0)
 
 
 def _fastest(problem: Problem, places: Tensor, residual: Tensor, design: Tensor) -> tuple[Tensor, slice]:
@@ -287,6 +286,8 @@ def _fastest(problem: Problem, places: Tensor, residual: Tensor, design: Tensor)
     what is left beyond smooth curves.
     """
     r = residual[places]
+    if len(r) < 3:
+        return r[:0], slice(0, 0)
     if problem.order is None:
         basis = _beyond(problem, places, design, torch.ones_like(problem.recording.y))
         return r - basis @ (basis.T @ r), slice(None)

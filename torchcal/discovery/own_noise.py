@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from torchcal.discovery.base import growing
 from torchcal.discovery.fitting import refit
 from torchcal.discovery.likeliest import alone, log_likelihood, settled
 from torchcal.discovery.model import PRIOR, Model
-from torchcal.discovery.noise import Noise, lone, spikes
+from torchcal.discovery.noise import Noise, lone, mine, spikes
 
 if TYPE_CHECKING:
     from torchcal.discovery.search import Search
 
-__all__ = ["fits_by_chance", "outliers", "suited", "weigh_alone"]
+__all__ = ["fits_by_chance", "other_growth", "outliers", "suited", "weigh_alone"]
 
 #: Log evidence of a model from which on what sticks out of it alone are outliers, and how many these may be.
 CLEAR, MOST_OUTLIERS = 10.0, 0.1
@@ -88,6 +89,20 @@ def _beta(x: float, a: float, b: float) -> float:
 def _log_beta(a: float, b: float) -> float:
     """−ln B(a, b)."""
     return math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b)
+
+
+def other_growth(search: "Search") -> Tensor | None:
+    """How unknown noise grows by the residual of the best model, ``(n_total,)``; None where that is as it was taken to
+    be, or nothing explains enough to tell. The misfit of the base may look like noise that grows."""
+    best = max(search.models, key=lambda model: model.weight, default=None)
+    if search.unit is not None or not search.noise.open or best is None or best.log_evidence < CLEAR:
+        return None
+    unit = growing(best.found)
+    same = all(
+        bool((unit[here] == 1).all()) == bool((search.noise.unit[here] == 1).all())
+        for here in (mine(search.problem, output) for output in range(len(search.problem.recording.outputs)))
+    )
+    return None if same else unit
 
 
 def outliers(search: "Search", observed: Tensor) -> Tensor | None:

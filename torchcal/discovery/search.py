@@ -56,6 +56,7 @@ class Search:
     tick: Callable[[str], None]
     executor: Executor | None = None
     clean: bool = False
+    unit: Tensor | None = None
     base: Fitted = field(init=False)
     noise: Noise = field(init=False)
     tangents: Tangents = field(init=False)
@@ -88,7 +89,9 @@ class Search:
 
     def calibrate_base(self) -> None:
         """Calibrate the base, set outliers aside unless that is done, and estimate the noise."""
-        self.base, self.noise = calibrate_base(self.problem, self.fixed, self.num_starts, self.seed, clean=self.clean)
+        self.base, self.noise = calibrate_base(
+            self.problem, self.fixed, self.num_starts, self.seed, clean=self.clean, unit=self.unit
+        )
         self.problem = self.base.problem
         if not self.exact:
             self.tangents = Tangents.of(self.base, self.noise)

@@ -44,8 +44,9 @@ _PIECE = 2**17
 _FEWER = 4
 """How many times fewer nodes make a search with them worth its while."""
 
-_ENDS, _FAR = 8, 100
-"""Ends of a search with few nodes that are followed with a few more, and for how many iterations."""
+_ENDS, _FAR, _POLISHED = 12, 100, 4
+"""Ends of a search with few nodes that are followed with a few more, for how many iterations; and how many of them are
+then followed with all nodes."""
 
 _GAP = 15.0
 """Objective above the best end's from which on only the `_DISTINCT` best are followed: little is to be won there."""
@@ -232,9 +233,9 @@ def search_with_few_nodes(
     if not bool(torch.isfinite(values[promised])):
         return None
     order = values.argsort(stable=True)
-    best = order[values[order] <= values[order[0]] + _SAME * (1 + values[order[0]].abs())]
+    best = order[values[order] <= values[order[0]] + _GAP]
     same = _told_apart(values[best], alpha(points[best])[:, propagate.pattern.leading])
-    for number in range(int(same.max()) + 1):  # several only where densities tie
+    for number in range(min(int(same.max()) + 1, _POLISHED)):
         rows = best[same == number]
         end = minimise(of(propagate), points[rows[:1]], piece=piece, curvature=of(middle), progress=progress)
         end = minimise(of(propagate), end.points, piece=piece, progress=progress)  # most often one step, of no gain

@@ -310,6 +310,8 @@ def _noise(diagnosis: Any, units: Mapping[str, str]) -> str:
         {
             "output": name,
             "sd": Right(in_digits(sd)),
+            "from": Right(in_digits(noise.range.get(name, (sd, sd))[0])),
+            "to": Right(in_digits(noise.range.get(name, (sd, sd))[1])),
             "unit": units.get(name, ""),
             "correlation of neighbours": Right(in_digits(noise.correlation.get(name), 2)),
             "step of quantisation": Right(in_digits(noise.quantisation.get(name))),

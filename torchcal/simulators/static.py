@@ -1,5 +1,6 @@
 """Static simulators: outputs as a function of conditions and parameters."""
 
+import re
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -245,12 +246,12 @@ def _describe(x: Conditions) -> str:
 def _advice(error: Exception, x: Conditions, parameters: Sequence[str]) -> str:
     """What to do where a function took x, or what x or p hold, for something else than they are."""
     named = isinstance(x, Mapping)
-    if named and set(x) == {"time", "run"}:
+    if named and set(x) == {"time", "run"} and not isinstance(error, KeyError):
         return (
             " The recording is one in time and the simulator static: it is called with x['time'] and x['run']. Use "
             "torchcal.ODESimulator for a model of rates."
         )
-    if isinstance(error, KeyError):
+    if isinstance(error, KeyError) and error.args and isinstance(error.args[0], str):
         if not isinstance(x, Mapping):
             return f" Here p holds {list(parameters)} (check the spelling)."
         return (
@@ -259,7 +260,7 @@ def _advice(error: Exception, x: Conditions, parameters: Sequence[str]) -> str:
         )
     if named and "dict" in str(error):
         return f" Here x is a dict, as in the recording: use {', '.join(f'x[{name!r}]' for name in x)}."
-    if not named and isinstance(error, TypeError | IndexError) and "str" in str(error):
+    if not named and isinstance(error, TypeError | IndexError) and re.search(r"\bstr\b", str(error)):
         return " Here x is a tensor, as in the recording: name its condition there, x={name: values}, or use x itself."
     return ""
 
