@@ -380,6 +380,29 @@ def test_rows_of_a_grid_of_conditions_do_not_follow_one_another():
     assert d.noise.sd["T"] == pytest.approx(1.0, rel=0.3)
 
 
+def test_correlated_noise_along_the_rows_of_scattered_conditions_is_noise():
+    found = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        dose, age = np.sort(rng.uniform(0, 5, 90)), rng.uniform(20, 70, 90)
+        noise = rng.standard_normal(90)
+        for k in range(1, 90):
+            noise[k] = 0.7 * noise[k - 1] + np.sqrt(1 - 0.49) * noise[k]
+        x = {"dose": torch.as_tensor(dose), "age": torch.as_tensor(age)}
+        response = tc.Simulator(
+            lambda x, p: p["top"] * x["dose"] / (p["half"] + x["dose"]),
+            [tc.Parameter("top", low=0.0, initial=1.0), tc.Parameter("half", low=0.1, high=10.0, initial=1.0)],
+        )
+        terms = [
+            tc.Term("effect of age", shifts={"top": lambda x, p: p["a"] * (x["age"] - 45)},
+                    parameters=[tc.Parameter("a")]),
+            tc.Term("binding", outputs={"y": lambda x, p, y: y + p["b"] * x["dose"]}, parameters=[tc.Parameter("b")]),
+        ]  # fmt: skip
+        y = x["dose"] / (1 + x["dose"]) + 0.05 * torch.as_tensor(noise)
+        found.append(diagnose(response, tc.Recording(x=x, y=y, noise=0.05), terms).verdict)
+    assert found.count("consistent") >= 5
+
+
 def test_a_given_sd_is_not_doubted_for_a_smooth_misfit():
     x = torch.linspace(-1, 1, 21, dtype=F64)
     line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])

@@ -15,6 +15,9 @@ from torchcal.simulators import Parameter, Simulator, Trajectories
 
 __all__ = ["Problem", "Whitening"]
 
+#: Combinations of all levels of all conditions, in the number of rows, up to which these are a grid.
+GRID = 2.0
+
 
 @dataclass(frozen=True, eq=False)
 class Whitening:
@@ -119,14 +122,14 @@ class Problem:
 
     @cached_property
     def follows(self) -> bool:
-        """Whether rows follow one another, so that noise can be correlated along them: in time, along the only
-        condition, or along one that grows or falls from row to row. The rows of a grid of conditions do not."""
+        """Whether rows follow one another, so that noise can be correlated along them, as they were recorded.
+
+        A grid's do not: a smooth effect of one of its conditions is steps along them, as slow noise may be.
+        """
         if self.order is not None:
             return True
-        x = self.recording.x
-        return isinstance(x, dict) and any(
-            bool((c.diff() > 0).all()) or bool((c.diff() < 0).all()) for c in x.values()
-        )
+        levels = math.prod(len(c.unique()) for c in self.recording.x.values())  # type: ignore[union-attr]
+        return levels > GRID * self.recording.n
 
     @cached_property
     def sequences(self) -> list[Tensor]:
