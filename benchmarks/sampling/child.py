@@ -37,7 +37,7 @@ def prepare(connection: Connection, folder: Path, name: str) -> None:
     other = time.perf_counter() - began
     best = -float(arrays.check_values[0])
     arrays.save(folder / f"{name}.npz")
-    size = {"d": int(arrays.rows.max()) + 1, "P": len(arrays.map), "N": len(arrays.y), "nodes": len(arrays.weights)}
+    size = {"d": int(arrays.rows.max()) + 1, "P": len(arrays.map), "N": len(arrays.y), "nodes": len(arrays.psi)}
     connection.send(
         {
             "title": posterior.title,
