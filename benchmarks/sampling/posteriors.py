@@ -178,7 +178,7 @@ def export(posterior: Posterior) -> tuple[Arrays, float]:
     propagate = problem.propagate
     pattern = propagate.pattern
     # The nodes that torchcal's own moments take: for a polynomial fewer than those of a quadrature rule.
-    psi = propagate._psi if propagate._carriers is None else propagate._carriers
+    psi = propagate._carriers
     projection = propagate._projection
     model = _polynomial(propagate) if posterior.function is None else _function(propagate)
     points = _points(problem, calibration.map.alpha, loc, scale_tril)

@@ -49,7 +49,8 @@ _ENDS, _FAR, _POLISHED = 12, 100, 4
 then followed with all nodes."""
 
 _GAP = 15.0
-"""Objective above the best end's from which on only the `_DISTINCT` best are followed: little is to be won there."""
+"""Objective above the best end's from which on only the `_DISTINCT` best are followed, and none is polished: little is
+to be won there."""
 
 _NEAR = 0.1
 """Difference of scaled means from which on ends of equal objectives are followed apart: they may be two that tie."""

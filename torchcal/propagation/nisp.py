@@ -67,7 +67,7 @@ class NISP(nn.Module):
     nodes: Tensor
     weights: Tensor
     _psi: Tensor
-    _carriers: Tensor | None
+    _carriers: Tensor
     _projection: Tensor | None
     _template: Tensor
     _places: Tensor
@@ -165,7 +165,7 @@ class NISP(nn.Module):
     @property
     def num_evaluations(self) -> int:
         """The number of nodes that moments of one α take: fewer than all of them for a polynomial of known degree."""
-        return self.num_nodes if self._carriers is None else len(self._carriers)
+        return len(self._carriers)
 
     def extra_repr(self) -> str:
         """Shown by ``print``."""
@@ -393,9 +393,9 @@ class NISP(nn.Module):
 
     def _mean(self, alpha: Tensor) -> Tensor:
         """The outputs' mean ``(*batch, 1, n)``."""
-        if self._carriers is not None and self._projection is not None:
-            return self._weighted(alpha, self._projection[:, :1], self._carriers)
-        return self._weighted(alpha, self.weights[:, None], self._psi)
+        if self._projection is None:
+            return self._weighted(alpha, self.weights[:, None], self._psi)
+        return self._weighted(alpha, self._projection[:, :1], self._carriers)
 
     def _weighted(self, alpha: Tensor, matrix: Tensor, psi: Tensor) -> Tensor:
         """Σ_q matrix[q, k] f_q, shape ``(*batch, k, n)``, node piece by node piece."""
@@ -421,7 +421,7 @@ class NISP(nn.Module):
     def _moments(self, alpha: Tensor) -> tuple[Tensor, Tensor]:
         if self._projection is not None:
             if self._affine is None:
-                terms = self._weighted(alpha, self._projection, self._psi if self._carriers is None else self._carriers)
+                terms = self._weighted(alpha, self._projection, self._carriers)
             else:
                 terms = self._linear(alpha, self._affine, self._projection.shape[1])
             return terms[..., 0, :], terms[..., 1:, :].square().sum(-2)
@@ -510,10 +510,10 @@ class NISP(nn.Module):
         device, dtype = self._template.device, self._template.dtype
         rule = rule_choice.build(basis, self.pattern.num_germs)
         self._choice = rule_choice
-        projection = carriers = None
+        projection = None
         whole = self._whole_order(rule_choice)
         order = self.order if self.order is not None else rule_choice.carried_order or whole
-        psi = polychaos.evaluate(basis, indices, rule.nodes)
+        psi = carriers = polychaos.evaluate(basis, indices, rule.nodes)
         few = self._interpolated(whole, order, rule)
         if few is not None:
             carriers, projection = psi[few[0]], few[1]
@@ -527,7 +527,7 @@ class NISP(nn.Module):
             ("_psi", psi),
             ("_carriers", carriers),
             ("_projection", projection),
-            ("_affine", self._affine_map(psi if carriers is None else carriers, projection)),
+            ("_affine", self._affine_map(carriers, projection)),
         ):
             # Built in float64 and only then cast, so that the rule is as good as the dtype allows.
             cast = None if value is None else value.to(device=device, dtype=dtype)
