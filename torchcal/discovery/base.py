@@ -93,10 +93,12 @@ def calibrate_base(
 
 
 def growing(found: Fitted) -> Tensor:
-    """How unknown noise grows with the outputs, by the residual of a fit; see `growth`."""
+    """How unknown noise grows with the outputs, by the residual of a fit, ``(n_total,)``; see `growth`."""
+    if found.problem.recording.noise is not None:
+        return torch.ones_like(found.problem.recording.y)
     whole = dataclasses.replace(found.problem, keep=torch.ones_like(found.problem.keep))
     f = whole.evaluate(found.values[None], [], found.warm)[0][0]
-    return growth(found.problem, found.residual, found.jacobian, found.problem.recording.noise, f)
+    return growth(found.problem, found.residual, found.jacobian, f)
 
 
 def _from_starts(problem: Problem, begin: Tensor, free: list[int], rough: Tensor, outputs: Tensor) -> Fitted | None:

@@ -137,11 +137,12 @@ def diagnose(
         for _ in range(ROUNDS):
             sticking = outliers(search, problem.keep) if detected else None
             unit = other_growth(search) if detected else None
-            others = sticking is not None and not any(torch.equal(keep, problem.keep & ~sticking) for keep in seen)
-            if not others and unit is None:
+            if sticking is not None and any(torch.equal(keep, problem.keep & ~sticking) for keep in seen):
+                sticking = None
+            if sticking is None and unit is None:
                 break
             # Others than at the base, whose misfit hides them and looks like some; and noise that grows, or does not.
-            kept = problem.keeping(~sticking) if others and sticking is not None else search.problem
+            kept = search.problem if sticking is None else problem.keeping(~sticking)
             search = dataclasses.replace(search, problem=kept, clean=True, unit=search.unit if unit is None else unit)
             seen.append(search.problem.keep)
             search.calibrate_base()

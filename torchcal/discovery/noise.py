@@ -242,15 +242,15 @@ def _beyond(problem: Problem, places: Tensor, design: Tensor, unit: Tensor, *, e
     return orthonormal(wide, most=int(0.6 * len(places)))
 
 
-def growth(problem: Problem, residual: Tensor, design: Tensor, given: Tensor | str | None, f: Tensor) -> Tensor:
+def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor) -> Tensor:
     """Noise sd in units of its median, ``(n_total,)``: 1, or growing with the model's output where the scatter does.
 
     An sd of a + |f| / max |f| is taken for the best of a few a where it makes the fastest part of the residual much
-    likelier (by `GROWS`; Laplace's distribution, whose scale a few outliers move little). Only noise of unknown size
-    is looked at, and not where replicates tell it. Outputs ``f`` are those of all data, used or not, ``(n_total,)``.
+    likelier (by `GROWS`; Laplace's distribution, whose scale a few outliers move little). It is for noise of unknown
+    size, and 1 where replicates tell it. Outputs ``f`` are those of all data, used or not, ``(n_total,)``.
     """
     unit = torch.ones_like(problem.recording.y)
-    if given is not None or _pure_error(problem) is not None:
+    if _pure_error(problem) is not None:
         return unit
     f = f.abs()
     for output in range(len(problem.recording.outputs)):

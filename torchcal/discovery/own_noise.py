@@ -53,7 +53,7 @@ def weigh_alone(search: "Search") -> tuple[float, float]:
         found = alone(model.found, search.noise, search.tangents)[1] - base
         model.in_use = search.gain(model.found.chi2) + here + model.price
         model.log_evidence = max(found + model.price, model.in_use)
-    best = max(search.models, key=lambda model: model.weight, default=None)
+    best = search.leader
     unknown = [search.with_unknown(search.base)[1]]
     if best is not None:
         unknown.append(search.with_unknown(best.found)[1] + best.prior)
@@ -94,7 +94,7 @@ def _log_beta(a: float, b: float) -> float:
 def other_growth(search: "Search") -> Tensor | None:
     """How unknown noise grows by the residual of the best model, ``(n_total,)``; None where that is as it was taken to
     be, or nothing explains enough to tell. The misfit of the base may look like noise that grows."""
-    best = max(search.models, key=lambda model: model.weight, default=None)
+    best = search.leader
     if search.unit is not None or not search.noise.open or best is None or best.log_evidence < CLEAR:
         return None
     unit = growing(best.found)
@@ -108,7 +108,7 @@ def other_growth(search: "Search") -> Tensor | None:
 def outliers(search: "Search", observed: Tensor) -> Tensor | None:
     """Data that stick out alone once the best model explains the rest, bool ``(n_total,)``; None where nothing explains
     enough to tell. All ``observed`` data are judged, those that are set aside too."""
-    best = max(search.models, key=lambda model: model.weight, default=None)
+    best = search.leader
     if search.exact or best is None or best.log_evidence < CLEAR:
         return None
     given = search.problem.recording.noise

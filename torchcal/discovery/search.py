@@ -137,6 +137,11 @@ class Search:
         """Models of one term that acts everywhere, by its number."""
         return {m.numbers[0]: m for m in self.models if len(m.numbers) == 1 and m.window is None}
 
+    @property
+    def leader(self) -> Model | None:
+        """The model with the most weight, where there is any."""
+        return max(self.models, key=lambda model: model.weight, default=None)
+
     def merge(self) -> None:
         """Candidates whose tangents and refits cannot be told apart become one hypothesis, under the first name."""
         plain = self.plain
@@ -314,10 +319,8 @@ class Search:
 
     def reweigh(self) -> None:
         """Estimate the noise again with the best model, and fit everything again where that changes it."""
-        if self.exact or not self.models:
-            return
-        best = max(self.models, key=lambda model: model.weight)
-        if best.log_evidence < 3.0:
+        best = self.leader
+        if self.exact or best is None or best.log_evidence < 3.0:
             return
         hopeful = [m for m in self.models if m.log_evidence > HOPELESS * best.log_evidence]
         fresh = suited(self, hopeful)

@@ -51,7 +51,8 @@ def refit_local(search: Search) -> None:
         if w.candidate not in same and w.z > 3.5 and w.z**2 > max(plain + 6.0, highest - 10.0):
             promising.setdefault(w.candidate, []).append(w)
     prior = math.log(PRIOR["local"] / max(len(search.candidates), 1))
-    chosen = sorted((w for each in promising.values() for w in _different(search, each)), key=lambda w: -w.z)
+    spans = {name: Span.of(driver) for name, driver in search._drivers().items()} if promising else {}
+    chosen = sorted((w for each in promising.values() for w in _different(each, spans)), key=lambda w: -w.z)
     for w in chosen[:MOST]:
         _keep(search, refit_window(search, w, prior))
     search.reweigh()
@@ -71,11 +72,11 @@ def refit_local(search: Search) -> None:
     _refine_edges(search, prior)
 
 
-def _different(search: Search, ranked: list[Window]) -> list[Window]:
+def _different(ranked: list[Window], spans: dict[str, Span]) -> list[Window]:
     """The best windows of a candidate, no two of them along one driver with most of the one within the other."""
     kept: list[Window] = []
     for w in ranked:
-        span = Span.of(search._drivers()[w.driver])
+        span = spans[w.driver]
         low, high = max(w.low, span.low), min(w.high, span.high)
         covered = 0.0
         for other in (o for o in kept if o.driver == w.driver):
