@@ -11,7 +11,8 @@ import torch
 
 import torchcal as tc
 from torchcal.discovery.fitting import fit
-from torchcal.discovery.noise import Noise, estimate, lone, spikes
+from torchcal.discovery.noise import Noise, estimate
+from torchcal.discovery.outliers import lone, spikes
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.search import Search
 

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from torchcal.discovery.candidates import base_columns
 from torchcal.discovery.fitting import Fitted, fit, follow_slopes, refit, starts
-from torchcal.discovery.noise import Noise, estimate, growth, spikes
+from torchcal.discovery.noise import Noise, estimate, growth
+from torchcal.discovery.outliers import spikes
 from torchcal.discovery.problem import Problem
 from torchcal.errors import ConvergenceError, DomainError, SimulatorError
 from torchcal.simulators import Trajectories

@@ -16,21 +16,13 @@ from torchcal.discovery.records import NoiseModel
 from torchcal.errors import DomainError
 
 __all__ = [
-    "GRID", "LEAST", "SHRINK", "Noise", "estimate", "growth", "least", "lone", "mine", "orthonormal", "smooth_columns",
-    "spikes",
+    "GRID", "LEAST", "SHRINK", "Noise", "estimate", "growth", "least", "mine", "orthonormal", "smooth_columns",
 ]  # fmt: skip
 
 #: AR(1) coefficients that are tried.
 GRID = torch.linspace(0.0, 0.95, 39, dtype=torch.float64)
 #: Share of a sequence's degrees of freedom that smooth curves may take.
 SMOOTH_SHARE = 1.0 / 6.0
-#: A sample that leaves its neighbours' range by more than this many robust sd, alone or with one beside it, is one.
-SPIKE = 4.5
-#: Robust sd from which on a residual of a model that explains the rest is an outlier, where its neighbours' are not
-#: half as large that way.
-LONE = 4.5
-#: By how many times the bend behind it a first or last sample must be off to be an outlier.
-BENT = 10.0
 #: Weight against correlation: log prior density of φ is −SHRINK·φ.
 SHRINK = 1.0
 #: Fewest data of an output whose noise may be correlated.
@@ -39,8 +31,6 @@ LEAST = 40
 CAUTION = 0.6
 #: Smallest noise sd that is estimated, in the output's spread.
 FLOOR = 1e-7
-#: Share of supposed outliers with another one as nearest neighbour above which they are no outliers.
-TOGETHER = 0.4
 #: Fewest data of an output whose noise may grow with it; the log-likelihood that this must gain; the sd at zero that
 #: are tried, in those at the largest output; the ratio of the largest sd to the smallest below which nothing is gained;
 #: and as how many independent data differences of neighbours count.
@@ -354,133 +344,3 @@ def _quantisation(problem: Problem) -> dict[str, float]:
         if step > 1e-6 * size and float(((seen / step) - (seen / step).round()).abs().max()) < 1e-3:
             found[name] = step
     return found
-
-
-def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
-    """Used data that stick out alone from their neighbours, bool ``(n,)``.
-
-    Along one order they are compared with two neighbours on either side. Among several conditions the
-    residual of a robust smooth fit takes its place.
-    """
-    found = torch.zeros(problem.n, dtype=torch.bool)
-    for places in problem.sequences:
-        if len(places) < 10:
-            continue
-        r = residual[places]
-        if sd is not None:
-            r = r / sd[problem.index[places]]
-        if problem.order is None:
-            left = _robust_left(smooth_columns(problem, places), r)
-            size = max(1.4826 * float(left.abs().median()), 0.0 if sd is None else 1.0)
-            high = left.abs() > SPIKE * size if size > 0 else torch.zeros_like(left, dtype=torch.bool)
-            found[places] = high if not _clustered(problem, places, high) else False
-            continue
-        off = _off_neighbours(r)
-        bend = r[1:-1] - 0.5 * (r[:-2] + r[2:])  # a curve leaves its neighbours' range nowhere, but bends everywhere
-        robust = math.sqrt(1.3 / 1.5) * 1.4826 * float(bend.abs().median())
-        if sd is not None:
-            robust = max(robust, math.sqrt(1.3))  # what white noise gives
-        if robust > 0:
-            found[places] = _alone(r, _with_ends(r, off, SPIKE * robust), SPIKE * robust)
-    return found
-
-
-def lone(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
-    """Used data that a model that explains the others misses by far, bool ``(n,)``.
-
-    In an order their neighbours must not be half as far off that way, and the ends are not judged: a quick beginning is
-    physics as likely as not. Among several conditions they must not be together.
-    """
-    found = torch.zeros(problem.n, dtype=torch.bool)
-    for places in problem.sequences:
-        if len(places) < 10:
-            continue
-        r = residual[places]
-        size = (1.4826 * r.abs().median()).expand(len(r))
-        if sd is not None:
-            size = size.maximum(sd[problem.index[places]])
-        far = (r.abs() > LONE * size) & (size > 0)
-        if problem.order is None:
-            found[places] = far & (not _clustered(problem, places, far))
-            continue
-        beside = torch.maximum(r.roll(1) * r.sign(), r.roll(-1) * r.sign())
-        far[[0, -1]] = False
-        found[places] = far & (beside < 0.5 * r.abs())
-    return found
-
-
-def _off_neighbours(r: Tensor) -> Tensor:
-    """By how much samples ``(m,)`` leave the range of the two middle ones of their four neighbours.
-
-    Beside two spikes that range reaches from the other samples to the spikes, so that these alone leave it.
-    """
-    padded = torch.cat([r[:1].expand(2), r, r[-1:].expand(2)])
-    around = torch.stack([padded[k : k + len(r)] for k in (0, 1, 3, 4)]).sort(0).values
-    off: Tensor = r - torch.maximum(torch.minimum(r, around[2]), around[1])
-    return off
-
-
-def _with_ends(r: Tensor, off: Tensor, least: float) -> Tensor:
-    """The same with both ends measured from a line through the next four.
-
-    Scaled to vary as much as the others do by noise alone; 0 where one of the four is off itself, by more than
-    ``least``, or where they bend: a parabola with their bend b would end 3.4 b off the line, and a decay more.
-    """
-    off = off.clone()
-    for end, next_ in ((0, r[1:5]), (-1, r[-5:-1].flip(0))):
-        beside = off[1:5] if end == 0 else off[-5:-1]
-        near, far = next_[:2].mean(), next_[2:].mean()
-        here = float((r[end] - near - 0.75 * (near - far)) * math.sqrt(1.3 / 2.8))
-        bend = float((next_[1] + next_[2] - next_[0] - next_[3]).abs()) / 4
-        plain = abs(here) > BENT * bend and not bool((beside.abs() > least).any())
-        off[end] = here if plain else 0.0
-    return off
-
-
-def _alone(r: Tensor, off: Tensor, least: float) -> Tensor:
-    """Which differences from neighbours are at least so large, singly or two together, bool ``(m,)``.
-
-    Those beside the top of a curve are nearly as large as at its top; those beside a spike are not. Before and behind a
-    step the values differ; before and behind a spike they do not.
-    """
-    high = (off.abs() > least).tolist()
-    size = [*off.abs().tolist(), 0.0]
-    found = torch.zeros(len(off), dtype=torch.bool)
-    k = 0
-    while k < len(high):
-        end = k
-        while end < len(high) and high[end]:
-            end += 1
-        if 0 < end - k <= 2:
-            inside = 0 < k and end < len(high)
-            step = abs(float(r[max(k - 3, 0) : k].median() - r[end : end + 3].median())) if inside else 0.0
-            found[k:end] = max(size[k - 1] if k else 0.0, size[end], step) < 0.5 * max(size[k:end])
-        k = end + 1
-    return found
-
-
-def _clustered(problem: Problem, places: Tensor, high: Tensor) -> bool:
-    """Whether data that stick out lie together among the conditions, as outliers do not."""
-    count = int(high.sum())
-    if count < 3:
-        return False
-    x = problem.recording.x
-    columns = [c[problem.condition_of[places]] for c in (x.values() if isinstance(x, dict) else [x])]
-    ranks = torch.stack([c.argsort().argsort().double() for c in columns], dim=-1)
-    distance = torch.cdist(ranks[high], ranks)
-    distance[torch.arange(count), high.nonzero()[:, 0]] = math.inf
-    together = float(high[distance.argmin(1)].double().mean())
-    return together > TOGETHER
-
-
-def _robust_left(columns: Tensor, values: Tensor) -> Tensor:
-    """What a smooth fit with Tukey's biweight leaves."""
-    columns = columns[:, : max(1, len(values) // 8)]
-    weight = torch.ones_like(values)
-    left = values - values.median()
-    for _ in range(10):
-        size = max(1.4826 * float(left.abs().median()), 1e-300)
-        weight = (1 - (left / (4.685 * size)).square()).clamp_min(0)
-        solution = torch.linalg.lstsq(columns * weight[:, None], (values * weight)[:, None], driver="gelsd").solution
-        left = values - (columns @ solution)[:, 0]
-    return left

@@ -12,7 +12,8 @@ from torchcal.discovery.base import growing
 from torchcal.discovery.fitting import refit
 from torchcal.discovery.likeliest import alone, log_likelihood, settled
 from torchcal.discovery.model import PRIOR, Model
-from torchcal.discovery.noise import Noise, lone, mine, spikes
+from torchcal.discovery.noise import Noise, mine
+from torchcal.discovery.outliers import lone, spikes
 
 if TYPE_CHECKING:
     from torchcal.discovery.search import Search
