@@ -180,7 +180,7 @@ def test_densities_that_differ_stop_everything(prepared, tmp_path):
 def test_rows(prepared, sampler):
     settings, _ = prepared
     if sampler == "torchcal-hmc":  # a process for each goal, and one is enough here
-        settings = replace(settings, goals=(100,))
+        settings = replace(settings, goals=(100,), limit=200.0)  # a busy machine is no failure
     row = run.once(settings, f"{NAME}__{sampler}", NAME, sampler)
     assert "failed" not in row, row
     assert set(row["times"]) == {str(goal) for goal in settings.goals}
