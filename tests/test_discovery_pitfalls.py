@@ -483,3 +483,60 @@ def test_runs_of_two_samples_tell_nothing_of_growing_noise():
         lambda t, s, p, u: {"A": -p["k"] * s["A"]}, {"A": None}, [tc.Parameter("k", low=0.0, initial=0.3)]
     )
     assert diagnose(base, tc.Recording(runs=runs), tc.terms.kinetics("A")).verdict == "consistent"
+
+
+def aged(seed, more=0.08):
+    """A response that a bend along one condition is missing from, and a slight one along the other, of some shape."""
+    rng = np.random.default_rng(seed)
+    dose, age = (torch.as_tensor(rng.uniform(0, 2, 80)) for _ in range(2))
+    y = 1 + 0.5 * dose + 0.3 * age + (age - 1) ** 2 + more * dose**2 + 0.05 * torch.as_tensor(rng.standard_normal(80))
+    base = tc.Simulator(
+        lambda x, p: p["a"] + p["b"] * x["dose"] + p["s"] * x["age"], [tc.Parameter(name) for name in "abs"]
+    )
+    shapes = {
+        "age": lambda x: (x["age"] - 1) ** 2,
+        "square": lambda x: x["dose"] ** 2,
+        "cube": lambda x: x["dose"] ** 3,
+        "root": lambda x: x["dose"].sqrt(),
+    }
+    terms = [
+        tc.Term(name, outputs={"y": lambda x, p, y, f=f: y + p["c"] * f(x)}, parameters=[tc.Parameter("c")])
+        for name, f in shapes.items()
+    ]
+    return base, tc.Recording(x={"dose": dose, "age": age}, y=y, noise=0.05), terms
+
+
+def test_what_is_likely_beside_a_name_is_listed():
+    d = diagnose(*aged(1))
+    assert (d.verdict, d.terms) == ("named", ["age"])
+    assert sorted(map(sorted, d.tied)) == [["age"], ["age", "cube"], ["age", "root"], ["age", "square"]]
+    assert 0.0 < d.remaining < 0.05
+    words = str(d).replace("\n", " ")
+    assert "probability alone or with others 0.9" in words
+    assert "Something else acts beside it with a probability of 0.9" in words
+    assert d.experiment is None or d.experiment.description in words
+
+
+def test_what_all_the_tied_share_is_said():
+    d = diagnose(*aged(0))
+    assert d.verdict == "ambiguous"
+    assert all("age" in tied for tied in d.tied)
+    assert "All of them have age." in str(d).replace("\n", " ")
+
+
+def test_one_that_alone_is_likelier_than_the_base_is_no_name_beside_many_that_are_not():
+    # Each of the waves is less probable than the base; together they have a twentieth of what the candidates share.
+    rng = np.random.default_rng(24)
+    x = torch.as_tensor(np.sort(rng.uniform(0, 2, 60)))
+    y = 1 + 0.5 * x + 0.14 * x**2 + 0.1 * torch.as_tensor(rng.standard_normal(60))
+    base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    shapes = {"square": lambda x: x**2}
+    shapes |= {f"wave {k}": (lambda x, k=k: torch.cos(k * torch.pi * x)) for k in range(2, 10)}
+    terms = [
+        tc.Term(name, outputs={"y": lambda x, p, y, f=f: y + p["c"] * f(x)}, parameters=[tc.Parameter("c")])
+        for name, f in shapes.items()
+    ]
+    d = diagnose(base, tc.Recording(x=x, y=y, noise=0.1), terms)
+    assert d.ranking[0].terms == ("square",)
+    assert d.ranking[0].probability > 0.7
+    assert (d.verdict, d.tied) == ("ambiguous", [["square"], ["none of these"]])

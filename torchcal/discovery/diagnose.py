@@ -26,7 +26,7 @@ from torchcal.discovery.records import NONE, Estimate, Hypothesis, Scores, Table
 from torchcal.discovery.result import Diagnosis
 from torchcal.discovery.search import Search
 from torchcal.discovery.several import refit_several
-from torchcal.discovery.verdict import PLAINLY_WHITE, Decision, decide
+from torchcal.discovery.verdict import PLAINLY_WHITE, Decision, base_alone, decide
 from torchcal.discovery.windows import refit_local
 from torchcal.errors import ConvergenceWarning, DomainError, RecordingError
 from torchcal.polychaos._checks import whole
@@ -40,6 +40,9 @@ __all__ = ["diagnose"]
 ROUNDS = 3
 #: Share of the level at which a fit to few data counts as more than noise by itself.
 FEW_DATA = 0.1
+#: Times the level up to which a misfit that noise alone gives counts as more than that where the base, beside the
+#: refitted candidates, is as improbable as the level: a statistic for all kinds of misfit sees each kind less well.
+OFTEN = 5.0
 #: Power of the stated detection limits.
 POWER = 0.95
 
@@ -158,11 +161,16 @@ def diagnose(
 def _refit(search: Search, confidence: float) -> bool:
     """Screen and refit single terms, and local ones where there is more than noise, which is returned."""
     search.screen_all()
-    detected = search.exact or search.p_detect < 1.0 - confidence
+    detected = at_once = search.exact or search.p_detect < 1.0 - confidence
     if search.terms:
         search.refit_singles(detected=detected)
-        if not detected and search.few and (p := fits_by_chance(search)) < FEW_DATA * (1.0 - confidence):
-            detected, search.p_detect, search.models = True, min(p, search.p_detect), []
+        level = 1.0 - confidence
+        if not detected and search.few and (p := fits_by_chance(search)) < FEW_DATA * level:
+            detected, search.p_detect = True, min(p, search.p_detect)
+        elif not detected:
+            detected = search.p_detect < OFTEN * level and base_alone(search) < level
+        if detected and not at_once:
+            search.models = []
             search.refit_singles()
         if detected:
             refit_local(search)
@@ -296,6 +304,8 @@ def _result(
     if best is not None:
         white = best.structure is not None and best.structure.p_value >= PLAINLY_WHITE and not search.exact
         remaining = 0.0 if white else 1.0 - explain.removed(search, best)
+        if decision.tied_models:  # something beside it is likely
+            remaining = max(remaining, explain.surpassed(search, best, decision.tied_models[0]))
     return Diagnosis(
         verdict=decision.verdict,
         terms=_in_order(search, best) if best else [],

@@ -138,6 +138,12 @@ def removed(search: Search, model: Model) -> float:
     return min(max(1.0 - max(left, 0.0) / excess, 0.0), 1.0)
 
 
+def surpassed(search: Search, model: Model, larger: Model) -> float:
+    """Share of the squared misfit that a larger model removes and this one leaves."""
+    whole = search.base.chi2 - larger.found.chi2
+    return min(max((model.found.chi2 - larger.found.chi2) / whole, 0.0), 1.0) if whole > 0 else 0.0
+
+
 def needed_shifts(search: Search) -> list[NeededShift]:
     """The shift of each parameter against the driver that it varies with most."""
     rows: dict[str, Place] = {}

@@ -38,11 +38,13 @@ class Diagnosis:
             library.
         terms: Names of the accepted terms, in order of acceptance.
         tied: Hypotheses that the data cannot tell apart, each a list of terms; the last is ``["none of these"]`` where
-            the best of the library is not probable enough for a name.
+            the best of the library is not probable enough for a name. Beside a name, the hypotheses that hold it, where
+            those with something more are likelier than it alone.
         where: Where the mismatch sits: equations, parameters or outputs, with spans and share of the misfit.
         ranking: All hypotheses, the best first.
         detection_limit: By candidate, the smallest effect that these data could have shown.
-        remaining: Share of the squared misfit beyond noise that the accepted terms leave.
+        remaining: Share of the squared misfit beyond noise that the accepted terms leave; at least what the likeliest
+            hypothesis with more terms removes beyond them.
         before: Scores of the base.
         after: Scores with the accepted terms; None where nothing was accepted.
         improved: The simulator with the accepted terms; the simulator as it was where there are none.

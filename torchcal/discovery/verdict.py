@@ -12,7 +12,7 @@ from torchcal.discovery.records import NONE
 from torchcal.discovery.search import Search
 from torchcal.discovery.structure import Structure
 
-__all__ = ["Decision", "decide"]
+__all__ = ["Decision", "base_alone", "decide"]
 
 #: A hypothesis is named when it has at least this probability among those the library offers.
 NAMED = 0.97
@@ -48,7 +48,7 @@ class Decision:
     Attributes:
         verdict: As in `Diagnosis`.
         best: The accepted model.
-        tied: Sets of names that the data cannot tell apart.
+        tied: Sets of names that the data cannot tell apart; of a name that is not all, the sets that hold it.
         tied_models: Their models.
         probability: Of every model, by its ``id``.
         none: Probability of something that is not in the library.
@@ -150,12 +150,17 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         decision.tied.append(list(model.names))
         decision.tied_models.append(model)
         _tie_other_names(search, model, decision)
-    if len(decision.tied) < 2:
-        decision.tied, decision.tied_models = [], []
-        _name(search, decision, best, mask)
-    elif decision.none > 1 - SURE:
+    if len(decision.tied) < 2 or decision.none > 1 - SURE:  # one alone is not sure enough, or it had been named
         decision.tied.append(list(NONE))
     return decision
+
+
+def base_alone(search: Search) -> float:
+    """Probability of the base beside the models that were refitted."""
+    decision = Decision()
+    decision.none_evidence = math.log(PRIOR["none"])
+    _weigh(search, decision)
+    return decision.base
 
 
 def _small(search: Search, model: Model) -> bool:
@@ -181,15 +186,37 @@ def _small(search: Search, model: Model) -> bool:
 
 def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) -> None:
     """Name what a model adds, if it is probable enough and the held-out data do not object."""
-    names = set(best.names)
-    sure = sum(decision.probability[id(m)] for m in search.models if names <= set(m.names))
+    holding = [m for m in search.models if set(best.names) <= set(m.names)]
+    sure = sum(decision.probability[id(m)] for m in holding)
     slow = search.noise.open and float(search.noise.correlation.max()) >= SLOWEST
     if sure < SURE or (slow and best.window is not None):
         decision.verdict = "ambiguous"
         decision.tied, decision.tied_models = [list(best.names), list(NONE)], [best]
         return
+    larger = sum(decision.probability[id(m)] for m in holding if len(m.names) > len(best.names))
+    if larger > sure - larger:
+        best = _wherever(search, decision, best)
+        _tie_larger(decision, holding, sure)
     decision.verdict, decision.best = "named", best
     _prove(search, decision, mask)
+
+
+def _wherever(search: Search, decision: Decision, best: Model) -> Model:
+    """A model's terms without its window, where others beside them are likelier: it may only stand in for these."""
+    plain = search.plain.get(best.numbers[0])
+    return best if best.window is None or plain is None else plain
+
+
+def _tie_larger(decision: Decision, holding: Sequence[Model], sure: float) -> None:
+    """List the hypotheses that share what is named and differ in what else they add, up to a share of theirs."""
+    covered = 0.0
+    for model in sorted(holding, key=lambda m: -decision.probability[id(m)]):
+        if covered >= TIED * sure:
+            break
+        covered += decision.probability[id(model)]
+        if model.window is None:
+            decision.tied.append(list(model.names))
+            decision.tied_models.append(model)
 
 
 def _other_names(search: Search, model: Model) -> list[tuple[int, str, str]]:
@@ -347,3 +374,4 @@ def _prove(search: Search, decision: Decision, mask: Tensor | None) -> None:
             f"base (by {-gain:.2g} ± {error:.1g} noise variances a datum), so the name is withdrawn."
         )
         decision.verdict, decision.best = "unexplained", None
+        decision.tied, decision.tied_models = [], []

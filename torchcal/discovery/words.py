@@ -13,6 +13,8 @@ __all__ = ["paragraph", "percent"]
 
 #: Correlation from sample to sample from which on noise is called slow.
 SLOW = 0.3
+#: Hypotheses that hold a named term and more, of which the paragraph lists so many.
+MORE = 4
 
 
 def percent(share: float) -> str:
@@ -176,10 +178,11 @@ def _proof(d: Any) -> str:
 def _named(d: Any) -> list[str]:
     top = _accepted(d)
     estimates = "; ".join(str(estimate) for estimate in top.estimates)
-    others = [row for row in d.ranking if row.terms and row.refitted and set(row.terms) != set(top.terms)]
+    others = [row for row in d.ranking if row.terms and row.refitted and not set(row.terms) >= set(top.terms)]
     rival = max(others, key=lambda row: row.probability, default=None)
-    probability = sum(row.probability for row in d.ranking if set(row.terms) == set(top.terms))
-    likely = "" if d.settings.get("nearly") else f"probability {probability:.3f}; "
+    probability = sum(row.probability for row in d.ranking if set(row.terms) >= set(top.terms))
+    with_others = " alone or with others" if d.tied else ""
+    likely = "" if d.settings.get("nearly") else f"probability{with_others} {probability:.3f}; "
     parts = [
         _where(d),
         f"Adding {_and([_with_region(d, name) for name in d.terms])} and refitting everything removes "
@@ -195,11 +198,35 @@ def _named(d: Any) -> list[str]:
         stands = f"stands {behind:.1f} natural-log units of evidence behind"
         if behind < 0:
             stands = f"has {-behind:.1f} natural-log units more evidence, and far less probability beforehand"
-        parts.append(f"The next best, {_and(list(rival.terms))}, {stands}.")
+        parts.append(f"The next best{' without it' if d.tied else ''}, {_and(list(rival.terms))}, {stands}.")
     parts.append(_proof(d))
+    if d.tied:
+        parts += _larger(d)
     if d.remaining > 0.005:
         parts.append(f"{percent(d.remaining)} of the misfit remains unexplained.")
     return parts
+
+
+def _larger(d: Any) -> list[str]:
+    """What is likely beside the named terms."""
+    more = [row for row in d.ranking if row.refitted and set(row.terms) > set(d.terms)]
+    listed = [
+        f"{_and([name for name in row.terms if name not in d.terms])} ({row.probability:.2f})" for row in more[:MORE]
+    ]
+    if len(more) > MORE:
+        listed.append("others")
+    together = sum(row.probability for row in more)
+    parts = [f"Something else acts beside it with a probability of {together:.2f}: {', or '.join(listed)}."]
+    return parts + _experiment(d)
+
+
+def _experiment(d: Any) -> list[str]:
+    if d.experiment is None:
+        return []
+    return [
+        f"What would tell them apart: {d.experiment.description} (predicted distance {d.experiment.separation:.1f} "
+        "noise sd)."
+    ]
 
 
 def _ambiguous(d: Any) -> list[str]:
@@ -221,13 +248,13 @@ def _ambiguous(d: Any) -> list[str]:
             f" little for a name, against {unknown:.2f} for something else: more data, or less noise, would tell.",
         ]
     parts = [_where(d), f"{len(known)} hypotheses explain it about as well, and these data cannot exclude any of them."]
+    shared = [name for name in known[0] if all(name in tied for tied in known)]
+    if shared:
+        parts.append(f"All of them have {_and(shared)}.")
     if len(known) < len(d.tied):
         parts.append(f"Nor can they exclude something that is not in the library (probability {unknown:.2f}).")
     if d.experiment is not None:
-        parts.append(
-            f"What would tell them apart: {d.experiment.description} (predicted distance "
-            f"{d.experiment.separation:.1f} noise sd)."
-        )
+        parts += _experiment(d)
     elif sum(any(row.refitted and set(row.terms) == set(tied) for row in d.ranking) for tied in known) > 1:
         parts.append("None of the simple experiments that were tried in thought would tell them apart.")
     return parts
