@@ -284,16 +284,15 @@ def _static_error(
     family = FAMILIES[answer["family"]]
     name = next(iter(family.outputs))
     x = {key: np.asarray(values, dtype=float) for key, values in case["x"].items()}
-    along = np.asarray(estimate["along"], dtype=float)
-    if len(along) != len(next(iter(x.values()))):
-        return 1.0
+    along, row = np.asarray(estimate["along"], dtype=float), np.asarray(estimate["time"], dtype=int)
+    x = {key: values[row] for key, values in x.items()}  # some data are missing, or were set aside
     if estimate["kind"] == "parameter":
         q = {key: np.array([value]) for key, value in answer["refit"].items()}
         moved = {**q, estimate["target"]: q[estimate["target"]] + along}
         found = family.outputs[name](None, x, moved, x) - family.outputs[name](None, x, q, x)
     else:
         found = along
-    true = np.sum([part["output " + name] for part in answer["added"][0]], axis=0)
+    true = np.sum([part["output " + name] for part in answer["added"][0]], axis=0)[row]
     return _relative(found, true, _slopes(lambda q: family.outputs[name](None, x, q, x), p, len(true)))
 
 

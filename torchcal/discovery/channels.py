@@ -130,6 +130,13 @@ def _bin_means(bins: Tensor, count: int, steps: Tensor) -> Tensor:
     return total / weight.reshape(-1, *(1 for _ in steps.shape[2:]))
 
 
+def _time(problem: Problem) -> Tensor:
+    """Time, or the condition's number, of every datum ``(n,)``."""
+    if problem.in_time and problem.order is not None:
+        return problem.order[problem.condition_of]
+    return problem.condition_of.double()
+
+
 def _rate_unit(unit: str | None, time: str) -> str | None:
     return None if unit is None else f"{unit or 1}/{time}"
 
@@ -200,14 +207,14 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
         at_data = _by_run(problem, at_data, bound.grid.run_of[problem.condition_of])
     else:
         at_data = problem.drivers_at_data(found.values[None], None)
-        time = problem.order[problem.condition_of] if problem.order is not None else torch.arange(problem.n).double()
+        time = _time(problem)
         for j, i in enumerate(found.free):
             if is_window(names[i]):
                 continue
             list_.append(
                 Channel("parameter", names[i], problem.parameters[i].unit, at_data, time, found.jacobian[:, j])
             )
-    time = problem.order[problem.condition_of] if problem.order is not None else torch.arange(problem.n).double()
+    time = _time(problem)
     for number, name in enumerate(problem.recording.outputs):
         mine = (problem.output_of == number).double()
         own_drivers = {**at_data, f"{name} itself": found.y}

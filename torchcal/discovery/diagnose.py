@@ -40,6 +40,8 @@ __all__ = ["diagnose"]
 ROUNDS = 3
 #: Share of the level at which a fit to few data counts as more than noise by itself.
 FEW_DATA = 0.1
+#: RMSE of a calibrated base, in the data's spread, from which on it explains nothing.
+NO_BETTER = 0.95
 #: Times the level up to which a misfit that noise alone gives counts as more than that where the base, beside the
 #: refitted candidates, is as improbable as the level: a statistic for all kinds of misfit sees each kind less well.
 OFTEN = 5.0
@@ -150,8 +152,8 @@ def diagnose(
             seen.append(search.problem.keep)
             search.calibrate_base()
             detected = _refit(search, confidence)
-        if detected and terms and _wants_more(search):
-            refit_several(search)
+        if detected and terms:
+            refit_several(search)  # two may do what one does that is white by itself
         decision = decide(search, detected, mask)
         return _result(search, decision, simulator, recording, mask, confidence, begun, given, seed)
     finally:
@@ -238,17 +240,6 @@ def _beyond_prediction(search: Search, mask: Tensor) -> bool:
     return bool((own > search.problem.recording.spread[seen]).any())
 
 
-def _wants_more(search: Search) -> bool:
-    """Whether one term is not the whole story, as far as a window in it does not stand in for another one."""
-    physical = [m for m in search.models if m.physical and m.window is None]
-    if not physical:
-        return True
-    best = max(physical, key=lambda m: m.weight)
-    if search.exact:
-        return explain.removed(search, best) < 0.99999
-    return search.examine(best).p_value < 0.05
-
-
 def _embeddable(search: Search) -> list[str]:
     """The base's calibrated parameters without unknown initial states."""
     base = [search.base.problem.parameters[i].name for i in search.base.free]
@@ -293,7 +284,7 @@ def _result(
         search.examine(shown)
     base = explain.fit_record(search.base, search.structure, ())
     final = base if best is None else explain.fit_record(best.found, best.structure, best.names)
-    _warn(search)
+    _warn(search, decision.verdict)
     before = _scores(search, search.base, mask)
     after = None if best is None else _scores(search, best.found, mask)
     if best is None:
@@ -341,6 +332,7 @@ def _result(
         settings={
             "seed": seed,
             "withdrawn": decision.withdrawn,
+            "doubt": decision.doubt,
             "nearly": decision.nearly,
             "region": None if best is None else best.where,
             "solver": _solver(search.problem.simulator),
@@ -377,11 +369,20 @@ def _improved(simulator: Simulator, best: Model) -> Simulator:
     return improved
 
 
-def _warn(search: Search) -> None:
+def _warn(search: Search, verdict: str) -> None:
     if search.base.agreeing < 0.2:
         warnings.warn(
             f"Only {search.base.agreeing:.0%} of the base's starting values came to the best fit. Give initial= or "
             "bounds to its parameters, or more num_starts.",
+            ConvergenceWarning,
+            stacklevel=4,
+        )
+    recording, found = search.problem.recording, search.base
+    size = float((found.residual / recording.spread[found.problem.index]).square().mean().sqrt())
+    if verdict == "unexplained" and size > NO_BETTER:
+        warnings.warn(
+            f"The calibrated base explains no more than a constant would (its RMSE is {size:.2g} of the data's "
+            "spread). Check the units and the simulator, and give initial= or bounds to its parameters.",
             ConvergenceWarning,
             stacklevel=4,
         )

@@ -19,6 +19,8 @@ LONE = 4.5
 BENT = 10.0
 #: Share of supposed outliers with another one as nearest neighbour above which they are no outliers.
 TOGETHER = 0.4
+#: Probability of as many of them at one value of a condition by chance, below which they are no outliers.
+CHANCE = 0.05
 
 
 def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
@@ -127,15 +129,33 @@ def _alone(r: Tensor, off: Tensor, least: float) -> Tensor:
 def _clustered(problem: Problem, places: Tensor, high: Tensor) -> bool:
     """Whether data that stick out lie together among the conditions, as outliers do not."""
     count = int(high.sum())
-    if count < 3:
-        return False
     x = problem.recording.x
     columns = [c[problem.condition_of[places]] for c in (x.values() if isinstance(x, dict) else [x])]
-    ranks = torch.stack([c.argsort().argsort().double() for c in columns], dim=-1)
+    if any(_one_level(column, high) for column in columns):
+        return True
+    if count < 3:
+        return False
+    ranks = torch.stack([c.unique(return_inverse=True)[1].double() for c in columns], dim=-1)
+    ranks = ranks * (len(places) / (ranks.amax(0) + 1))
     distance = torch.cdist(ranks[high], ranks)
     distance[torch.arange(count), high.nonzero()[:, 0]] = math.inf
     together = float(high[distance.argmin(1)].double().mean())
     return together > TOGETHER
+
+
+def _one_level(column: Tensor, high: Tensor) -> bool:
+    """Whether more data that stick out share one value of a condition than chance would have it."""
+    levels, which = column.unique(return_inverse=True)
+    count = int(high.sum())
+    if count < 2 or 2 * len(levels) > len(column):
+        return False
+    there = torch.bincount(which[high], minlength=len(levels)).tolist()
+    share = (torch.bincount(which, minlength=len(levels)).double() / len(column)).tolist()
+    least = min(
+        sum(math.comb(count, k) * q**k * (1 - q) ** (count - k) for k in range(seen, count + 1))
+        for seen, q in zip(there, share, strict=True)
+    )
+    return least * len(levels) < CHANCE
 
 
 def _robust_left(columns: Tensor, values: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from torchcal.discovery.likeliest import alone, log_likelihood, settled
 from torchcal.discovery.model import PRIOR, Model
 from torchcal.discovery.noise import Noise, mine
 from torchcal.discovery.outliers import lone, spikes
+from torchcal.discovery.problem import Problem
 
 if TYPE_CHECKING:
     from torchcal.discovery.search import Search
@@ -22,6 +23,10 @@ __all__ = ["fits_by_chance", "other_growth", "outliers", "suited", "weigh_alone"
 
 #: Log evidence of a model from which on what sticks out of it alone are outliers, and how many these may be.
 CLEAR, MOST_OUTLIERS = 10.0, 0.1
+#: Models that are fitted again with their own noise at the end.
+SETTLED = 10
+#: How often what sticks out is judged anew without it.
+TRIMS = 3
 #: Log odds from which on something unknown is clearly likelier than the best model.
 LIKELIER = 3.0
 #: χ² a datum below which the noise estimated is its least, not the misfit's size: a residual so far below is rounding.
@@ -50,8 +55,10 @@ def weigh_alone(search: "Search") -> tuple[float, float]:
     """
     base = settled(search.base, search.noise, search.tangents)[1]
     here = log_likelihood(search.base, search.noise, search.tangents) - base
+    leading = sorted(search.models, key=lambda m: -m.weight)[:SETTLED]
     for model in search.models:
-        found = alone(model.found, search.noise, search.tangents)[1] - base
+        judge = settled if model in leading else alone  # fitted again with its own noise, as the base is
+        found = judge(model.found, search.noise, search.tangents)[1] - base
         model.in_use = search.gain(model.found.chi2) + here + model.price
         model.log_evidence = max(found + model.price, model.in_use)
     best = search.leader
@@ -112,12 +119,27 @@ def outliers(search: "Search", observed: Tensor) -> Tensor | None:
     best = search.leader
     if search.exact or best is None or best.log_evidence < CLEAR:
         return None
-    given = search.problem.recording.noise
-    whole = dataclasses.replace(best.found.problem, keep=observed)
-    found = refit(best.found, search.noise.whitening(whole), whole)  # what was set aside may be the effect itself
+    found, keep = best.found, observed
+    for _ in range(TRIMS):  # what sticks out most draws the fit to itself, and off what sticks out less
+        fitted = dataclasses.replace(best.found.problem, keep=keep)
+        found = refit(found, search.noise.whitening(fitted), fitted)
+        before, keep = keep, observed  # what was set aside may be the effect itself
+        for _ in range(2):  # beside what sticks out most an end of a recording is not judged
+            problem = dataclasses.replace(best.found.problem, keep=keep)
+            y = problem.evaluate(found.values[None], [], found.warm)[0][0]
+            keep = keep & ~_sticking(search, problem, problem.y - y)
+        if torch.equal(keep, before):
+            break
+    sticking = observed & ~keep
+    return sticking if float(sticking.sum()) <= MOST_OUTLIERS * float(observed.sum()) else None
+
+
+def _sticking(search: "Search", problem: Problem, residual: Tensor) -> Tensor:
+    """Data that stick out alone of what a model leaves, bool ``(n_total,)``."""
+    given = problem.recording.noise
     sd = given if isinstance(given, Tensor) else None
-    residual = found.residual / search.noise.unit[whole.index] if search.noise.open else found.residual
-    bad = spikes(whole, residual, sd) | lone(whole, residual, sd)
-    sticking = torch.zeros_like(observed)
-    sticking[whole.index[bad]] = True
-    return sticking if float(bad.double().mean()) <= MOST_OUTLIERS else None
+    if search.noise.open:
+        residual = residual / search.noise.unit[problem.index]
+    found = torch.zeros_like(problem.keep)
+    found[problem.index] = spikes(problem, residual, sd) | lone(problem, residual, sd)
+    return found

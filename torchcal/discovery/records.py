@@ -295,7 +295,8 @@ class MissingRate:
         rate: Estimate there, ``(m,)``, in ``unit``.
         sd: Its standard deviation, ``(m,)``.
         unit: Unit of the rate.
-        time: Times of the grid along the calibrated trajectory, ``(T,)``; conditions' index for a static one.
+        time: Times of the grid along the calibrated trajectory, ``(T,)``; the conditions' rows in the
+            recording for a static one.
         along: Estimate along that grid, ``(T,)``.
     """
 

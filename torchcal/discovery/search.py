@@ -33,6 +33,9 @@ UNPHYSICAL = math.log(1e-3)
 MOST = 40
 #: Refitted in any case: this many, and those with at least this share of the largest score.
 FEW, CHANCE = 6, 0.2
+#: Shapes that a refit begins at, by their tangents; the same where the base misses the data by more than the root of
+#: `FAR` noise sd.
+SHAPES, SHAPES_FAR, FAR = 3, 8, 30.0
 #: Shares of the linear estimate from which refits begin.
 STEPS = (0.05, 1.0)
 #: Log evidence by which something unknown must explain the base's residual better than any noise, to be there.
@@ -201,6 +204,8 @@ class Search:
         if len(usable) == 0:
             return self._blind_begin(candidate)
         rows, used = [], set()
+        # The tangents of an effect that is far from small say little of which shape it has.
+        far = not self.exact and self.base.chi2 > FAR * self.problem.n
         for column in usable[self.screening.z[usable].argsort(descending=True)].tolist():
             g = int(self.screening.shape[column])
             if g in used:
@@ -208,9 +213,9 @@ class Search:
             used.add(g)
             a = int(self.screening.amplitude[column])
             signed = float(self.screening.columns[:, column] @ self.residual.e) / float(self.screening.norm[column])
-            for factor in STEPS if len(used) == 1 else STEPS[:1]:
+            for factor in STEPS if len(used) == 1 or far else STEPS[:1]:
                 rows.append(self._step_along(candidate, g, a, factor * signed))
-            if len(used) == 3:
+            if len(used) == (SHAPES_FAR if far else SHAPES):
                 break
         return torch.stack(rows)
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from torchcal.discovery import explain, verify
+from torchcal.discovery.doubts import distinct, doubt
 from torchcal.discovery.model import PRIOR, Model
 from torchcal.discovery.own_noise import weigh_alone
 from torchcal.discovery.records import NONE
@@ -14,10 +15,14 @@ from torchcal.discovery.structure import Structure
 
 __all__ = ["Decision", "base_alone", "decide"]
 
-#: A hypothesis is named when it has at least this probability among those the library offers.
+#: A hypothesis is named when it has at least this probability among those of no more terms that the library offers.
 NAMED = 0.97
+#: The same among hypotheses of more terms too.
+NAMED_AMONG_LARGER = 0.8
 #: And at least this among all, "none of these" and the base included.
 SURE = 0.7
+#: The same of one beside which something else is likely: two wrong ones can do together what none of these does alone.
+SURE_OF_PART = 0.85
 #: Log odds behind the best model up to which one with fewer terms may be named for what all share.
 BEHIND = 5.0
 #: Structure left after a hypothesis with less probability than this by noise alone speaks against it.
@@ -32,8 +37,6 @@ LARGER, CHANCE = 1.25, 3.0
 NOTHING = 0.02
 #: Data a free parameter below which a fit without held-out data names nothing.
 LEAST_FITTED = 4
-#: Correlation from sample to sample from which on noise of unknown size may be physics that a window has left.
-SLOWEST = 0.85
 #: Of the tied hypotheses, those that together have this probability are listed.
 TIED = 0.98
 #: Of a recording without noise, the share of the held-out misfit that a named term must remove.
@@ -55,6 +58,7 @@ class Decision:
         base: Probability of the base alone.
         none_evidence: Log weight of something that is not in the library.
         withdrawn: Why a name was withdrawn, in words.
+        doubt: Why the best explanation is no name, though probable, in words.
         nearly: Whether what is left is not white, and the name rests on the share of the misfit that it removes.
     """
 
@@ -68,6 +72,7 @@ class Decision:
         self.base = 1.0
         self.none_evidence = 0.0
         self.withdrawn = ""
+        self.doubt = ""
         self.nearly = False
 
 
@@ -128,7 +133,7 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         if (
             best.weight > white[0].weight - BEHIND  # what all likely models share is a name, but not of a bad fit
             and set(best.names) <= set(white[0].names)
-            and _certainty(groups, best) >= NAMED
+            and _certain(groups, best)
             and not _other_names(search, best)
         ):
             _name(search, decision, best, mask)
@@ -147,6 +152,8 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
             break  # no better than the base is no explanation
         seen.add(names)
         covered += groups[names]
+        if any(set(tied) < names for tied in decision.tied):
+            continue  # one that is listed, and more
         decision.tied.append(list(model.names))
         decision.tied_models.append(model)
         _tie_other_names(search, model, decision)
@@ -188,13 +195,14 @@ def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) 
     """Name what a model adds, if it is probable enough and the held-out data do not object."""
     holding = [m for m in search.models if set(best.names) <= set(m.names)]
     sure = sum(decision.probability[id(m)] for m in holding)
-    slow = search.noise.open and float(search.noise.correlation.max()) >= SLOWEST
-    if sure < SURE or (slow and best.window is not None):
+    larger = sum(decision.probability[id(m)] for m in holding if len(m.names) > len(best.names))
+    alone = larger <= sure - larger
+    decision.doubt = doubt(search, best)
+    if sure < (SURE if alone else SURE_OF_PART) or decision.doubt:
         decision.verdict = "ambiguous"
         decision.tied, decision.tied_models = [list(best.names), list(NONE)], [best]
         return
-    larger = sum(decision.probability[id(m)] for m in holding if len(m.names) > len(best.names))
-    if larger > sure - larger:
+    if not alone:
         best = _wherever(search, decision, best)
         _tie_larger(decision, holding, sure)
     decision.verdict, decision.best = "named", best
@@ -255,16 +263,22 @@ def _groups(models: Sequence[Model]) -> dict[frozenset[str], float]:
     return found
 
 
-def _certainty(groups: dict[frozenset[str], float], model: Model) -> float:
-    """Probability that all of a model's terms are there, whatever else is."""
-    return sum(share for names, share in groups.items() if names >= frozenset(model.names))
+def _certain(groups: dict[frozenset[str], float], model: Model) -> bool:
+    """Whether all of a model's terms are there, whatever else is.
+
+    Several others together can copy almost anything, and are the rarer the more they are: against them less will do.
+    """
+    own = frozenset(model.names)
+    holding = sum(share for names, share in groups.items() if names >= own)
+    others = sum(share for names, share in groups.items() if not names >= own and len(names) <= len(own))
+    return holding >= NAMED * (holding + others) and holding >= NAMED_AMONG_LARGER
 
 
 def _gain(search: Search, model: Model, mask: Tensor | None, against: Model | None = None) -> float:
     """Share of the squared misfit of the base, or of another model, that a model removes on held-out data."""
     before = search.base if against is None else against.found
     if mask is None:  # what was fitted proves nothing where there are few data a parameter
-        enough = search.problem.n >= LEAST_FITTED * len(model.found.free)
+        enough = distinct(search.problem) >= LEAST_FITTED * len(model.found.free)
         return 1.0 - model.found.chi2 / before.chi2 if enough else 0.0
     seen = mask & search.problem.keep
     if not bool(seen.any()):
@@ -290,8 +304,13 @@ def _nearly(search: Search, ranked: list[Model], mask: Tensor | None, decision: 
         best = mine[0]
         if explain.removed(search, best) < NEARLY or _gain(search, best, mask) < REMOVED:
             continue
+        if best.found.chi2 > (1 - REMOVED) * search.base.chi2 or doubt(search, best):
+            continue  # noise is most of what is left, and of what there was
         left = 1.0 - explain.removed(search, best)
-        rivals = [m for m in mine[1:] if frozenset(m.names) != frozenset(best.names)]
+        rivals = [
+            m for m in ranked
+            if not m.note and len(m.numbers) <= size and frozenset(m.names) != frozenset(best.names)
+        ]  # fmt: skip
         if not _other_names(search, best) and all(1.0 - explain.removed(search, m) > BEATEN * left for m in rivals):
             decision.verdict, decision.best, decision.nearly = "named", best, True
             _prove(search, decision, mask)

@@ -22,9 +22,11 @@ __all__ = ["refit_local", "refit_window"]
 #: Refits at most; of one candidate; around one refitted term; how many of those, and how many more of terms that the
 #: base has everywhere.
 MOST, MOST_EACH, MOST_AROUND, LEADING, HELD = 10, 2, 2, 3, 1
+#: Score below which a window promises nothing.
+LEAST_SCORE = 3.5
 #: How often windows are sought anew around the leading terms.
 ROUNDS = 2
-#: Log evidence below the best up to which a local model's edges are made sharp.
+#: Log evidence below the best up to which a local model's edges are made sharp, and is its window's best.
 CLOSE = 10.0
 #: Share of a window within another one along the same driver from which on they are one start.
 ALIKE = 0.7
@@ -48,7 +50,7 @@ def refit_local(search: Search) -> None:
     promising: dict[int, list[Window]] = {}
     for w in sorted(search.local, key=lambda w: -w.z):
         plain = max(gains.get(w.candidate, 0.0), search.screening.score(w.candidate) ** 2)
-        if w.candidate not in same and w.z > 3.5 and w.z**2 > max(plain + 6.0, highest - 10.0):
+        if w.candidate not in same and w.z > LEAST_SCORE and w.z**2 > max(plain + 6.0, highest - 10.0):
             promising.setdefault(w.candidate, []).append(w)
     prior = math.log(PRIOR["local"] / max(len(search.candidates), 1))
     spans = {name: Span.of(driver) for name, driver in search._drivers().items()} if promising else {}
@@ -69,7 +71,31 @@ def refit_local(search: Search) -> None:
             for w in _around(search, model)[:MOST_AROUND]:
                 _keep(search, refit_window(search, w, prior, model))
     search.reweigh()
+    if _rivals(search, prior):
+        search.reweigh()
     _refine_edges(search, prior)
+
+
+def _rivals(search: Search, prior: float) -> bool:
+    """Hold what leads in a window against the other candidates in that window: in a short one many do the same.
+
+    Returns whether there was any.
+    """
+    lead = max((m for m in search.models if m.physical), key=lambda m: m.weight, default=None)
+    if lead is None or lead.window is None:
+        return False
+    w = lead.window
+    tried = {
+        m.numbers[0] for m in search.models
+        if m.window is not None and m.window.driver == w.driver and m.weight > lead.weight - CLOSE
+    }  # fmt: skip
+    others: dict[int, Window] = {}
+    for other in sorted(search.local, key=lambda other: -other.z):
+        if other.driver == w.driver and other.z > LEAST_SCORE and other.candidate not in {*tried, *search.gone}:
+            others.setdefault(other.candidate, other)
+    for other in others.values():
+        _keep(search, refit_window(search, dataclasses.replace(other, low=w.low, high=w.high), prior))
+    return bool(others)
 
 
 def _different(ranked: list[Window], spans: dict[str, Span]) -> list[Window]:
@@ -91,13 +117,13 @@ def _different(ranked: list[Window], spans: dict[str, Span]) -> list[Window]:
 
 
 def _refine_edges(search: Search, prior: float) -> None:
-    """The best local models again with edges as steep as the data want, where the usual ones leave something behind."""
+    """The best local models again with edges as steep as the data want."""
     ranked = sorted((m for m in search.models if m.physical), key=lambda m: -m.weight)
     if not ranked:
         return
     least = ranked[0].log_evidence - max(CLOSE, 0.02 * ranked[0].log_evidence)
     for model in ranked[:MOST]:
-        if model.window is None or model.log_evidence < least or search.examine(model).p_value >= PLAINLY_WHITE:
+        if model.window is None or model.log_evidence < least:
             continue
         w = dataclasses.replace(model.window, amplitude=_amplitude(search, model)[2])
         span = Span.of(search._drivers()[w.driver])
@@ -159,7 +185,7 @@ def _around(search: Search, model: Model) -> list[Window]:
     named = search._drivers()
     kept: dict[str, Window] = {}
     for w in sorted(windows_of(model.numbers[0], residual, response, drivers, sign)[0], key=lambda w: -w.z):
-        if w.driver in named and w.driver not in kept and w.z > 3.5:
+        if w.driver in named and w.driver not in kept and w.z > LEAST_SCORE:
             kept[w.driver] = w
     return list(kept.values())
 

@@ -7,7 +7,6 @@ from typing import Any
 
 from torchcal.discovery.channels import RUN
 from torchcal.discovery.records import NONE
-from torchcal.discovery.verdict import SLOWEST
 
 __all__ = ["paragraph", "percent"]
 
@@ -168,7 +167,7 @@ def _proof(d: Any) -> str:
             f"; on {b.n} data kept from both fits from {b.rmse:.4g} to {a.rmse:.4g} (log score {b.log_score:.3g} to "
             f"{a.log_score:.3g}, 95 % intervals hold {percent(b.coverage)}, then {percent(a.coverage)})"
         )
-    if d.before.model_error_sd is not None and d.after.model_error_sd is not None:
+    if d.before.model_error_sd and d.after.model_error_sd is not None:
         text += (
             f". The embedded model-error sd shrinks from {d.before.model_error_sd:.3g} to {d.after.model_error_sd:.3g}"
         )
@@ -197,7 +196,7 @@ def _named(d: Any) -> list[str]:
         behind = top.log_evidence - rival.log_evidence
         stands = f"stands {behind:.1f} natural-log units of evidence behind"
         if behind < 0:
-            stands = f"has {-behind:.1f} natural-log units more evidence, and far less probability beforehand"
+            stands = f"has {-behind:.1f} natural-log units more evidence, and a probability of {rival.probability:.2g}"
         parts.append(f"The next best{' without it' if d.tied else ''}, {_and(list(rival.terms))}, {stands}.")
     parts.append(_proof(d))
     if d.tied:
@@ -234,14 +233,8 @@ def _ambiguous(d: Any) -> list[str]:
     known = [tied for tied in d.tied if tuple(tied) != NONE]
     if len(known) == 1:
         sure = sum(row.probability for row in d.ranking if set(known[0]) <= set(row.terms))
-        best = max((row for row in d.ranking if set(row.terms) == set(known[0])), key=lambda row: row.probability)
-        slowest = max(d.noise.correlation.values(), default=0.0)
-        if best.region and d.noise.source == "estimated" and slowest >= SLOWEST:
-            return [
-                _where(d),
-                f"{_and(known[0])} explains it best, in a window, but what that leaves is so slow that it may as well "
-                "be physics as noise: a known noise sd, replicates or a repeated run would tell.",
-            ]
+        if d.settings.get("doubt"):
+            return [_where(d), f"{_hypothesis(d, known[0])} explains it best, {d.settings['doubt']}"]
         return [
             _where(d),
             f"{_and(known[0])}, the best explanation in the library, has a probability of {sure:.2f} only, which is too"
@@ -265,8 +258,8 @@ def _unexplained(d: Any) -> list[str]:
     best = next((row for row in d.ranking if row.terms and row.refitted), None)
     if best is not None:
         parts.append(
-            f"The best of the library, {_and(list(best.terms))}, removes {percent(best.misfit_removed)} of the misfit "
-            "beyond noise" + (f" ({best.note})" if best.note else "") + "."
+            f"The best of the library, {_hypothesis(d, best.terms)}, removes {percent(best.misfit_removed)} of the "
+            "misfit beyond noise" + (f" ({best.note})" if best.note else "") + "."
         )
     if d.settings.get("withdrawn"):
         parts.append(d.settings["withdrawn"])

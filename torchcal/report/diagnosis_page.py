@@ -189,11 +189,12 @@ def _where(diagnosis: Any, units: Mapping[str, str]) -> str:
 
 def _ranking(diagnosis: Any) -> str:
     chosen = set(_get(diagnosis, "terms"))
+    region = getattr(diagnosis, "settings", {}).get("region")
     tied = {frozenset(terms) for terms in _get(diagnosis, "tied")}
     hypotheses = sorted(_get(diagnosis, "ranking"), key=lambda item: -_comparable(item.log_evidence))
     rows, marked = [], []
     for place, item in enumerate(hypotheses):
-        is_chosen = bool(chosen) and set(item.terms) == chosen
+        is_chosen = bool(chosen) and set(item.terms) == chosen and item.region == region
         remarks = ["accepted"] if is_chosen else ["tied"] if frozenset(item.terms) in tied else []
         remarks += [] if item.physical else ["not physical"]
         remarks += [item.region] if item.region else []

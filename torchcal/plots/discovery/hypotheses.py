@@ -16,6 +16,7 @@ def ranking(
     hypotheses: Iterable[Any],
     *,
     accepted: Sequence[str] = (),
+    region: str | None = None,
     tied: Iterable[Sequence[str]] = (),
     value: str = "log_evidence",
     most: int = 12,
@@ -28,6 +29,7 @@ def ranking(
         hypotheses: Each with ``terms`` (empty for the base), ``log_evidence`` (natural logarithm, relative to the
             base), ``probability`` and ``physical``; ``region`` in words where it acts there alone.
         accepted: Terms of the accepted hypothesis.
+        region: Where these act, if locally: other rows of the same terms are other hypotheses.
         tied: Each the terms of a hypothesis that the data cannot tell from the best.
         value: What the bars show: ``"log_evidence"`` or ``"probability"``.
         most: Largest number of bars; the base, "none of these" and the tied ones are among them.
@@ -66,7 +68,7 @@ def ranking(
     def kind(item: Any) -> str:
         if not item.terms or tuple(item.terms) == NONE:
             return "base, or none of these"
-        if chosen and frozenset(item.terms) == chosen:
+        if chosen and frozenset(item.terms) == chosen and getattr(item, "region", None) == region:
             return "accepted"
         if not item.physical:
             return "not physical"

@@ -173,7 +173,13 @@ def figure_parts(diagnosis: Any) -> list[FigurePart]:
                 "Ranking of the hypotheses",
                 "Log evidence against the base model, ln K, and probability among all hypotheses considered.",
                 lambda fig: _ignore(
-                    ranking(hypotheses, accepted=diagnosis.terms, tied=diagnosis.tied, ax=fig.subplots())
+                    ranking(
+                        hypotheses,
+                        accepted=diagnosis.terms,
+                        region=getattr(diagnosis, "settings", {}).get("region"),
+                        tied=diagnosis.tied,
+                        ax=fig.subplots(),
+                    )
                 ),
                 7.0,
                 max(3.2, 1.4 + 0.26 * bars),

@@ -1,0 +1,254 @@
+"""When the best explanation is a name, and when it is none."""
+
+import numpy as np
+import pytest
+import torch
+
+import torchcal as tc
+from torchcal.discovery import doubts, outliers
+from torchcal.discovery.problem import Problem
+from torchcal.discovery.search import Search
+from torchcal.errors import ConvergenceWarning
+
+F64 = torch.float64
+CHANGES = {"offset": lambda x, y: 1.0, "gain": lambda x, y: y, "drift": lambda x, y: x, "cubic": lambda x, y: x**3}
+
+
+def diagnose(simulator, recording, terms, **options):
+    return tc.diagnose(simulator, recording, terms, **{"seed": 0, "progress": False, **options})
+
+
+def added(name, form):
+    """A term that adds ``c`` times a form of the condition and the output."""
+    return tc.Term(name, outputs={"y": lambda x, p, y: y + p["c"] * form(x, y)}, parameters=[tc.Parameter("c")])
+
+
+def straight(names="ab"):
+    return tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter(name) for name in names])
+
+
+def normal(n, seed):
+    return torch.as_tensor(np.random.default_rng(seed).standard_normal(n))
+
+
+def correlated(n, seed, rho):
+    e = normal(n, seed).tolist()
+    for k in range(1, n):
+        e[k] = rho * e[k - 1] + (1 - rho**2) ** 0.5 * e[k]
+    return torch.tensor(e, dtype=F64)
+
+
+# --- windows -------------------------------------------------------------------------------------------------------
+
+
+def test_what_leads_in_a_window_is_held_against_all_others_there():
+    # In a short window a bump that nothing in the library is looks like an offset, a gain or a drift alike.
+    x = torch.linspace(1, 11, 110, dtype=F64)
+    bump = 0.4 * torch.exp(-0.5 * ((x - 6) / 0.5).square())
+    terms = [added(name, form) for name, form in CHANGES.items()]
+    d = diagnose(straight(), tc.Recording(x=x, y=1 + 0.5 * x + bump + 0.05 * normal(110, 13)), terms)
+    assert d.verdict in ("ambiguous", "unexplained")
+    inside = [row for row in d.ranking if row.region and row.refitted and row.misfit_removed > 0.9]
+    assert len({row.terms for row in inside}) >= 2
+
+
+def test_edges_are_as_steep_as_the_data_want_before_anything_else_is_likelier():
+    x = torch.linspace(0, 10, 120, dtype=F64)
+    y = 1 + 0.5 * x + 0.4 * (x < 4.2) + 0.05 * normal(120, 28)
+    terms = [added(name, form) for name, form in CHANGES.items() if name != "drift"]
+    d = diagnose(straight(), tc.Recording(x=x, y=y, noise=0.05), terms)
+    local = [row for row in d.ranking if row.region and row.terms == ("offset",)]
+    assert local[0].probability == max(row.probability for row in d.ranking)
+    assert any(e.name.endswith("edge") for e in local[0].estimates)
+
+
+# --- several -------------------------------------------------------------------------------------------------------
+
+
+def aged(seed, more=0.08):
+    """A response that a bend along one condition is missing from, and a slight one along the other, of some shape."""
+    rng = np.random.default_rng(seed)
+    dose, age = (torch.as_tensor(rng.uniform(0, 2, 80)) for _ in range(2))
+    y = 1 + 0.5 * dose + 0.3 * age + (age - 1) ** 2 + more * dose**2 + 0.05 * torch.as_tensor(rng.standard_normal(80))
+    base = tc.Simulator(
+        lambda x, p: p["a"] + p["b"] * x["dose"] + p["s"] * x["age"], [tc.Parameter(name) for name in "abs"]
+    )
+    shapes = {
+        "age": lambda x, y: (x["age"] - 1) ** 2,
+        "square": lambda x, y: x["dose"] ** 2,
+        "cube": lambda x, y: x["dose"] ** 3,
+        "root": lambda x, y: x["dose"].sqrt(),
+    }
+    terms = [added(name, form) for name, form in shapes.items()]
+    return base, tc.Recording(x={"dose": dose, "age": age}, y=y, noise=0.05), terms
+
+
+def test_what_is_likely_beside_a_name_is_listed():
+    d = diagnose(*aged(1))
+    assert (d.verdict, d.terms) == ("named", ["age"])
+    assert sorted(map(sorted, d.tied)) == [["age"], ["age", "cube"], ["age", "root"], ["age", "square"]]
+    assert 0.0 < d.remaining < 0.05
+    words = str(d).replace("\n", " ")
+    assert "probability alone or with others 0.9" in words
+    assert "Something else acts beside it with a probability of 0.9" in words
+    assert d.experiment is None or d.experiment.description in words
+
+
+def test_what_all_the_tied_share_is_said():
+    d = diagnose(*aged(0))
+    assert d.verdict == "ambiguous"
+    assert all("age" in tied for tied in d.tied)
+    assert "All of them have age." in str(d).replace("\n", " ")
+
+
+def test_pairs_are_weighed_where_one_term_leaves_noise_too():
+    d = diagnose(*aged(3, more=0.0))
+    assert d.terms == ["age"]
+    assert any(len(row.terms) == 2 and row.refitted and row.probability > 0 for row in d.ranking)
+
+
+# --- doubts --------------------------------------------------------------------------------------------------------
+
+
+def bent(bend=0.14, seed=24):
+    rng = np.random.default_rng(seed)
+    x = torch.as_tensor(np.sort(rng.uniform(0, 2, 60)))
+    return x, 1 + 0.5 * x + bend * x**2 + 0.1 * torch.as_tensor(rng.standard_normal(60))
+
+
+SQUARE = added("square", lambda x, y: x**2)
+
+
+def test_one_that_alone_is_likelier_than_the_base_is_no_name_beside_many_that_are_not():
+    # Each of the waves is less probable than the base; together they have a twentieth of what the candidates share.
+    x, y = bent()
+    waves = [added(f"wave {k}", lambda x, y, k=k: torch.cos(k * torch.pi * x)) for k in range(2, 10)]
+    d = diagnose(straight(), tc.Recording(x=x, y=y, noise=0.1), [SQUARE, *waves], max_terms=1)
+    assert d.ranking[0].terms == ("square",)
+    assert d.ranking[0].probability > 0.7
+    assert (d.verdict, d.tied) == ("ambiguous", [["square"], ["none of these"]])
+
+
+@pytest.mark.parametrize(
+    ("constant", "value", "words"),
+    [
+        ("OPEN", 0.0, "leave its size open"),
+        ("SLOWEST", -1.0, "may as well be physics as noise"),
+        ("EVEN", 9.0, "may as well be physics as noise"),
+    ],
+)
+def test_a_doubt_is_said_instead_of_a_name(monkeypatch, constant, value, words):
+    x, y = bent(bend=1.0)
+    problem = straight(), tc.Recording(x=x, y=y), [SQUARE]
+    assert diagnose(*problem).terms == ["square"]
+    monkeypatch.setattr(doubts, constant, value)
+    d = diagnose(*problem)
+    assert (d.verdict, d.tied) == ("ambiguous", [["square"], ["none of these"]])
+    assert words in str(d).replace("\n", " ")
+
+
+def test_replicates_are_no_more_conditions():
+    # Five temperatures, each ten times: four parameters fit whatever curve there is.
+    x = torch.linspace(0, 2, 5, dtype=F64).repeat_interleave(10)
+    y = 1 + 0.5 * x + torch.sin(3 * x) + 0.05 * normal(50, 1)
+    terms = [SQUARE, added("cube", lambda x, y: x**3), added("fourth", lambda x, y: x**4)]
+    d = diagnose(straight(), tc.Recording(x=x, y=y), terms)
+    assert d.verdict != "named"
+    problem = Problem.of(straight(), tc.Recording(x=x, y=y))
+    assert doubts.distinct(problem) == 5
+
+
+def test_an_abrupt_change_that_slow_noise_stands_in_for_is_no_name():
+    # Cooling that weakens by a third at once; the library has a slow loss alone, and the noise is not given.
+    t = torch.linspace(0, 60, 121, dtype=F64)
+    k = torch.where(t < 25, 0.08, 0.05)
+    steps = torch.cat([torch.zeros(1, dtype=F64), 0.5 * (k[1:] + k[:-1]) * (t[1:] - t[:-1])])
+    outside = 20 + 5 * torch.sin(t / 3)
+    y = torch.zeros_like(t)
+    y[0] = 90.0
+    for i in range(1, len(t)):  # exact where outside and k are constant
+        y[i] = outside[i] + (y[i - 1] - outside[i]) * torch.exp(-steps[i])
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"T": -p["k"] * (s["T"] - u["outside"])}, {"T": "degC"},
+        [tc.Parameter("k", low=0.0, high=1.0, initial=0.07)],
+    )  # fmt: skip
+    fouling = tc.Term(
+        "fouling", shifts={"k": lambda t, s, p, u: -p["d"] * (1 - torch.exp(-t / p["tau"]))},
+        parameters=[tc.Parameter("d", low=0.0, high=0.08), tc.Parameter("tau", low=1.0, high=100.0, neutral=None)],
+    )  # fmt: skip
+    run = tc.Run(time=t, outputs={"T": y + 0.03 * normal(121, 11)}, inputs={"outside": outside})
+    d = diagnose(base, tc.Recording(runs=[run]), [fouling])
+    assert d.verdict != "named"
+
+
+def test_noise_along_the_rows_of_a_grid_is_given_no_name():
+    inhibitor, dose = (c.flatten() for c in torch.meshgrid(
+        torch.linspace(0, 3, 4, dtype=F64), torch.linspace(0.2, 5, 15, dtype=F64), indexing="ij"))  # fmt: skip
+    base = tc.Simulator(
+        lambda x, p: p["v"] * x["S"] / (p["k"] + x["S"]),
+        [tc.Parameter("v", low=0.0, initial=1.0), tc.Parameter("k", low=0.1, high=9.0, initial=1.0)],
+    )
+    terms = [
+        tc.Term("competitive", shifts={"k": lambda x, p: p["c"] * x["I"]}, parameters=[tc.Parameter("c")]),
+        tc.Term("uncompetitive", shifts={"v": lambda x, p: p["c"] * x["I"]}, parameters=[tc.Parameter("c")]),
+        added("offset", lambda x, y: 1.0),
+    ]
+    for seed in range(6):
+        y = 1.2 * dose / (0.9 + dose) + 0.05 * correlated(60, seed, 0.6)
+        assert diagnose(base, tc.Recording(x={"I": inhibitor, "S": dose}, y=y), terms).verdict != "named"
+
+
+# --- noise and detection --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("rows", "together"), [([0, 2, 3], True), ([0, 7, 19], False), ([4], False)])
+def test_data_that_stick_out_at_one_level_of_a_grid_are_no_outliers(rows, together):
+    field, current = (c.flatten() for c in torch.meshgrid(
+        torch.linspace(0.05, 0.8, 5, dtype=F64), torch.linspace(1, 5, 5, dtype=F64), indexing="ij"))  # fmt: skip
+    hall = tc.Simulator(lambda x, p: p["r"] * x["I"] * x["B"], [tc.Parameter("r", initial=1.0)])
+    y = 2.0 * field * current + 0.01 * normal(25, 3)
+    y[rows] += 0.5
+    problem = Problem.of(hall, tc.Recording(x={"B": field, "I": current}, y=y))
+    high = torch.zeros(25, dtype=torch.bool)
+    high[rows] = True
+    assert outliers._clustered(problem, torch.arange(25), high) is together
+
+
+@pytest.mark.parametrize(("p", "verdict"), [(0.005, "named"), (0.03, "named"), (0.2, "consistent")])
+def test_a_base_that_is_improbable_counts_as_a_misfit(monkeypatch, p, verdict):
+    # A statistic for all kinds of misfit sees each kind less well than its own refit does.
+    screen_all = Search.screen_all
+
+    def screened(search):
+        screen_all(search)
+        search.p_detect = p
+
+    monkeypatch.setattr(Search, "screen_all", screened)
+    x, y = bent(bend=1.0)
+    assert diagnose(straight(), tc.Recording(x=x, y=y, noise=0.1), [SQUARE]).verdict == verdict
+    x, y = bent(bend=0.0)
+    assert diagnose(straight(), tc.Recording(x=x, y=y, noise=0.1), [SQUARE]).verdict == "consistent"
+
+
+def test_what_is_missing_says_at_which_conditions():
+    x = torch.linspace(0, 6, 60, dtype=F64)
+    y = 1 + 0.5 * x + 0.4 * torch.sin(3 * x) + 0.02 * normal(60, 4)
+    y[[3, 30]] = torch.nan
+    d = diagnose(straight(), tc.Recording(x=x, y=y, noise=0.02, missing=True), [SQUARE])
+    assert d.verdict == "unexplained"
+    rows = d.missing.time.long().tolist()
+    assert sorted(rows) == [k for k in range(60) if k not in (3, 30)]
+    both = torch.stack([d.missing.along, torch.sin(3 * x[rows])], dim=-1)
+    line = torch.stack([torch.ones(58, dtype=F64), x[rows]], dim=-1)  # which the base makes up for
+    both = both - line @ torch.linalg.lstsq(line, both).solution
+    assert torch.corrcoef(both.T)[0, 1] > 0.95
+
+
+def test_a_base_no_better_than_a_constant_is_warned_of():
+    x = torch.linspace(0, 10, 60, dtype=F64)
+    base = tc.Simulator(
+        lambda x, p: p["a"] * torch.exp(-p["k"] * x), [tc.Parameter("a"), tc.Parameter("k", initial=900.0)]
+    )
+    recording = tc.Recording(x=x, y=3 + torch.sin(x) + 0.02 * normal(60, 2), noise=0.02)
+    with pytest.warns(ConvergenceWarning, match="no more than a constant"):
+        diagnose(base, recording, [SQUARE])
