@@ -132,7 +132,7 @@ def test_one_that_alone_is_likelier_than_the_base_is_no_name_beside_many_that_ar
 @pytest.mark.parametrize(
     ("constant", "value", "words"),
     [
-        ("OPEN", 0.0, "leave its size open"),
+        ("OPEN", 1e9, "leave the size of what it adds open"),
         ("SLOWEST", -1.0, "may as well be physics as noise"),
         ("EVEN", 9.0, "may as well be physics as noise"),
     ],
@@ -158,27 +158,31 @@ def test_replicates_are_no_more_conditions():
     assert doubts.distinct(problem) == 5
 
 
-def test_an_abrupt_change_that_slow_noise_stands_in_for_is_no_name():
-    # Cooling that weakens by a third at once; the library has a slow loss alone, and the noise is not given.
-    t = torch.linspace(0, 60, 121, dtype=F64)
-    k = torch.where(t < 25, 0.08, 0.05)
-    steps = torch.cat([torch.zeros(1, dtype=F64), 0.5 * (k[1:] + k[:-1]) * (t[1:] - t[:-1])])
-    outside = 20 + 5 * torch.sin(t / 3)
-    y = torch.zeros_like(t)
-    y[0] = 90.0
-    for i in range(1, len(t)):  # exact where outside and k are constant
-        y[i] = outside[i] + (y[i - 1] - outside[i]) * torch.exp(-steps[i])
-    base = tc.ODESimulator(
-        lambda t, s, p, u: {"T": -p["k"] * (s["T"] - u["outside"])}, {"T": "degC"},
-        [tc.Parameter("k", low=0.0, high=1.0, initial=0.07)],
-    )  # fmt: skip
-    fouling = tc.Term(
-        "fouling", shifts={"k": lambda t, s, p, u: -p["d"] * (1 - torch.exp(-t / p["tau"]))},
-        parameters=[tc.Parameter("d", low=0.0, high=0.08), tc.Parameter("tau", low=1.0, high=100.0, neutral=None)],
-    )  # fmt: skip
-    run = tc.Run(time=t, outputs={"T": y + 0.03 * normal(121, 11)}, inputs={"outside": outside})
-    d = diagnose(base, tc.Recording(runs=[run]), [fouling])
-    assert d.verdict != "named"
+@pytest.mark.parametrize("shape", ["normal", "Laplace", "spiky"])
+def test_only_noise_of_two_sizes_is_uneven(shape):
+    generator = np.random.default_rng(3)
+    uneven = 0
+    for n in (30, 100, 1000):
+        for _ in range(200):
+            e = generator.laplace(size=n) if shape == "Laplace" else generator.standard_normal(n)
+            if shape == "spiky":
+                e[: n // 10] *= 10
+            uneven += doubts._evenness(torch.as_tensor(e)) < doubts.EVEN
+    # 3 in 1000 by chance at most, of 600; of Laplace's, whose ratio is 0.73, a few among the shortest.
+    assert uneven <= {"normal": 6, "Laplace": 60, "spiky": 600}[shape]
+    assert shape != "spiky" or uneven > 540
+
+
+def test_the_size_of_a_product_is_determined_where_its_factors_are_not():
+    x, y = bent(bend=1.0)
+    product = tc.Term("product", outputs={"y": lambda x, p, y: y + p["c"] * p["d"] * x**2},
+                      parameters=[tc.Parameter("c"), tc.Parameter("d")])  # fmt: skip
+    assert diagnose(straight(), tc.Recording(x=x, y=y, noise=0.1), [product]).terms == ["product"]
+    both = tc.Term("both", outputs={"y": lambda x, p, y: y + p["c"] * x**2 + p["e"] * torch.sin(5 * x)},
+                   parameters=[tc.Parameter("c"), tc.Parameter("e")])  # fmt: skip
+    for seed in range(24, 32):  # the second amplitude is within its sd of zero, now and then far within
+        x, y = bent(bend=1.0, seed=seed)
+        assert diagnose(straight(), tc.Recording(x=x, y=y, noise=0.1), [both]).terms == ["both"]
 
 
 def test_noise_along_the_rows_of_a_grid_is_given_no_name():
@@ -193,9 +197,17 @@ def test_noise_along_the_rows_of_a_grid_is_given_no_name():
         tc.Term("uncompetitive", shifts={"v": lambda x, p: p["c"] * x["I"]}, parameters=[tc.Parameter("c")]),
         added("offset", lambda x, y: 1.0),
     ]
+    z = []
     for seed in range(6):
-        y = 1.2 * dose / (0.9 + dose) + 0.05 * correlated(60, seed, 0.6)
-        assert diagnose(base, tc.Recording(x={"I": inhibitor, "S": dose}, y=y), terms).verdict != "named"
+        recording = tc.Recording(
+            x={"I": inhibitor, "S": dose}, y=1.2 * dose / (0.9 + dose) + 0.05 * correlated(60, seed, 0.6)
+        )
+        z.append(doubts._along_rows(Problem.of(base, recording), correlated(60, seed, 0.6)))
+        assert diagnose(base, recording, terms).verdict != "named"
+    assert min(z) > 2.0
+    assert max(z) > doubts.ALONG
+    white = [doubts._along_rows(Problem.of(base, recording), normal(60, seed)) for seed in range(200)]
+    assert sum(found > doubts.ALONG for found in white) <= 2  # 1 in 2000 by chance
 
 
 # --- noise and detection --------------------------------------------------------------------------------------------

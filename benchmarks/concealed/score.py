@@ -16,8 +16,8 @@ What the numbers mean:
 - *precision*: share of right names among all names given, nulls and effects outside the library included.
 - *no wrong name*: share of the recordings with names in which every name given was planted, whether or not all that was
   planted was named.
-- Of two terms, one named and the other reported as remaining (`REMAINS` of the misfit or more, or a list of what is
-  likely beside the name) counts as half.
+- Of two terms, one named and the other reported as remaining (`REMAINS` of the misfit or more, or both
+  among what is listed beside the name) counts as half.
 - *right equation*: the first place of ``where``, or the named term, acts on an equation or output of the effect.
 - *region F1*: overlap of the samples in the reported and in the planted region; 0 where nothing was found.
 - *held-out ratio*: RMSE against the noise-free truth on held-out samples, with the named term over without.
@@ -152,7 +152,7 @@ def credit(result: Mapping[str, Any], answer: Mapping[str, Any]) -> float:
     if exact(terms, answer, result):
         return 1.0
     one_of_two = answer["kind"] == "two" and len(terms) == 1 and matches(terms, answer, result) == 1
-    reported = (result["remaining"] or 0.0) >= REMAINS or bool(result["tied"])
+    reported = (result["remaining"] or 0.0) >= REMAINS or any(exact(t, answer, result) for t in result["tied"])
     return 0.5 if one_of_two and reported else 0.0
 
 

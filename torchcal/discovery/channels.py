@@ -132,9 +132,8 @@ def _bin_means(bins: Tensor, count: int, steps: Tensor) -> Tensor:
 
 def _time(problem: Problem) -> Tensor:
     """Time, or the condition's number, of every datum ``(n,)``."""
-    if problem.in_time and problem.order is not None:
-        return problem.order[problem.condition_of]
-    return problem.condition_of.double()
+    at = problem.condition_of
+    return problem.order[at] if problem.in_time and problem.order is not None else at.double()
 
 
 def _rate_unit(unit: str | None, time: str) -> str | None:

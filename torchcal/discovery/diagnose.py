@@ -153,7 +153,7 @@ def diagnose(
             search.calibrate_base()
             detected = _refit(search, confidence)
         if detected and terms:
-            refit_several(search)  # two may do what one does that is white by itself
+            refit_several(search)
         decision = decide(search, detected, mask)
         return _result(search, decision, simulator, recording, mask, confidence, begun, given, seed)
     finally:
@@ -295,8 +295,9 @@ def _result(
     if best is not None:
         white = best.structure is not None and best.structure.p_value >= PLAINLY_WHITE and not search.exact
         remaining = 0.0 if white else 1.0 - explain.removed(search, best)
-        if decision.tied_models:  # something beside it is likely
-            remaining = max(remaining, explain.surpassed(search, best, decision.tied_models[0]))
+        larger = next((m for m in decision.tied_models if len(m.names) > len(best.names)), None)
+        if larger is not None:  # something beside it is likely
+            remaining = max(remaining, explain.surpassed(search, best, larger))
     return Diagnosis(
         verdict=decision.verdict,
         terms=_in_order(search, best) if best else [],
@@ -379,7 +380,8 @@ def _warn(search: Search, verdict: str) -> None:
         )
     recording, found = search.problem.recording, search.base
     size = float((found.residual / recording.spread[found.problem.index]).square().mean().sqrt())
-    if verdict == "unexplained" and size > NO_BETTER:
+    best = recording.y[found.problem.index].mean()
+    if verdict == "unexplained" and size > NO_BETTER and not torch.allclose(found.y, best):
         warnings.warn(
             f"The calibrated base explains no more than a constant would (its RMSE is {size:.2g} of the data's "
             "spread). Check the units and the simulator, and give initial= or bounds to its parameters.",
@@ -392,7 +394,10 @@ def _ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[H
     rows = []
     alike: dict[int, tuple[Model, float]] = {}
     ordered = sorted(search.models, key=lambda m: -decision.probability.get(id(m), 0.0))
-    for place, model in enumerate(ordered[:60]):
+    listed = ordered[:60]
+    if decision.best is not None and decision.best not in listed:
+        listed.append(decision.best)
+    for place, model in enumerate(listed):
         held = None
         if mask is not None and (place < 3 or model is decision.best):
             apart = search.held_out(model.found, mask)

@@ -1,6 +1,7 @@
 """Why the best explanation of a recording may be no name, however probable it is."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -9,7 +10,7 @@ from torchcal.discovery.model import Model
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.search import Search
 
-__all__ = ["distinct", "doubt"]
+__all__ = ["distinct", "doubt", "left_open"]
 
 #: Correlation from sample to sample from which on noise of unknown size may be physics that a term has left.
 SLOWEST = 0.85
@@ -18,53 +19,76 @@ SLOWEST = 0.85
 EVEN, MANY = 0.55, 30
 #: Correlation along the rows of a grid, in sd, from which on what is left may be noise in the order of the recording.
 ALONG = 3.3
-#: Times an amplitude's magnitude from which on its sd leaves it open.
-OPEN = 10.0
+#: Distance of a term's amplitudes from neutral, in their joint sd, up to which the data leave them open.
+OPEN = 0.1
 
 
 def doubt(search: Search, model: Model) -> str:
-    """Why a model is no name, however probable, in words; empty if it may be one."""
-    sd = model.found.sd()
-    for i in model.candidate.amplitudes:
-        size = abs(float(model.found.values[i] - model.candidate.neutral[model.candidate.own.index(i)]))
-        if float(sd[i]) > OPEN * size:
-            return "but these data leave its size open: more conditions would tell."
-    if distinct(search.problem) <= len(model.found.free) + len(model.candidate.own):
-        return "but there are hardly more distinct conditions than parameters: more conditions would tell."
-    if _noise_is_physics(search, model):
-        return (
-            "but what it leaves is so slow, or of such uneven size, that it may as well be physics as noise: a known "
-            "noise sd, replicates or a repeated run would tell."
-        )
+    """Why a model is no name, however probable, in a sentence; empty if it may be one."""
+    return left_open(search, model) or _noise_or_physics(search, model)
+
+
+def left_open(search: Search, model: Model) -> str:
+    """Why the data do not determine what a model adds; empty if they do."""
+    names = [q.name for q in model.found.problem.parameters]
+    for term in model.candidate.terms:
+        own = {*(term.full(q.name) for q in term.parameters), *term.frees}
+        shapes = [i for i in model.candidate.own if names[i] in own and i not in model.candidate.amplitudes]
+        places = [i for i in model.candidate.amplitudes if names[i] in own]
+        if places and _distance(model, places, shapes) <= OPEN:
+            return "The data leave the size of what it adds open: more conditions would tell."
+    # As many to spare as are added: else there is a curve through the data, whatever they are.
+    if distinct(search.problem) - len(model.found.free) <= len(model.candidate.own):
+        return "There are hardly more distinct conditions than parameters: more conditions would tell."
     return ""
 
 
-def _noise_is_physics(search: Search, model: Model) -> bool:
-    """Whether what is taken for noise of unknown size may be physics that a model leaves.
+def _distance(model: Model, places: Sequence[int], shapes: Sequence[int]) -> float:
+    """Of a term's amplitudes from neutral, in their joint sd with its shapes held.
 
-    Noise so slow is what a wrong shape leaves, too; and where most of it is small, and some of it large, it is no noise
-    of one size.
+    A product may be determined where neither of its factors is.
+    """
+    found, candidate = model.found, model.candidate
+    away = found.values[list(places)] - candidate.neutral[[candidate.own.index(i) for i in places]]
+    columns = found.whitening(found.jacobian)
+    mine = [found.free.index(i) for i in places]
+    others = columns[:, [k for k, i in enumerate(found.free) if i not in {*places, *shapes}]]
+    moved = columns[:, mine] @ away
+    unit = others / others.norm(dim=0).clamp_min(1e-300)
+    left = moved - unit @ torch.linalg.lstsq(unit, moved[:, None], rcond=1e-10, driver="gelsd").solution[:, 0]
+    return float(left.norm())
+
+
+def _noise_or_physics(search: Search, model: Model) -> str:
+    """What may be physics that a model leaves, though it is taken for noise.
+
+    Noise of unknown size that is slow is what a wrong shape leaves, too; where most of it is small, and some of it
+    large, it is no noise of one size. Of a grid of conditions no correlated noise is estimated.
     """
     noise, problem = search.noise, model.found.problem
     e = noise.whitening(problem).vector(model.found.residual)
     if not problem.in_time and not problem.follows and _along_rows(problem, e) > ALONG:
-        return True
-    if not noise.open:
-        return False
-    for k, rho in enumerate(noise.correlation.tolist()):
+        return (
+            "What it leaves is correlated in the order of the recording, as noise or as physics: the same conditions "
+            "in another order would tell."
+        )
+    for k, rho in enumerate(noise.correlation.tolist() if noise.open else ()):
         mine = e[problem.output_of == k]
-        if len(mine) and rho >= SLOWEST:
-            return True
-        if len(mine) >= MANY and 1.4826 * float(mine.abs().median()) < EVEN * float(mine.square().mean().sqrt()):
-            return True
-    return False
+        if len(mine) and (rho >= SLOWEST or (len(mine) >= MANY and _evenness(mine) < EVEN)):
+            return (
+                "What it leaves is so slow, or of such uneven size, that it may as well be physics as noise: a known "
+                "noise sd, replicates or a repeated run would tell."
+            )
+    return ""
+
+
+def _evenness(e: Tensor) -> float:
+    """Robust over plain sd."""
+    return 1.4826 * float(e.abs().median()) / max(float(e.square().mean().sqrt()), 1e-300)
 
 
 def _along_rows(problem: Problem, e: Tensor) -> float:
-    """Correlation of what is left with the next datum of the recording, in its sd by chance; of the worst output.
-
-    Of a grid of conditions no correlated noise is estimated: the next row of the recording may follow the last in time.
-    """
+    """Correlation of what is left with the next datum of the recording, in its sd by chance; of the worst output."""
     worst = 0.0
     for k in problem.output_of.unique().tolist():
         mine = e[problem.output_of == k]
@@ -73,7 +97,9 @@ def _along_rows(problem: Problem, e: Tensor) -> float:
 
 
 def distinct(problem: Problem) -> int:
-    """Data in use at distinct conditions: replicates do not tell one curve from another."""
+    """Data in use at distinct conditions, of a static recording: replicates do not tell one curve from another."""
+    if problem.in_time:
+        return problem.n
     x = problem.recording.x
     columns = torch.stack([c.double() for c in (x.values() if isinstance(x, dict) else [x])], dim=-1)
     which = columns.unique(dim=0, return_inverse=True)[1][problem.condition_of]

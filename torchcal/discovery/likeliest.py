@@ -163,7 +163,7 @@ def with_unknown(
             found[at] = tried, _log_density(residual.found.whitening, residual.e, tried, tangents) + gain
         return found[at][1]
 
-    factors = range(len(SMALLER) if noise.open and not problem.in_time else 1)
+    factors = range(len(SMALLER) if noise.open and problem.order is None else 1)
     places = tuple(int((GRID - rho).abs().argmin()) for rho in noise.correlation)
     best = places, (0,) * len(places)
     evidence(best)

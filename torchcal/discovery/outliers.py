@@ -20,7 +20,7 @@ BENT = 10.0
 #: Share of supposed outliers with another one as nearest neighbour above which they are no outliers.
 TOGETHER = 0.4
 #: Probability of as many of them at one value of a condition by chance, below which they are no outliers.
-CHANCE = 0.05
+CHANCE = 0.1
 
 
 def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
@@ -131,10 +131,10 @@ def _clustered(problem: Problem, places: Tensor, high: Tensor) -> bool:
     count = int(high.sum())
     x = problem.recording.x
     columns = [c[problem.condition_of[places]] for c in (x.values() if isinstance(x, dict) else [x])]
-    if any(_one_level(column, high) for column in columns):
-        return True
     if count < 3:
         return False
+    if any(_one_level(column, high, CHANCE / len(columns)) for column in columns):
+        return True
     ranks = torch.stack([c.unique(return_inverse=True)[1].double() for c in columns], dim=-1)
     ranks = ranks * (len(places) / (ranks.amax(0) + 1))
     distance = torch.cdist(ranks[high], ranks)
@@ -143,11 +143,11 @@ def _clustered(problem: Problem, places: Tensor, high: Tensor) -> bool:
     return together > TOGETHER
 
 
-def _one_level(column: Tensor, high: Tensor) -> bool:
-    """Whether more data that stick out share one value of a condition than chance would have it."""
+def _one_level(column: Tensor, high: Tensor, chance: float) -> bool:
+    """Whether more data that stick out share one value of a condition than by chance of less than this."""
     levels, which = column.unique(return_inverse=True)
     count = int(high.sum())
-    if count < 2 or 2 * len(levels) > len(column):
+    if 2 * len(levels) > len(column):
         return False
     there = torch.bincount(which[high], minlength=len(levels)).tolist()
     share = (torch.bincount(which, minlength=len(levels)).double() / len(column)).tolist()
@@ -155,7 +155,7 @@ def _one_level(column: Tensor, high: Tensor) -> bool:
         sum(math.comb(count, k) * q**k * (1 - q) ** (count - k) for k in range(seen, count + 1))
         for seen, q in zip(there, share, strict=True)
     )
-    return least * len(levels) < CHANCE
+    return least * len(levels) < chance
 
 
 def _robust_left(columns: Tensor, values: Tensor) -> Tensor:

@@ -7,33 +7,43 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
+from torchcal.discovery.explain import removed
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.screen import screen
 from torchcal.discovery.search import Search
 from torchcal.discovery.structure import Residual
+from torchcal.discovery.verdict import PLAINLY_WHITE
 from torchcal.errors import DomainError, SimulatorError
 
 __all__ = ["refit_several"]
 
-#: Pairs that are refitted at most.
-MOST = 14
+#: Pairs that are refitted at most; where one term leaves noise alone.
+MOST, FEWER = 14, 10
+#: Share of the misfit that one term removes of a recording without noise, and nothing need be sought beside it.
+ALL = 0.99999
 #: Of them from the linear search; and the correlation of two tangents from which on they are one.
 FROM_LINEAR, NEARLY_SAME = 8, 0.999
 
 
 def refit_several(search: Search) -> None:
-    """Pairs from the linear search at the base, and second terms after the best single ones; then thirds."""
+    """Pairs from the linear search at the base, and second terms after the best single ones; then thirds.
+
+    Where one term leaves noise alone, two may do what it does: fewer of them are tried.
+    """
     single = sorted((m for m in search.models if len(m.numbers) == 1), key=lambda m: -m.weight)
     count = len(search.candidates)
     if count < 2 or search.max_terms < 2:
         return
+    enough = _enough(search)
+    if enough and search.exact:
+        return
     wanted: dict[tuple[int, ...], tuple[int, int] | None] = {}
     for columns in _linear_pairs(search):
         wanted[tuple(int(search.screening.owner[k]) for k in columns)] = columns
-    for model in single[:3]:
+    for model in single[: 1 if enough else 3]:
         for j in _next_terms(search, model)[:5]:
             wanted.setdefault(tuple(sorted((model.numbers[0], j))), None)
-    pairs = [pair for pair in wanted if len(set(pair)) == 2][:MOST]
+    pairs = [pair for pair in wanted if len(set(pair)) == 2][: FEWER if enough else MOST]
     prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))
     fitted = _refit_sets(search, [(pair, wanted[pair]) for pair in pairs], prior)
     search.models += fitted
@@ -46,6 +56,15 @@ def refit_several(search: Search) -> None:
         third = math.log(0.2 * PRIOR["several"] / (count * (count - 1) * max(count - 2, 1) / 6))
         more = [tuple(sorted((*best.numbers, j))) for j in _next_terms(search, best)[:4] if j not in best.numbers]
         search.models += _refit_sets(search, [(numbers, None) for numbers in more], third)
+
+
+def _enough(search: Search) -> bool:
+    """Whether one term that acts everywhere leaves noise alone; a window may stand in for a second one."""
+    physical = [m for m in search.models if m.physical and m.window is None]
+    if not physical:
+        return False
+    best = max(physical, key=lambda m: m.weight)
+    return removed(search, best) >= ALL if search.exact else search.examine(best).p_value >= PLAINLY_WHITE
 
 
 def _linear_pairs(search: Search) -> list[tuple[int, int]]:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from torchcal.discovery import explain, verify
-from torchcal.discovery.doubts import distinct, doubt
+from torchcal.discovery.doubts import distinct, doubt, left_open
 from torchcal.discovery.model import PRIOR, Model
 from torchcal.discovery.own_noise import weigh_alone
 from torchcal.discovery.records import NONE
@@ -193,29 +193,32 @@ def _small(search: Search, model: Model) -> bool:
 
 def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) -> None:
     """Name what a model adds, if it is probable enough and the held-out data do not object."""
-    holding = [m for m in search.models if set(best.names) <= set(m.names)]
+    holding = [m for m in search.models if m.physical and not m.note and set(best.names) <= set(m.names)]
     sure = sum(decision.probability[id(m)] for m in holding)
     larger = sum(decision.probability[id(m)] for m in holding if len(m.names) > len(best.names))
     alone = larger <= sure - larger
-    decision.doubt = doubt(search, best)
-    if sure < (SURE if alone else SURE_OF_PART) or decision.doubt:
-        decision.verdict = "ambiguous"
-        decision.tied, decision.tied_models = [list(best.names), list(NONE)], [best]
-        return
+    shown = best if alone else _wherever(search, best)
+    decision.doubt = doubt(search, shown)
     if not alone:
-        best = _wherever(search, decision, best)
-        _tie_larger(decision, holding, sure)
+        _tie_larger(search, decision, holding, sure)
+    if sure < (SURE if alone else SURE_OF_PART) or decision.doubt or not shown.physical:
+        decision.verdict = "ambiguous"
+        if alone:
+            decision.tied, decision.tied_models = [list(best.names)], [best]
+        decision.tied.append(list(NONE))
+        return
+    best = shown
     decision.verdict, decision.best = "named", best
     _prove(search, decision, mask)
 
 
-def _wherever(search: Search, decision: Decision, best: Model) -> Model:
+def _wherever(search: Search, best: Model) -> Model:
     """A model's terms without its window, where others beside them are likelier: it may only stand in for these."""
     plain = search.plain.get(best.numbers[0])
     return best if best.window is None or plain is None else plain
 
 
-def _tie_larger(decision: Decision, holding: Sequence[Model], sure: float) -> None:
+def _tie_larger(search: Search, decision: Decision, holding: Sequence[Model], sure: float) -> None:
     """List the hypotheses that share what is named and differ in what else they add, up to a share of theirs."""
     covered = 0.0
     for model in sorted(holding, key=lambda m: -decision.probability[id(m)]):
@@ -225,6 +228,7 @@ def _tie_larger(decision: Decision, holding: Sequence[Model], sure: float) -> No
         if model.window is None:
             decision.tied.append(list(model.names))
             decision.tied_models.append(model)
+            _tie_other_names(search, model, decision)
 
 
 def _other_names(search: Search, model: Model) -> list[tuple[int, str, str]]:
@@ -304,13 +308,10 @@ def _nearly(search: Search, ranked: list[Model], mask: Tensor | None, decision: 
         best = mine[0]
         if explain.removed(search, best) < NEARLY or _gain(search, best, mask) < REMOVED:
             continue
-        if best.found.chi2 > (1 - REMOVED) * search.base.chi2 or doubt(search, best):
-            continue  # noise is most of what is left, and of what there was
+        if best.found.chi2 > (1 - REMOVED) * search.base.chi2 or left_open(search, best):
+            continue  # most of the misfit was noise; or the data do not determine what is added
         left = 1.0 - explain.removed(search, best)
-        rivals = [
-            m for m in ranked
-            if not m.note and len(m.numbers) <= size and frozenset(m.names) != frozenset(best.names)
-        ]  # fmt: skip
+        rivals = [m for m in mine[1:] if frozenset(m.names) != frozenset(best.names)]
         if not _other_names(search, best) and all(1.0 - explain.removed(search, m) > BEATEN * left for m in rivals):
             decision.verdict, decision.best, decision.nearly = "named", best, True
             _prove(search, decision, mask)

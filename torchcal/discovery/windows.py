@@ -19,14 +19,15 @@ from torchcal.simulators import Trajectories
 
 __all__ = ["refit_local", "refit_window"]
 
-#: Refits at most; of one candidate; around one refitted term; how many of those, and how many more of terms that the
-#: base has everywhere.
+#: Refits at most, in windows that promise much and in the leader's; of one candidate; around one refitted term; how
+#: many of those, and how many more of terms that the base has everywhere.
 MOST, MOST_EACH, MOST_AROUND, LEADING, HELD = 10, 2, 2, 3, 1
 #: Score below which a window promises nothing.
 LEAST_SCORE = 3.5
 #: How often windows are sought anew around the leading terms.
 ROUNDS = 2
-#: Log evidence below the best up to which a local model's edges are made sharp, and is its window's best.
+#: Log evidence below the best up to which a local model's edges are made sharp; log odds up to which a candidate counts
+#: as tried along the driver of the leader's window.
 CLOSE = 10.0
 #: Share of a window within another one along the same driver from which on they are one start.
 ALIKE = 0.7
@@ -93,7 +94,7 @@ def _rivals(search: Search, prior: float) -> bool:
     for other in sorted(search.local, key=lambda other: -other.z):
         if other.driver == w.driver and other.z > LEAST_SCORE and other.candidate not in {*tried, *search.gone}:
             others.setdefault(other.candidate, other)
-    for other in others.values():
+    for other in list(others.values())[:MOST]:
         _keep(search, refit_window(search, dataclasses.replace(other, low=w.low, high=w.high), prior))
     return bool(others)
 
@@ -131,7 +132,8 @@ def _refine_edges(search: Search, prior: float) -> None:
         found = [refit_window(search, w, prior, model, edge=True, span=scale) for scale in scales]
         other = max((one for one in found if one is not None), key=lambda one: one.weight, default=None)
         if other is not None and other.weight > model.weight:
-            search.models[search.models.index(model)] = other
+            search.models.remove(model)
+            _keep(search, other)
 
 
 def _keep(search: Search, model: Model | None) -> None:

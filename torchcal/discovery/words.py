@@ -177,9 +177,13 @@ def _proof(d: Any) -> str:
 def _named(d: Any) -> list[str]:
     top = _accepted(d)
     estimates = "; ".join(str(estimate) for estimate in top.estimates)
-    others = [row for row in d.ranking if row.terms and row.refitted and not set(row.terms) >= set(top.terms)]
+    mine = [row for row in d.ranking if (_holds(d, row) if d.tied else set(row.terms) == set(d.terms))]
+    held = {id(row) for row in mine}
+    others = [row for row in d.ranking if row.terms and row.refitted and id(row) not in held]
+    if d.tied:
+        others = [row for row in others if not set(row.terms) >= set(d.terms)]
     rival = max(others, key=lambda row: row.probability, default=None)
-    probability = sum(row.probability for row in d.ranking if set(row.terms) >= set(top.terms))
+    probability = sum(row.probability for row in mine)
     with_others = " alone or with others" if d.tied else ""
     likely = "" if d.settings.get("nearly") else f"probability{with_others} {probability:.3f}; "
     parts = [
@@ -188,9 +192,10 @@ def _named(d: Any) -> list[str]:
         f"{percent(top.misfit_removed)} of the misfit beyond noise ({likely}{estimates}).",
     ]
     if d.settings.get("nearly"):
+        apart = "" if d.held_out is None else "on held-out data too, "
         parts.append(
             "What is left is more than noise, as on most real recordings; the name rests on the share that is removed, "
-            "on held-out data too, and on every rival leaving at least three times as much."
+            f"{apart}and on every rival of as many terms leaving at least three times as much."
         )
     elif rival is not None:
         behind = top.log_evidence - rival.log_evidence
@@ -206,13 +211,17 @@ def _named(d: Any) -> list[str]:
     return parts
 
 
+def _holds(d: Any, row: Any) -> bool:
+    """Whether a row of the ranking has the named terms, alone or with others."""
+    return bool(row.refitted and row.physical and not row.note and set(row.terms) >= set(d.terms))
+
+
 def _larger(d: Any) -> list[str]:
     """What is likely beside the named terms."""
-    more = [row for row in d.ranking if row.refitted and set(row.terms) > set(d.terms)]
-    listed = [
-        f"{_and([name for name in row.terms if name not in d.terms])} ({row.probability:.2f})" for row in more[:MORE]
-    ]
-    if len(more) > MORE:
+    more = [row for row in d.ranking if _holds(d, row) and set(row.terms) != set(d.terms)]
+    shown = [row for row in more[:MORE] if row.probability >= 0.005]
+    listed = [f"{_and([name for name in row.terms if name not in d.terms])} ({row.probability:.2f})" for row in shown]
+    if len(more) > len(shown):
         listed.append("others")
     together = sum(row.probability for row in more)
     parts = [f"Something else acts beside it with a probability of {together:.2f}: {', or '.join(listed)}."]
@@ -234,16 +243,19 @@ def _ambiguous(d: Any) -> list[str]:
     if len(known) == 1:
         sure = sum(row.probability for row in d.ranking if set(known[0]) <= set(row.terms))
         if d.settings.get("doubt"):
-            return [_where(d), f"{_hypothesis(d, known[0])} explains it best, {d.settings['doubt']}"]
+            return [_where(d), f"{_hypothesis(d, known[0])} explains it best. {d.settings['doubt']}"]
         return [
             _where(d),
-            f"{_and(known[0])}, the best explanation in the library, has a probability of {sure:.2f} only, which is too"
-            f" little for a name, against {unknown:.2f} for something else: more data, or less noise, would tell.",
+            f"{_and(known[0])}, the best explanation in the library, has a probability of {sure:.2f}, which is too "
+            f"little for a name: something that is not in the library has {unknown:.2f}, other terms and the base "
+            f"alone have {max(1 - sure - unknown, 0.0):.2f} together. More data, or less noise, would tell.",
         ]
     parts = [_where(d), f"{len(known)} hypotheses explain it about as well, and these data cannot exclude any of them."]
     shared = [name for name in known[0] if all(name in tied for tied in known)]
     if shared:
         parts.append(f"All of them have {_and(shared)}.")
+    if d.settings.get("doubt"):
+        parts.append(d.settings["doubt"].replace("it ", "the best of them ", 1))
     if len(known) < len(d.tied):
         parts.append(f"Nor can they exclude something that is not in the library (probability {unknown:.2f}).")
     if d.experiment is not None:

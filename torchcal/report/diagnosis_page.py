@@ -190,7 +190,7 @@ def _where(diagnosis: Any, units: Mapping[str, str]) -> str:
 def _ranking(diagnosis: Any) -> str:
     chosen = set(_get(diagnosis, "terms"))
     region = getattr(diagnosis, "settings", {}).get("region")
-    tied = {frozenset(terms) for terms in _get(diagnosis, "tied")}
+    tied = {frozenset(terms) for terms in _get(diagnosis, "tied")} - {frozenset(chosen)}
     hypotheses = sorted(_get(diagnosis, "ranking"), key=lambda item: -_comparable(item.log_evidence))
     rows, marked = [], []
     for place, item in enumerate(hypotheses):

@@ -48,6 +48,8 @@ def ranking(
     if not rows:
         raise DomainError("Expected at least one hypothesis. Got none.")
     chosen, sets = frozenset(accepted), {frozenset(terms) for terms in tied}
+    same = [h for h in rows if chosen and frozenset(h.terms) == chosen]
+    named = [h for h in same if getattr(h, "region", None) == region] or same
     kept = [h for h in rows if not h.terms or tuple(h.terms) == NONE or frozenset(h.terms) in {*sets, chosen}]
     kept += [h for h in rows if all(h is not other for other in kept)][: max(0, most - len(kept))]
     left_out = len(rows) - len(kept)
@@ -68,11 +70,11 @@ def ranking(
     def kind(item: Any) -> str:
         if not item.terms or tuple(item.terms) == NONE:
             return "base, or none of these"
-        if chosen and frozenset(item.terms) == chosen and getattr(item, "region", None) == region:
+        if any(item is other for other in named):
             return "accepted"
         if not item.physical:
             return "not physical"
-        return "tied" if frozenset(item.terms) in sets else "considered"
+        return "tied" if frozenset(item.terms) in sets - {chosen} else "considered"
 
     kinds = [kind(item) for item in rows]
     numbers = [finite(getattr(item, value), math.nan) for item in rows]
