@@ -5,7 +5,7 @@ import pytest
 import torch
 
 import torchcal as tc
-from torchcal.discovery import doubts, outliers
+from torchcal.discovery import candidates, doubts, outliers
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.search import Search
 from torchcal.errors import ConvergenceWarning
@@ -105,6 +105,27 @@ def test_pairs_are_weighed_where_one_term_leaves_noise_too():
     d = diagnose(*aged(3, more=0.0))
     assert d.terms == ["age"]
     assert any(len(row.terms) == 2 and row.refitted and row.probability > 0 for row in d.ranking)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_term_that_gives_an_output_anew_loses_nothing_of_others(order):
+    x = torch.linspace(0.2, 8, 80, dtype=F64)
+    base = tc.Simulator(lambda x, p: p["v"] * x / (p["k"] + x), [tc.Parameter(n, low=0.0, initial=1.0) for n in "vk"])
+    hill = tc.Term(
+        "cooperativity",
+        outputs={"y": lambda x, p, y: p["v"] * x ** (1 + p["h"]) / (p["k"] ** (1 + p["h"]) + x ** (1 + p["h"]))},
+        parameters=[tc.Parameter("h", low=-0.9, high=4.0)],
+    )
+    drift = added("drift", lambda x, y: x)
+    problem = Problem.of(base, tc.Recording(x=x, y=x))
+    values = torch.ones(2, dtype=F64)
+    assert candidates.replaces(problem, values, hill)
+    assert not candidates.replaces(problem, values, drift)
+    y = 2 * x**2 / (1.5**2 + x**2) + 0.1 * x + 0.01 * normal(80, 5)
+    assert sorted(diagnose(base, tc.Recording(x=x, y=y, noise=0.01), [drift, hill][::order]).terms) == [
+        "cooperativity",
+        "drift",
+    ]
 
 
 # --- doubts --------------------------------------------------------------------------------------------------------

@@ -108,6 +108,24 @@ def check_repeats(problem: Problem, values: Tensor, what: str = "the simulator")
         )
 
 
+def replaces(problem: Problem, values: Tensor, term: Term) -> bool:
+    """Whether a term of a static simulator gives an output anew, whatever that was, by the base's values ``(P,)``.
+
+    What other terms did to the output before is lost.
+    """
+    if problem.in_time or not term.outputs:
+        return False
+    x = problem.recording.x
+    p = {q.name: value for q, value in zip(problem.parameters, values, strict=True)}
+    p |= {q.name: values.new_tensor(_shape_points(q, 1)[0] if (at := neutral_of(q)) is None else at)
+          for q in term.parameters}  # fmt: skip
+    y = problem.recording.spread.new_ones(problem.recording.n)
+    try:
+        return any(torch.equal(f(x, p, y) + 0 * y, f(x, p, 2 * y) + 0 * y) for f in term.outputs.values())
+    except Exception:  # a term that needs more than that is called by the simulator, which tells what is wrong
+        return False
+
+
 def _place(problem: Problem, k: int) -> str:
     """Which output a used datum is, and at which condition or time, in words."""
     x, row = problem.recording.x, int(problem.condition_of[k])

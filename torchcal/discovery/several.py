@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
+from torchcal.discovery.candidates import Candidate, drivers_scale, prepare, replaces
 from torchcal.discovery.explain import removed
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.screen import screen
@@ -23,6 +23,8 @@ MOST, FEWER = 14, 10
 ALL = 0.99999
 #: Of them from the linear search; and the correlation of two tangents from which on they are one.
 FROM_LINEAR, NEARLY_SAME = 8, 0.999
+#: Correlation of two tangents from which on a candidate is tried in the other's place beside the leading pair's.
+ALIKE = 0.9
 
 
 def refit_several(search: Search) -> None:
@@ -46,6 +48,9 @@ def refit_several(search: Search) -> None:
     pairs = [pair for pair in wanted if len(set(pair)) == 2][: FEWER if enough else MOST]
     prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))
     fitted = _refit_sets(search, [(pair, wanted[pair]) for pair in pairs], prior)
+    lead = max((m for m in [*search.models, *fitted] if m.physical), key=lambda m: m.weight, default=None)
+    if lead is not None and len(lead.numbers) == 2:
+        fitted += _refit_sets(search, [(pair, None) for pair in _swapped(search, lead) if pair not in pairs], prior)
     search.models += fitted
     if isinstance(search.problem.recording.noise, Tensor):  # else a smaller noise makes physics of any small misfit
         search.reweigh()
@@ -65,6 +70,19 @@ def _enough(search: Search) -> bool:
         return False
     best = max(physical, key=lambda m: m.weight)
     return removed(search, best) >= ALL if search.exact else search.examine(best).p_value >= PLAINLY_WHITE
+
+
+def _swapped(search: Search, lead: Model) -> list[tuple[int, ...]]:
+    """Pairs with another candidate that does nearly the same, at some shapes, in place of one of a pair's terms."""
+    found: dict[tuple[int, ...], float] = {}
+    columns, owner = search.screening.columns, search.screening.owner
+    for i in lead.numbers:
+        (kept,) = set(lead.numbers) - {i}
+        for j in set(range(len(search.candidates))) - {*lead.numbers, *search.gone}:
+            alike = (columns[:, owner == i].T @ columns[:, owner == j]).abs()
+            if alike.numel() and float(alike.max()) >= ALIKE:
+                found[tuple(sorted((kept, j)))] = float(alike.max())
+    return sorted(found, key=lambda pair: -found[pair])[:MOST]
 
 
 def _linear_pairs(search: Search) -> list[tuple[int, int]]:
@@ -147,6 +165,7 @@ def _hypothetical(
     search: Search, numbers: tuple[int, ...], prior: float, columns: tuple[int, int] | None
 ) -> Hypothetical | None:
     terms = [term for i in numbers for term in search.candidates[i].terms]
+    terms.sort(key=lambda term: not replaces(search.base.problem, search.base.values, term))  # else others are lost
     try:
         candidate = prepare(
             search.base.problem, search.base, terms, search.fixed, drivers_scale(search.base.problem, search.base)
