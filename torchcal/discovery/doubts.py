@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchcal.discovery.local import is_window
 from torchcal.discovery.model import Model
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.search import Search
@@ -33,7 +34,7 @@ def left_open(search: Search, model: Model) -> str:
     names = [q.name for q in model.found.problem.parameters]
     for term in model.candidate.terms:
         own = {*(term.full(q.name) for q in term.parameters), *term.frees}
-        shapes = [i for i in model.candidate.own if names[i] in own and i not in model.candidate.amplitudes]
+        shapes = [i for i in model.candidate.own if names[i] in own and not is_window(names[i])]
         places = [i for i in model.candidate.amplitudes if names[i] in own]
         if places and _distance(model, places, shapes) <= OPEN:
             return "The data leave the size of what it adds open: more conditions would tell."
@@ -44,7 +45,7 @@ def left_open(search: Search, model: Model) -> str:
 
 
 def _distance(model: Model, places: Sequence[int], shapes: Sequence[int]) -> float:
-    """Of a term's amplitudes from neutral, in their joint sd with its shapes held.
+    """Of a term's amplitudes from neutral, in their joint sd with its shapes held, but not the ends of its window.
 
     A product may be determined where neither of its factors is.
     """
