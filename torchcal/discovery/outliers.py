@@ -129,10 +129,10 @@ def _alone(r: Tensor, off: Tensor, least: float) -> Tensor:
 def _clustered(problem: Problem, places: Tensor, high: Tensor) -> bool:
     """Whether data that stick out lie together among the conditions, as outliers do not."""
     count = int(high.sum())
-    x = problem.recording.x
-    columns = [c[problem.condition_of[places]] for c in (x.values() if isinstance(x, dict) else [x])]
     if count < 3:
         return False
+    x = problem.recording.x
+    columns = [c[problem.condition_of[places]] for c in (x.values() if isinstance(x, dict) else [x])]
     if any(_one_level(column, high, CHANCE / len(columns)) for column in columns):
         return True
     ranks = torch.stack([c.unique(return_inverse=True)[1].double() for c in columns], dim=-1)

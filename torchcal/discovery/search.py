@@ -145,6 +145,11 @@ class Search:
         """The model with the most weight, where there is any."""
         return max(self.models, key=lambda model: model.weight, default=None)
 
+    @property
+    def physical_leader(self) -> Model | None:
+        """The physical model with the most weight, where there is any."""
+        return max((model for model in self.models if model.physical), key=lambda model: model.weight, default=None)
+
     def merge(self) -> None:
         """Candidates whose tangents and refits cannot be told apart become one hypothesis, under the first name."""
         plain = self.plain

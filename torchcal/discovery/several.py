@@ -48,10 +48,12 @@ def refit_several(search: Search) -> None:
     pairs = [pair for pair in wanted if len(set(pair)) == 2][: FEWER if enough else MOST]
     prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))
     fitted = _refit_sets(search, [(pair, wanted[pair]) for pair in pairs], prior)
-    lead = max((m for m in [*search.models, *fitted] if m.physical), key=lambda m: m.weight, default=None)
-    if lead is not None and len(lead.numbers) == 2:
-        fitted += _refit_sets(search, [(pair, None) for pair in _swapped(search, lead) if pair not in pairs], prior)
     search.models += fitted
+    lead = search.physical_leader
+    if lead is not None and len(lead.numbers) == 2:
+        twins = _refit_sets(search, [(pair, None) for pair in _swapped(search, lead) if pair not in pairs], prior)
+        fitted += twins
+        search.models += twins
     if isinstance(search.problem.recording.noise, Tensor):  # else a smaller noise makes physics of any small misfit
         search.reweigh()
     if search.max_terms < 3 or not fitted:

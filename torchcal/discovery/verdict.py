@@ -207,8 +207,7 @@ def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) 
             decision.tied, decision.tied_models = [list(best.names)], [best]
         decision.tied.append(list(NONE))
         return
-    best = shown
-    decision.verdict, decision.best = "named", best
+    decision.verdict, decision.best = "named", shown
     _prove(search, decision, mask)
 
 

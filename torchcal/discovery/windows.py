@@ -82,7 +82,7 @@ def _rivals(search: Search, prior: float) -> bool:
 
     Returns whether there was any.
     """
-    lead = max((m for m in search.models if m.physical), key=lambda m: m.weight, default=None)
+    lead = search.physical_leader
     if lead is None or lead.window is None:
         return False
     w = lead.window
