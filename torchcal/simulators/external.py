@@ -29,7 +29,8 @@ class ExternalSimulator(Simulator):
 
     with :math:`s_j` half the parameter's range where it has two bounds, otherwise the largest of
     :math:`|\lambda_j|` and ``|initial|`` (1 where there is neither), and :math:`|\lambda_j|` on a logarithmic
-    scale. The points lie up to a step outside the bounds. A gradient costs 2d evaluations for each row of parameter
+    scale. The points lie up to a step outside the bounds; where one side has no answer, the other and the middle give
+    the slope. A gradient costs 2d evaluations for each row of parameter
     values, and is computed only where it is asked for.
 
     Args:
@@ -255,7 +256,8 @@ class _Differenced(torch.autograd.Function):
         size = (direction.abs() / ctx.job.steps(centre)).amax(dim=(1, 2), keepdim=True)
         moved = direction / torch.where(size > 0, size, torch.ones_like(size))
         up, down = torch.as_tensor(ctx.job(torch.cat([centre + moved, centre - moved]).cpu().numpy())).chunk(2)
-        return (0.5 * size[:, :, 0].cpu() * (up - down)).to(values)
+        change = _over_two_steps(up, down, lambda: torch.as_tensor(ctx.job(centre.cpu().numpy())))
+        return (0.5 * size[:, :, 0].cpu() * change).to(values)
 
     @staticmethod
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, None]:
@@ -280,10 +282,20 @@ class _Differenced(torch.autograd.Function):
         # The distance that is left after rounding, against outputs that list n conditions once for each output.
         double = (above - below).detach().diagonal(dim1=0, dim2=3).permute(2, 0, 1)  # (count, rows, length)
         double = double.expand(count, rows, n).repeat(1, 1, up.shape[-1] // n)
-        parts = (up - down) / double * slope[used].to(up)
+        change = _over_two_steps(up, down, lambda: _Differenced.apply(picked, ctx.job))
+        parts = change / double * slope[used].to(up)
         if length == 1:
             grad = parts.sum(-1, keepdim=True)
         else:
             grad = parts.reshape(count, rows, -1, n).sum(2)
         grad = grad.permute(1, 2, 0).to(values.dtype)
         return torch.zeros_like(values).index_put((used.nonzero()[:, 0],), grad), None
+
+
+def _over_two_steps(up: Tensor, down: Tensor, middle: Callable[[], Tensor]) -> Tensor:
+    """Differences over two steps; where one side has no answer, twice that over the other step."""
+    good = up.isfinite() & down.isfinite()
+    if bool(good.all()):
+        return up - down
+    centre = middle()
+    return torch.where(good, up - down, 2.0 * torch.where(up.isfinite(), up - centre, centre - down))
