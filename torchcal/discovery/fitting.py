@@ -15,6 +15,8 @@ __all__ = ["Fitted", "fit", "starts"]
 #: Relative change of χ² below which a fit has converged.
 TOLERANCE = 1e-7
 MAX_STEPS = 60
+#: More steps of the best alone, where it has not converged in those: along a bent valley they are short.
+FINISH = 240
 #: Samples that the slope at the beginning is taken from.
 SLOPES = (12, 24, 48)
 #: How many times longer or shorter than 1 a run must be for rates to be guessed from it.
@@ -178,12 +180,14 @@ def fit(
     warm: Any = None,
     data: Tensor | None = None,
     max_steps: int = MAX_STEPS,
+    finish: int = FINISH,
 ) -> Fitted | None:
     """Minimise χ² over the free parameters from every row of ``begin`` (H, P); None where no start works.
 
     Marquardt's scaling makes it independent of units. A parameter on a bound that the gradient pushes outward is held
     for the step. Parameters with ``transform="log"`` are stepped in their logarithm. With ``data`` (H, n) every start
-    is fitted to data of its own, and ``ends_chi2`` tells how well.
+    is fitted to data of its own, and ``ends_chi2`` tells how well. Where the best has not converged after ``max_steps``
+    it goes on alone for at most ``finish`` more.
     """
     low, high = problem.limits()
     low, high = low[free], high[free]
@@ -277,6 +281,20 @@ def fit(
         if bool(done.all()):
             break
     best = int(chi2.argmin())
+    agreeing = float((chi2 <= chi2[best] * (1 + 1e-3) + 0.1).double().mean())
+    if free and finish and not bool(done[best]):
+        last = fit(
+            problem,
+            whitening,
+            values[best : best + 1],
+            free,
+            warm=warm[best : best + 1] if isinstance(warm, Tensor) else warm,
+            data=None if data is None else data[best : best + 1],
+            max_steps=finish,
+            finish=0,
+        )
+        if last is not None:
+            return dataclasses.replace(last, ends=values, ends_chi2=chi2, agreeing=agreeing)
     gradient = (whitening(jacobian[best]).T @ residual[best]) if free else residual[best, :0]
     now = values[best, free]
     width = torch.where(torch.isfinite(high - low), high - low, now.abs().clamp_min(1e-300))
@@ -304,7 +322,7 @@ def fit(
         warm=warm[best : best + 1] if isinstance(warm, Tensor) else None,
         ends=values,
         ends_chi2=chi2,
-        agreeing=float((chi2 <= chi2[best] * (1 + 1e-3) + 0.1).double().mean()),
+        agreeing=agreeing,
     )
 
 

@@ -118,7 +118,9 @@ def _corrected(search: Search, effects: dict[int, _Effect], sizes: dict[int, flo
             break
         warm: Any = base.warm.expand(len(known), *base.warm.shape[1:]) if isinstance(base.warm, Tensor) else None
         begin = base.values.expand(len(known), -1)
-        found = fit(base.problem, base.whitening, begin, base.free, warm=warm, data=torch.stack(data), max_steps=30)
+        found = fit(
+            base.problem, base.whitening, begin, base.free, warm=warm, data=torch.stack(data), max_steps=30, finish=0
+        )
         if found is None or found.ends_chi2 is None or len(found.ends_chi2) != len(known):
             break
         for trial, chi2 in zip(known, found.ends_chi2.tolist(), strict=True):

@@ -43,13 +43,13 @@ class Refit:
         begin, warm = self.begin, self.warm
         if self.shape:
             free = [i for i in self.free if i not in self.shape]
-            first = fit(self.problem, self.whitening, begin, free, warm=warm, max_steps=12)
+            first = fit(self.problem, self.whitening, begin, free, warm=warm, max_steps=12, finish=0)
             if first is None or first.ends is None or first.ends_chi2 is None:
                 return None
             begin, warm = first.ends[first.ends_chi2.argsort()[:2]], None
             if isinstance(first.warm, Tensor):
                 warm = first.warm.expand(len(begin), *first.warm.shape[1:])
-        return fit(self.problem, self.whitening, begin, self.free, warm=warm, max_steps=60)
+        return fit(self.problem, self.whitening, begin, self.free, warm=warm)
 
 
 def refit_all(
