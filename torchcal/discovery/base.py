@@ -19,6 +19,10 @@ __all__ = ["calibrate_base", "growing"]
 
 #: The solver's error against the noise.
 SOLVER_SHARE = 0.05
+#: Difference of χ² up to which an initial angle in another turn gives the same fit.
+SAME_FIT = 0.01
+#: Share of the data that may be outliers.
+MOST = 0.2
 #: How often steps are made four times shorter where no starting value has a finite solution.
 STEEP = 3
 
@@ -72,16 +76,20 @@ def calibrate_base(
             "rate is about 1 over the time in which something happens); look at the runs' initial values; and of a "
             "stiff model replace a fast state by its equilibrium, or give max_step=."
         )
-    found = _sharpen(found)
+    found = _unwound(_sharpen(found))
     if not exact and not clean:
+        whole = found
         for _ in range(3):
             given = recording.noise if isinstance(recording.noise, Tensor) else None
             units = (growing(found) if unit is None else unit)[found.problem.index]
             bad = spikes(found.problem, found.residual / units, given)
-            if not bool(bad.any()) or float(bad.double().mean()) > 0.2:
+            if not bool(bad.any()):
                 break
             keep = found.problem.keep.clone()
             keep[found.problem.index[bad]] = False
+            if float(keep.sum()) < (1 - MOST) * whole.problem.n:  # so many are none
+                found = whole
+                break
             found = _again(found, keep)
     units = growing(found) if unit is None else unit
     noise = estimate(found.problem, found.residual, found.jacobian, recording.noise, units)
@@ -116,11 +124,34 @@ def _from_starts(problem: Problem, begin: Tensor, free: list[int], rough: Tensor
     early = problem.keeping(keep.repeat(len(problem.recording.outputs)))
     ends = begin
     if early.n >= 3 * len(free):
-        first = fit(early, early.whitening(rough, outputs), begin, free, max_steps=15)
+        first = fit(early, early.whitening(rough, outputs), begin, free, max_steps=15, finish=0)
         if first is not None and first.ends is not None and first.ends_chi2 is not None:
             order = first.ends_chi2.argsort()
             ends = torch.cat([first.ends[order[: max(4, len(order) // 2)]], guided[:4]])
     return fit(problem, problem.whitening(rough, outputs), ends, free)
+
+
+def _unwound(found: Fitted) -> Fitted:
+    """The same fit with unseen initial angles within half a turn of zero, where whole turns change nothing.
+
+    Not everything that may be missing is as periodic as the base.
+    """
+    bound = found.problem.simulator
+    if not isinstance(bound, Trajectories):
+        return found
+    names = [q.name for q in found.problem.parameters]
+    values = found.values.clone()
+    for i in found.free:
+        turns = round(float(values[i]) / (2 * math.pi))
+        if turns and names[i] in bound.initial_names:
+            values[i] -= 2 * math.pi * turns
+            y = found.problem.evaluate(values[None], [])[0][0]
+            same = float(found.whitening.vector(found.problem.y - y).square().sum()) <= found.chi2 + SAME_FIT
+            values[i] = values[i] if same else found.values[i]
+    if torch.equal(values, found.values):
+        return found
+    again = fit(found.problem, found.whitening, values[None], found.free)
+    return found if again is None else dataclasses.replace(again, agreeing=found.agreeing)
 
 
 def _again(found: Fitted, keep: Tensor) -> Fitted:

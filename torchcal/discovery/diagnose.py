@@ -20,7 +20,7 @@ from torchcal.discovery.experiment import propose
 from torchcal.discovery.fitting import Fitted, starts
 from torchcal.discovery.limits import limits
 from torchcal.discovery.model import PRIOR, Model
-from torchcal.discovery.own_noise import fits_by_chance, other_growth, outliers
+from torchcal.discovery.own_noise import explains, fits_by_chance, other_growth, outdone, outliers
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.records import NONE, Estimate, Hypothesis, Scores, Table
 from torchcal.discovery.result import Diagnosis
@@ -137,27 +137,40 @@ def diagnose(
         search.calibrate_base()
         if holdout is None and mask is not None and _beyond_prediction(search, mask):
             mask = verify.within(recording)
-        detected = _refit(search, confidence)
-        seen = [search.problem.keep]
-        for _ in range(ROUNDS):
-            sticking = outliers(search, problem.keep) if detected else None
-            unit = other_growth(search) if detected else None
-            if sticking is not None and any(torch.equal(keep, problem.keep & ~sticking) for keep in seen):
-                sticking = None
-            if sticking is None and unit is None:
-                break
-            # Others than at the base, whose misfit hides them and looks like some; and noise that grows, or does not.
-            kept = search.problem if sticking is None else problem.keeping(~sticking)
-            search = dataclasses.replace(search, problem=kept, clean=True, unit=search.unit if unit is None else unit)
-            seen.append(search.problem.keep)
-            search.calibrate_base()
-            detected = _refit(search, confidence)
+        search, detected = _settled(search, problem, confidence)
+        if terms and search.problem.n < problem.n and not (detected and explains(search)):
+            # What the best model misses is no outlier of it; where there is none, all physics may have been set aside.
+            every = dataclasses.replace(search, problem=problem, clean=True)
+            every.calibrate_base()
+            every, more = _settled(every, problem, confidence)
+            if more and outdone(search, every, detected):
+                search, detected = every, True
         if detected and terms:
             refit_several(search)
         decision = decide(search, detected, mask)
         return _result(search, decision, simulator, recording, mask, confidence, begun, given, seed)
     finally:
         bar.close()
+
+
+def _settled(search: Search, observed: Problem, confidence: float) -> tuple[Search, bool]:
+    """Screen and refit, again where others of the observed data turn out to be outliers, or the noise to grow."""
+    detected = _refit(search, confidence)
+    seen = [search.problem.keep]
+    for _ in range(ROUNDS):
+        sticking = outliers(search, observed.keep) if detected else None
+        unit = other_growth(search) if detected else None
+        if sticking is not None and any(torch.equal(keep, observed.keep & ~sticking) for keep in seen):
+            sticking = None
+        if sticking is None and unit is None:
+            break
+        # Others than at the base, whose misfit hides them and looks like some; and noise that grows, or does not.
+        kept = search.problem if sticking is None else observed.keeping(~sticking)
+        search = dataclasses.replace(search, problem=kept, clean=True, unit=search.unit if unit is None else unit)
+        seen.append(search.problem.keep)
+        search.calibrate_base()
+        detected = _refit(search, confidence)
+    return search, detected
 
 
 def _refit(search: Search, confidence: float) -> bool:

@@ -22,6 +22,8 @@ EVEN, MANY = 0.55, 30
 ALONG = 3.3
 #: Distance of a term's amplitudes from neutral, in their joint sd, up to which the data leave them open.
 OPEN = 0.1
+#: Share of the largest effect of the base's parameters below which a direction of them moves no datum.
+UNSEEN = 1e-7
 
 
 def doubt(search: Search, model: Model) -> str:
@@ -47,15 +49,36 @@ def left_open(search: Search, model: Model) -> str:
 def _distance(model: Model, places: Sequence[int], shapes: Sequence[int]) -> float:
     """Of a term's amplitudes from neutral, in their joint sd with its shapes held, but not the ends of its window.
 
-    A product may be determined where neither of its factors is.
+    A product may be determined where neither of its factors is; and what the base leaves open of its own parameters,
+    the scale of a state that is not seen, say, is no matter of the term.
     """
     found, candidate = model.found, model.candidate
     away = found.values[list(places)] - candidate.neutral[[candidate.own.index(i) for i in places]]
     columns = found.whitening(found.jacobian)
     mine = [found.free.index(i) for i in places]
-    others = columns[:, [k for k, i in enumerate(found.free) if i not in {*places, *shapes}]]
+    kept = [k for k, i in enumerate(found.free) if i not in {*places, *shapes}]
     moved = columns[:, mine] @ away
-    unit = others / others.norm(dim=0).clamp_min(1e-300)
+    left = _beside(columns[:, kept], moved)
+    if left > OPEN:
+        return left
+    base = [k for k, i in enumerate(found.free) if i not in candidate.own]
+    values = found.values.clone()
+    values[candidate.own] = candidate.neutral
+    jacobian = found.problem.evaluate(values[None], [found.free[k] for k in base])[1][0]
+    slope = found.whitening(jacobian)
+    if not bool(slope.isfinite().all()):
+        return left
+    unit = slope.norm(dim=0)
+    unit = torch.where(unit > 0, unit, unit.max().clamp_min(1e-300))
+    _, sizes, directions = torch.linalg.svd(slope / unit, full_matrices=False)
+    seen = directions[sizes > UNSEEN * sizes.max()] / unit  # in the parameters' own units, (directions, base)
+    others = [k for k in kept if k not in base]
+    return _beside(torch.cat([columns[:, base] @ seen.T, columns[:, others]], dim=1), moved)
+
+
+def _beside(columns: Tensor, moved: Tensor) -> float:
+    """What is left of an effect beside others, in noise sd."""
+    unit = columns / columns.norm(dim=0).clamp_min(1e-300)
     left = moved - unit @ torch.linalg.lstsq(unit, moved[:, None], rcond=1e-10, driver="gelsd").solution[:, 0]
     return float(left.norm())
 

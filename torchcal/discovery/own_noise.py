@@ -19,7 +19,15 @@ from torchcal.discovery.problem import Problem
 if TYPE_CHECKING:
     from torchcal.discovery.search import Search
 
-__all__ = ["fits_by_chance", "other_growth", "outliers", "suited", "weigh_alone"]
+__all__ = [
+    "explains",
+    "fits_by_chance",
+    "other_growth",
+    "outdone",
+    "outliers",
+    "suited",
+    "weigh_alone",
+]
 
 #: Log evidence of a model from which on what sticks out of it alone are outliers, and how many these may be.
 CLEAR, MOST_OUTLIERS = 10.0, 0.1
@@ -27,6 +35,8 @@ CLEAR, MOST_OUTLIERS = 10.0, 0.1
 SETTLED = 10
 #: How often what sticks out is judged anew without it.
 TRIMS = 3
+#: Share of outliers among data, and log odds from which on physics explains better what had been taken for some.
+RARE, EXPLAINED = 0.05, 5.0
 #: Log odds from which on something unknown is clearly likelier than the best model.
 LIKELIER = 3.0
 #: χ² a datum below which the noise estimated is its least, not the misfit's size: a residual so far below is rounding.
@@ -103,7 +113,7 @@ def other_growth(search: "Search") -> Tensor | None:
     """How unknown noise grows by the residual of the best model, ``(n_total,)``; None where that is as it was taken to
     be, or nothing explains enough to tell. The misfit of the base may look like noise that grows."""
     best = search.leader
-    if search.unit is not None or not search.noise.open or best is None or best.log_evidence < CLEAR:
+    if search.unit is not None or not search.noise.open or best is None or not explains(search):
         return None
     unit = growing(best.found)
     same = all(
@@ -117,7 +127,7 @@ def outliers(search: "Search", observed: Tensor) -> Tensor | None:
     """Data that stick out alone once the best model explains the rest, bool ``(n_total,)``; None where nothing explains
     enough to tell. All ``observed`` data are judged, those that are set aside too."""
     best = search.leader
-    if search.exact or best is None or best.log_evidence < CLEAR:
+    if search.exact or best is None or not explains(search):
         return None
     found, keep = best.found, observed
     for _ in range(TRIMS):  # what sticks out most draws the fit to itself, and off what sticks out less
@@ -132,6 +142,40 @@ def outliers(search: "Search", observed: Tensor) -> Tensor | None:
             break
     sticking = observed & ~keep
     return sticking if float(sticking.sum()) <= MOST_OUTLIERS * float(observed.sum()) else None
+
+
+def explains(search: "Search") -> bool:
+    """Whether one model explains enough to tell what it leaves from outliers."""
+    return search.leader is not None and search.leader.log_evidence >= CLEAR
+
+
+def outdone(search: "Search", every: "Search", detected: bool) -> bool:
+    """Whether a model of ``every``, which sets fewer data aside or none, is clearly likelier than any hypothesis of
+    ``search`` (than the base, where it has not ``detected`` anything) with the outliers that these leave.
+
+    An outlier is drawn evenly from the range of its output's data. A model explains as many of them at least as it has
+    parameters more than the base: a curve goes through fewer wherever they are.
+    """
+    best, other = every.physical_leader, search.physical_leader if detected else None
+    if best is None or every.problem.n - search.problem.n < max(len(best.candidate.own), 1):
+        return False
+    known = settled(search.base, search.noise, search.tangents)[1] + math.log(PRIOR["base"])
+    if other is not None:
+        known = max(known, settled(other.found, search.noise, search.tangents)[1] + other.prior)
+    model = settled(best.found, every.noise, every.tangents)[1] + best.prior
+    return model + _of_outliers(every) > known + _of_outliers(search) + EXPLAINED
+
+
+def _of_outliers(search: "Search") -> float:
+    """Log density of what is set aside, with that of normal data without its constant for all others."""
+    recording, value = search.problem.recording, 0.0
+    for output in range(len(recording.outputs)):
+        here = mine(search.problem, output) & recording.observed
+        y, aside = recording.y[here], int((here & ~search.problem.keep).sum())
+        if aside:
+            density = RARE / (1 - RARE) * math.sqrt(2 * math.pi) / max(float(y.max() - y.min()), 1e-300)
+            value += aside * math.log(density)
+    return value
 
 
 def _sticking(search: "Search", problem: Problem, residual: Tensor) -> Tensor:

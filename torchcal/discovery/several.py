@@ -43,15 +43,17 @@ def refit_several(search: Search) -> None:
     for columns in _linear_pairs(search):
         wanted[tuple(int(search.screening.owner[k]) for k in columns)] = columns
     for model in single[: 1 if enough else 3]:
+        lead = model.numbers[0]
+        lead = search.twins[lead] if lead in search.gone else lead  # in a window they may differ, beside others not
         for j in _next_terms(search, model)[:5]:
-            wanted.setdefault(tuple(sorted((model.numbers[0], j))), None)
+            wanted.setdefault(tuple(sorted((lead, j))), None)
     pairs = [pair for pair in wanted if len(set(pair)) == 2][: FEWER if enough else MOST]
     prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))
     fitted = _refit_sets(search, [(pair, wanted[pair]) for pair in pairs], prior)
     search.models += fitted
-    lead = search.physical_leader
-    if lead is not None and len(lead.numbers) == 2:
-        twins = _refit_sets(search, [(pair, None) for pair in _swapped(search, lead) if pair not in pairs], prior)
+    best = search.physical_leader
+    if best is not None and len(best.numbers) == 2:
+        twins = _refit_sets(search, [(pair, None) for pair in _swapped(search, best) if pair not in pairs], prior)
         fitted += twins
         search.models += twins
     if isinstance(search.problem.recording.noise, Tensor):  # else a smaller noise makes physics of any small misfit

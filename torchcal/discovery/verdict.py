@@ -19,10 +19,12 @@ __all__ = ["Decision", "base_alone", "decide"]
 NAMED = 0.97
 #: The same among hypotheses of more terms too.
 NAMED_AMONG_LARGER = 0.8
-#: And at least this among all, "none of these" and the base included.
-SURE = 0.7
+#: And at least this among all, "none of these" and the base included: a wrong name costs more than three right ones.
+SURE = 0.75
 #: The same of one beside which something else is likely: two wrong ones can do together what none of these does alone.
 SURE_OF_PART = 0.85
+#: Probability of "none of these" from which on the verdict is that; where it has what is missing to 1, it is tied.
+UNKNOWN = 0.7
 #: Log odds behind the best model up to which one with fewer terms may be named for what all share.
 BEHIND = 5.0
 #: Structure left after a hypothesis with less probability than this by noise alone speaks against it.
@@ -41,8 +43,9 @@ LEAST_FITTED = 4
 TIED = 0.98
 #: Of a recording without noise, the share of the held-out misfit that a named term must remove.
 REMOVED = 0.9
-#: The same of a recording whose noise is unknown, and how much more of the misfit every rival must leave.
-NEARLY, BEATEN = 0.97, 3.0
+#: The same of a recording whose noise is unknown, how much more of the misfit every rival must leave, how many times
+#: its noise may be left, and data a free parameter that tell what is noise.
+NEARLY, BEATEN, LEFT, PLENTY = 0.97, 3.0, 3.0, 20
 
 
 class Decision:
@@ -125,7 +128,7 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         return decision
     groups = _groups(ranked)
     white = [m for m in ranked[:6] if search.examine(m).p_value >= WHITE and _small(search, m)]
-    if not white or decision.none > SURE:
+    if not white or decision.none > UNKNOWN:
         decision.verdict = "unexplained"
         _nearly(search, ranked, mask, decision)
         return decision
@@ -157,7 +160,7 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         decision.tied.append(list(model.names))
         decision.tied_models.append(model)
         _tie_other_names(search, model, decision)
-    if len(decision.tied) < 2 or decision.none > 1 - SURE:  # one alone is not sure enough, or it had been named
+    if len(decision.tied) < 2 or decision.none > 1 - UNKNOWN:  # one alone is not sure enough, or it had been named
         decision.tied.append(list(NONE))
     return decision
 
@@ -307,8 +310,10 @@ def _nearly(search: Search, ranked: list[Model], mask: Tensor | None, decision: 
         best = mine[0]
         if explain.removed(search, best) < NEARLY or _gain(search, best, mask) < REMOVED:
             continue
-        if best.found.chi2 > (1 - REMOVED) * search.base.chi2 or left_open(search, best):
-            continue  # most of the misfit was noise; or the data do not determine what is added
+        most = min((1 - REMOVED) * search.base.chi2, LEFT**2 * search.problem.n)
+        few = distinct(search.problem) < PLENTY * len(best.found.free)
+        if best.found.chi2 > most or few or left_open(search, best):
+            continue  # most of the misfit was noise, or most of what is left is not; or the data leave it open
         left = 1.0 - explain.removed(search, best)
         rivals = [m for m in mine[1:] if frozenset(m.names) != frozenset(best.names)]
         if not _other_names(search, best) and all(1.0 - explain.removed(search, m) > BEATEN * left for m in rivals):

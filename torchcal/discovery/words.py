@@ -12,6 +12,8 @@ __all__ = ["paragraph", "percent"]
 
 #: Correlation from sample to sample from which on noise is called slow.
 SLOW = 0.3
+#: Share of the misfit beyond noise below which there is hardly any to remove.
+LITTLE = 0.005
 #: Hypotheses that hold a named term and more, of which the paragraph lists so many.
 MORE = 4
 
@@ -186,10 +188,13 @@ def _named(d: Any) -> list[str]:
     probability = sum(row.probability for row in mine)
     with_others = " alone or with others" if d.tied else ""
     likely = "" if d.settings.get("nearly") else f"probability{with_others} {probability:.3f}; "
+    does = f"removes {percent(top.misfit_removed)} of the misfit beyond noise"
+    if top.misfit_removed < LITTLE:  # the base's misfit is as large as noise, and has a shape
+        does = f"lowers χ² from {d.base.chi2:.4g} to {d.final.chi2:.4g}"
     parts = [
         _where(d),
-        f"Adding {_and([_with_region(d, name) for name in d.terms])} and refitting everything removes "
-        f"{percent(top.misfit_removed)} of the misfit beyond noise ({likely}{estimates}).",
+        f"Adding {_and([_with_region(d, name) for name in d.terms])} and refitting everything {does} "
+        f"({likely}{estimates}).",
     ]
     if d.settings.get("nearly"):
         apart = "" if d.held_out is None else "on held-out data too, "
