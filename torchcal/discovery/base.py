@@ -151,7 +151,9 @@ def _unwound(found: Fitted) -> Fitted:
     if torch.equal(values, found.values):
         return found
     again = fit(found.problem, found.whitening, values[None], found.free)
-    return found if again is None else dataclasses.replace(again, agreeing=found.agreeing)
+    if again is None or again.chi2 > found.chi2 + SAME_FIT:
+        return found
+    return dataclasses.replace(again, agreeing=found.agreeing)
 
 
 def _again(found: Fitted, keep: Tensor) -> Fitted:

@@ -20,7 +20,7 @@ from torchcal.discovery.experiment import propose
 from torchcal.discovery.fitting import Fitted, starts
 from torchcal.discovery.limits import limits
 from torchcal.discovery.model import PRIOR, Model
-from torchcal.discovery.own_noise import explains, fits_by_chance, other_growth, outdone, outliers
+from torchcal.discovery.own_noise import EXPLAINED, explains, fits_by_chance, other_growth, outdone, outliers
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.records import NONE, Estimate, Hypothesis, Scores, Table
 from torchcal.discovery.result import Diagnosis
@@ -138,17 +138,15 @@ def diagnose(
         if holdout is None and mask is not None and _beyond_prediction(search, mask):
             mask = verify.within(recording)
         search, detected = _settled(search, problem, confidence)
+        suspect: tuple[str, ...] = ()
         if terms and search.problem.n < problem.n and not (detected and explains(search)):
             # What the best model misses is no outlier of it; where there is none, all physics may have been set aside.
-            every = dataclasses.replace(search, problem=problem, clean=True)
-            every.calibrate_base()
-            every, more = _settled(every, problem, confidence)
-            if more and outdone(search, every, detected):
-                search, detected = every, True
+            every, suspect = _with_all(search, problem, detected, confidence)
+            search, detected = (search, detected) if every is None else (every, True)
         if detected and terms:
             refit_several(search)
         decision = decide(search, detected, mask)
-        return _result(search, decision, simulator, recording, mask, confidence, begun, given, seed)
+        return _result(search, decision, simulator, recording, mask, confidence, begun, given, seed, suspect)
     finally:
         bar.close()
 
@@ -171,6 +169,28 @@ def _settled(search: Search, observed: Problem, confidence: float) -> tuple[Sear
         search.calibrate_base()
         detected = _refit(search, confidence)
     return search, detected
+
+
+def _with_all(
+    search: Search, observed: Problem, detected: bool, confidence: float
+) -> tuple[Search | None, tuple[str, ...]]:
+    """The search of all observed data, where its best model is clearly likelier than outliers.
+
+    Where they are too few to prove it, the names of what may explain them are returned instead.
+    """
+    every = dataclasses.replace(search, problem=observed, clean=True, unit=None)
+    every.calibrate_base()
+    every.screen_all()
+    every.refit_singles()
+    odds, spare = outdone(search, every, detected)
+    if odds <= EXPLAINED or spare <= 0:
+        sticking = outliers(every, observed.keep)
+        if sticking is None or not 0 < int(sticking.sum()) < observed.n - search.problem.n:
+            best = every.physical_leader
+            return None, best.names if best is not None and odds > 0 else ()
+    every, _ = _settled(every, observed, confidence)
+    odds, spare = outdone(search, every, detected)
+    return (every if odds > EXPLAINED and spare > 0 else None), ()
 
 
 def _refit(search: Search, confidence: float) -> bool:
@@ -290,6 +310,7 @@ def _result(
     begun: float,
     terms: list[Term],
     seed: int,
+    suspect: tuple[str, ...],
 ) -> Diagnosis:
     best = decision.best
     shown = best or (decision.tied_models[0] if decision.tied_models else None)
@@ -336,7 +357,7 @@ def _result(
         missing=explain.missing_rate(search) if decision.verdict != "consistent" else None,
         experiment=propose(decision.tied_models, search.noise) if decision.tied_models else None,
         equations=explain.formulas(best) if best else [],
-        identifiability=explain.identifiability(search),
+        identifiability=explain.identifiability(search) + ([] if best is None else explain.other_minima(search, best)),
         recording=recording,
         simulator=simulator,
         held_out=mask,
@@ -348,6 +369,7 @@ def _result(
             "withdrawn": decision.withdrawn,
             "doubt": decision.doubt,
             "nearly": decision.nearly,
+            "set_aside": suspect,
             "region": None if best is None else best.where,
             "solver": _solver(search.problem.simulator),
         },

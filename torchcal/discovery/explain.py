@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.channels import Channel
-from torchcal.discovery.fitting import Fitted
+from torchcal.discovery.fitting import Fitted, fit, starts
 from torchcal.discovery.local import region_text
 from torchcal.discovery.model import Model
 from torchcal.discovery.noise import estimate
@@ -22,6 +22,7 @@ __all__ = [
     "locate",
     "missing_rate",
     "needed_shifts",
+    "other_minima",
     "symptoms",
 ]
 
@@ -36,6 +37,9 @@ APART = 5.0
 
 #: A span begins where the estimated change exceeds this share of its largest magnitude.
 SPAN_LEVEL = 0.3
+#: Starts from which what is named is fitted again, and steps; a minimum that is higher by less than `RIVAL` in χ² and
+#: more than `ELSEWHERE` sd away is another one.
+STARTS, AGAIN, RIVAL, ELSEWHERE = 4, 60, 4.0, 4.0
 #: A base parameter that moves by this many sd when a term is added was bent by it.
 BENT = 3.0
 
@@ -263,6 +267,31 @@ def identifiability(search: Search) -> list[str]:
                     f"{search.candidates[j].name} and {candidate.name} are nearly the same here (correlation {c:.3f})"
                 )
     return rows[:12]
+
+
+def other_minima(search: Search, model: Model) -> list[str]:
+    """Other estimates of a named term's size that fit about as well, from the base's first guesses.
+
+    The sd that are given are those within one minimum.
+    """
+    found, candidate = model.found, model.candidate
+    sd, neutral = found.sd(), dict(zip(candidate.own, candidate.neutral.tolist(), strict=True))
+    # Where the size is open, as the scale of an unseen state leaves it, there is a valley and no other minimum.
+    places = [i for i in candidate.amplitudes if 0 < float(sd[i]) < abs(float(found.values[i]) - neutral[i])]
+    held = [i for i in range(len(found.values)) if i not in found.free]
+    begin = starts(found.problem, STARTS, search.seed, {i: float(found.values[i]) for i in (*held, *candidate.own)})
+    if search.exact or not places:
+        return []
+    again = fit(found.problem, found.whitening, begin, found.free, max_steps=AGAIN, finish=0)
+    if again is None or again.ends is None or again.ends_chi2 is None:
+        return []
+    for k in again.ends_chi2.argsort().tolist():
+        more = float(again.ends_chi2[k]) - found.chi2
+        away = (again.ends[k] - found.values).abs()
+        if more < RIVAL and any(float(away[i]) > ELSEWHERE * float(sd[i]) for i in places):
+            values = [f"{found.problem.parameters[i].name} = {float(again.ends[k, i]):.3g}" for i in places]
+            return [f"{', '.join(values)} fits about as well (χ² {more:+.2g}): the sd given holds around one minimum"]
+    return []
 
 
 def _told_apart(search: Search, i: int, j: int) -> bool:

@@ -210,7 +210,8 @@ def fit(
     if not bool(alive.all()):  # infinite trajectories would poison the batch
         values, y, jacobian, residual, chi2 = (t[alive] for t in (values, y, jacobian, residual, chi2))
         warm = warm[alive] if isinstance(warm, Tensor) else None
-        target = target[alive] if data is not None else target
+        if data is not None:
+            target, data = target[alive], data[alive]
     damping = torch.full_like(chi2, 1e-3)
     size = torch.zeros(len(values), len(free), dtype=torch.float64)
     done = torch.zeros(len(values), dtype=torch.bool)

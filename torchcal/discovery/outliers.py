@@ -68,6 +68,8 @@ def lone(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
             size = size.maximum(sd[problem.index[places]])
         far = (r.abs() > LONE * size) & (size > 0)
         if problem.order is None:
+            worst = far & (r.abs() >= 0.5 * r.abs().max())
+            far = worst if int(worst.sum()) == 1 else far  # it draws the fit off those around it
             found[places] = far & (not _clustered(problem, places, far))
             continue
         beside = torch.maximum(r.roll(1) * r.sign(), r.roll(-1) * r.sign())

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.base import growing
-from torchcal.discovery.fitting import refit
+from torchcal.discovery.fitting import Fitted, refit
 from torchcal.discovery.likeliest import alone, log_likelihood, settled
 from torchcal.discovery.model import PRIOR, Model
 from torchcal.discovery.noise import Noise, mine
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from torchcal.discovery.search import Search
 
 __all__ = [
+    "EXPLAINED",
     "explains",
     "fits_by_chance",
     "other_growth",
@@ -149,21 +150,38 @@ def explains(search: "Search") -> bool:
     return search.leader is not None and search.leader.log_evidence >= CLEAR
 
 
-def outdone(search: "Search", every: "Search", detected: bool) -> bool:
-    """Whether a model of ``every``, which sets fewer data aside or none, is clearly likelier than any hypothesis of
-    ``search`` (than the base, where it has not ``detected`` anything) with the outliers that these leave.
+def outdone(search: "Search", every: "Search", detected: bool) -> tuple[float, int]:
+    """How much likelier one search's best model is than another's, with the outliers of each.
 
-    An outlier is drawn evenly from the range of its output's data. A model explains as many of them at least as it has
-    parameters more than the base: a curve goes through fewer wherever they are.
+    Args:
+        search: With more data set aside; its best hypothesis is the base, where it has not ``detected`` anything.
+        every: With fewer set aside, or none.
+        detected: Whether ``search`` has more than noise.
+
+    Returns:
+        Log odds, and how many more data the model of ``every`` explains than it has
+        parameters: one datum that shows one parameter alone is always explained by it. An outlier is drawn evenly from
+        the range of its output's data.
     """
     best, other = every.physical_leader, search.physical_leader if detected else None
-    if best is None or every.problem.n - search.problem.n < max(len(best.candidate.own), 1):
-        return False
-    known = settled(search.base, search.noise, search.tangents)[1] + math.log(PRIOR["base"])
+    if best is None:
+        return -math.inf, 0
+    known = _density(search, search.base) + math.log(PRIOR["base"])
     if other is not None:
-        known = max(known, settled(other.found, search.noise, search.tangents)[1] + other.prior)
-    model = settled(best.found, every.noise, every.tangents)[1] + best.prior
-    return model + _of_outliers(every) > known + _of_outliers(search) + EXPLAINED
+        known = max(known, _density(search, other.found) + other.prior)
+    odds = _density(every, best.found) + best.prior - known
+    return odds, every.problem.n - search.problem.n - len(best.candidate.own)
+
+
+def _density(search: "Search", found: Fitted) -> float:
+    """Log density of all data, without constants: normal with the noise that suits a fit, and what is set aside.
+
+    Not integrated over the base's parameters: which of them there are to integrate over, and how far away the data lie
+    that they are told by, is not the same for other data.
+    """
+    w = alone(found, search.noise, search.tangents)[0].whitening(found.problem)
+    size = 0.5 * float(torch.log1p(-w.correlation.square()).sum()) + float(w.sd.log().sum())
+    return _of_outliers(search) - size - 0.5 * float(w.vector(found.residual).square().sum())
 
 
 def _of_outliers(search: "Search") -> float:

@@ -45,7 +45,7 @@ def refit_several(search: Search) -> None:
     for model in single[: 1 if enough else 3]:
         lead = model.numbers[0]
         lead = search.twins[lead] if lead in search.gone else lead  # in a window they may differ, beside others not
-        for j in _next_terms(search, model)[:5]:
+        for j in [j for j in _next_terms(search, model) if j != lead][:5]:
             wanted.setdefault(tuple(sorted((lead, j))), None)
     pairs = [pair for pair in wanted if len(set(pair)) == 2][: FEWER if enough else MOST]
     prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))

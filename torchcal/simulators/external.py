@@ -283,7 +283,9 @@ class _Differenced(torch.autograd.Function):
         double = (above - below).detach().diagonal(dim1=0, dim2=3).permute(2, 0, 1)  # (count, rows, length)
         double = double.expand(count, rows, n).repeat(1, 1, up.shape[-1] // n)
         change = _over_two_steps(up, down, lambda: _Differenced.apply(picked, ctx.job))
-        parts = change / double * slope[used].to(up)
+        # Where there is no slope at all, none is asked for, or NaN would spread to the other conditions.
+        asked = (slope[used].to(up) != 0) | change.isfinite()
+        parts = torch.where(asked, change, torch.zeros_like(change)) / double * slope[used].to(up)
         if length == 1:
             grad = parts.sum(-1, keepdim=True)
         else:
