@@ -8,7 +8,7 @@ from typing import Any
 from torchcal.discovery.channels import RUN
 from torchcal.discovery.records import NONE
 
-__all__ = ["listed", "paragraph", "percent"]
+__all__ = ["paragraph", "percent"]
 
 #: Correlation from sample to sample from which on noise is called slow.
 SLOW = 0.3
@@ -29,7 +29,7 @@ def _probability(p: float) -> str:
     return f"{p:.2g}" if p >= 0.001 else "< 0.001"
 
 
-def listed(names: list[str]) -> str:
+def _and(names: list[str]) -> str:
     """Names in a sentence."""
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
 
@@ -60,7 +60,7 @@ def _headline(d: Any) -> str:
     if d.verdict == "consistent":
         return "Verdict: consistent (nothing is missing that these data could show)"
     if d.verdict == "named":
-        return f"Verdict: named: {listed([_with_region(d, name) for name in d.terms])}"
+        return f"Verdict: named: {_and([_with_region(d, name) for name in d.terms])}"
     if d.verdict == "ambiguous":
         return "Verdict: ambiguous: " + ", or ".join(_hypothesis(d, tied) for tied in d.tied)
     return "Verdict: unexplained (something is missing that is not in this library)"
@@ -105,7 +105,7 @@ def _set_aside(d: Any) -> str:
     if not d.settings.get("set_aside"):
         return ""
     return (
-        f"What was set aside as outliers may also be explained by {listed(list(d.settings['set_aside']))}; so few data "
+        f"What was set aside as outliers may also be explained by {_and(list(d.settings['set_aside']))}; so few data "
         "cannot tell. Repeat them."
     )
 
@@ -204,7 +204,7 @@ def _named(d: Any) -> list[str]:
         does = f"lowers χ² from {d.base.chi2:.4g} to {d.final.chi2:.4g}"
     parts = [
         _where(d),
-        f"Adding {listed([_with_region(d, name) for name in d.terms])} and refitting everything {does} "
+        f"Adding {_and([_with_region(d, name) for name in d.terms])} and refitting everything {does} "
         f"({likely}{estimates}).",
     ]
     if d.settings.get("nearly"):
@@ -218,7 +218,7 @@ def _named(d: Any) -> list[str]:
         stands = f"stands {behind:.1f} natural-log units of evidence behind"
         if behind < 0:
             stands = f"has {-behind:.1f} natural-log units more evidence, and a probability of {rival.probability:.2g}"
-        parts.append(f"The next best{' without it' if d.tied else ''}, {listed(list(rival.terms))}, {stands}.")
+        parts.append(f"The next best{' without it' if d.tied else ''}, {_and(list(rival.terms))}, {stands}.")
     parts.append(_proof(d))
     if d.tied:
         parts += _larger(d)
@@ -236,7 +236,7 @@ def _larger(d: Any) -> list[str]:
     """What is likely beside the named terms."""
     more = [row for row in d.ranking if _holds(d, row) and set(row.terms) != set(d.terms)]
     shown = [row for row in more[:MORE] if row.probability >= 0.005]
-    listed = [f"{listed([name for name in row.terms if name not in d.terms])} ({row.probability:.2f})" for row in shown]
+    listed = [f"{_and([name for name in row.terms if name not in d.terms])} ({row.probability:.2f})" for row in shown]
     if len(more) > len(shown):
         listed.append("others")
     together = sum(row.probability for row in more)
@@ -262,14 +262,14 @@ def _ambiguous(d: Any) -> list[str]:
             return [_where(d), f"{_hypothesis(d, known[0])} explains it best. {d.settings['doubt']}"]
         return [
             _where(d),
-            f"{listed(known[0])}, the best explanation in the library, has a probability of {sure:.2f}, which is too "
+            f"{_and(known[0])}, the best explanation in the library, has a probability of {sure:.2f}, which is too "
             f"little for a name: something that is not in the library has {unknown:.2f}, other terms and the base "
             f"alone have {max(1 - sure - unknown, 0.0):.2f} together. More data, or less noise, would tell.",
         ]
     parts = [_where(d), f"{len(known)} hypotheses explain it about as well, and these data cannot exclude any of them."]
     shared = [name for name in known[0] if all(name in tied for tied in known)]
     if shared:
-        parts.append(f"All of them have {listed(shared)}.")
+        parts.append(f"All of them have {_and(shared)}.")
     if d.settings.get("doubt"):
         parts.append(d.settings["doubt"].replace("it ", "the best of them ", 1))
     if len(known) < len(d.tied):
