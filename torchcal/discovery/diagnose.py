@@ -19,15 +19,16 @@ from torchcal.discovery.embedded import embed_each, model_error_sd
 from torchcal.discovery.experiment import propose
 from torchcal.discovery.fitting import Fitted, starts
 from torchcal.discovery.limits import limits
-from torchcal.discovery.model import PRIOR, Model
-from torchcal.discovery.own_noise import EXPLAINED, explains, fits_by_chance, other_growth, outdone, outliers
+from torchcal.discovery.model import Model
+from torchcal.discovery.own_noise import explains
 from torchcal.discovery.problem import Problem
-from torchcal.discovery.records import NONE, Estimate, Hypothesis, Scores, Table
+from torchcal.discovery.ranking import ranking
+from torchcal.discovery.records import Scores, Table
 from torchcal.discovery.result import Diagnosis
+from torchcal.discovery.rounds import settle, with_all
 from torchcal.discovery.search import Search
 from torchcal.discovery.several import refit_several
-from torchcal.discovery.verdict import PLAINLY_WHITE, Decision, base_alone, decide
-from torchcal.discovery.windows import refit_local
+from torchcal.discovery.verdict import PLAINLY_WHITE, Decision, decide
 from torchcal.errors import ConvergenceWarning, DomainError, RecordingError
 from torchcal.polychaos._checks import whole
 from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories
@@ -36,22 +37,10 @@ from torchcal.terms import Term, extend
 
 __all__ = ["diagnose"]
 
-#: How often everything is fitted again because other data turned out to be outliers.
-ROUNDS = 3
-#: Share of the level at which a fit to few data counts as more than noise by itself.
-FEW_DATA = 0.1
 #: RMSE of a calibrated base, in the data's spread, from which on it explains nothing.
 NO_BETTER = 0.95
-#: Times the level up to which a misfit that noise alone gives counts as more than that where the base, beside the
-#: refitted candidates, is as improbable as the level: a statistic for all kinds of misfit sees each kind less well.
-OFTEN = 5.0
 #: Power of the stated detection limits.
 POWER = 0.95
-
-COLUMNS = (
-    "terms", "region", "log_evidence", "probability", "misfit_removed", "p_white", "physical", "estimates",
-    "held_out_rmse", "score", "refitted", "aliases", "note",
-)  # fmt: skip
 
 
 def diagnose(
@@ -137,79 +126,19 @@ def diagnose(
         search.calibrate_base()
         if holdout is None and mask is not None and _beyond_prediction(search, mask):
             mask = verify.within(recording)
-        search, detected = _settled(search, problem, confidence)
+        search, detected = settle(search, problem, confidence)
         suspect: tuple[str, ...] = ()
         if terms and search.problem.n < problem.n and not (detected and explains(search)):
             # What the best model misses is no outlier of it; where there is none, all physics may have been set aside.
-            every, suspect = _with_all(search, problem, detected, confidence)
-            search, detected = (search, detected) if every is None else (every, True)
+            every, suspect = with_all(search, problem, detected, confidence)
+            if every is not None:
+                search, detected = every, True
         if detected and terms:
             refit_several(search)
         decision = decide(search, detected, mask)
         return _result(search, decision, simulator, recording, mask, confidence, begun, given, seed, suspect)
     finally:
         bar.close()
-
-
-def _settled(search: Search, observed: Problem, confidence: float) -> tuple[Search, bool]:
-    """Screen and refit, again where others of the observed data turn out to be outliers, or the noise to grow."""
-    detected = _refit(search, confidence)
-    seen = [search.problem.keep]
-    for _ in range(ROUNDS):
-        sticking = outliers(search, observed.keep) if detected else None
-        unit = other_growth(search) if detected else None
-        if sticking is not None and any(torch.equal(keep, observed.keep & ~sticking) for keep in seen):
-            sticking = None
-        if sticking is None and unit is None:
-            break
-        # Others than at the base, whose misfit hides them and looks like some; and noise that grows, or does not.
-        kept = search.problem if sticking is None else observed.keeping(~sticking)
-        search = dataclasses.replace(search, problem=kept, clean=True, unit=search.unit if unit is None else unit)
-        seen.append(search.problem.keep)
-        search.calibrate_base()
-        detected = _refit(search, confidence)
-    return search, detected
-
-
-def _with_all(
-    search: Search, observed: Problem, detected: bool, confidence: float
-) -> tuple[Search | None, tuple[str, ...]]:
-    """The search of all observed data, where its best model is clearly likelier than outliers.
-
-    Where they are too few to prove it, the names of what may explain them are returned instead.
-    """
-    every = dataclasses.replace(search, problem=observed, clean=True, unit=None)
-    every.calibrate_base()
-    every.screen_all()
-    every.refit_singles()
-    odds, spare = outdone(search, every, detected)
-    if odds <= EXPLAINED or spare <= 0:
-        sticking = outliers(every, observed.keep)
-        if sticking is None or not 0 < int(sticking.sum()) < observed.n - search.problem.n:
-            best = every.physical_leader
-            return None, best.names if best is not None and odds > 0 else ()
-    every, _ = _settled(every, observed, confidence)
-    odds, spare = outdone(search, every, detected)
-    return (every if odds > EXPLAINED and spare > 0 else None), ()
-
-
-def _refit(search: Search, confidence: float) -> bool:
-    """Screen and refit single terms, and local ones where there is more than noise, which is returned."""
-    search.screen_all()
-    detected = at_once = search.exact or search.p_detect < 1.0 - confidence
-    if search.terms:
-        search.refit_singles(detected=detected)
-        level = 1.0 - confidence
-        if not detected and search.few and (p := fits_by_chance(search)) < FEW_DATA * level:
-            detected, search.p_detect = True, min(p, search.p_detect)
-        elif not detected:
-            detected = search.p_detect < OFTEN * level and base_alone(search) < level
-        if detected and not at_once:
-            search.models = []
-            search.refit_singles()
-        if detected:
-            refit_local(search)
-    return detected
 
 
 def _check(simulator: Any, recording: Any, candidates: Any, confidence: float) -> list[Term]:
@@ -337,7 +266,7 @@ def _result(
         terms=_in_order(search, best) if best else [],
         tied=decision.tied,
         where=explain.locate(search, shown) if decision.verdict != "consistent" else Table([], ("kind", "target")),
-        ranking=_ranking(search, decision, mask),
+        ranking=ranking(search, decision, mask),
         detection_limit=limits(
             search, 1.0 - confidence, POWER, [term for term in terms if _contains(simulator, term)]
         ),
@@ -423,80 +352,3 @@ def _warn(search: Search, verdict: str) -> None:
             ConvergenceWarning,
             stacklevel=4,
         )
-
-
-def _ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[Hypothesis]:
-    rows = []
-    alike: dict[int, tuple[Model, float]] = {}
-    ordered = sorted(search.models, key=lambda m: -decision.probability.get(id(m), 0.0))
-    listed = ordered[:60]
-    if decision.best is not None and decision.best not in listed:
-        listed.append(decision.best)
-    for place, model in enumerate(listed):
-        held = None
-        if mask is not None and (place < 3 or model is decision.best):
-            apart = search.held_out(model.found, mask)
-            if apart is not None and bool((mask & search.problem.keep).any()):
-                held = verify.score(
-                    search.problem.recording, apart.prediction, apart.sd, mask & search.problem.keep
-                ).rmse
-        names = [q.name for q in model.candidate.problem.parameters]
-        own: tuple[Estimate, ...] = explain.estimates(model.found, [i for i in model.candidate.own if names[i]])
-        others = search.aliases.get(model.numbers[0], []) if model in search.plain.values() else []
-        share = decision.probability.get(id(model), 0.0) / (1 + len(others))  # nothing tells which of them it is
-        for j in others:
-            alike[j] = (model, share)
-        rows.append(
-            Hypothesis(
-                terms=model.names,
-                log_evidence=model.log_evidence,
-                probability=share,
-                estimates=own,
-                physical=model.physical,
-                misfit_removed=explain.removed(search, model),
-                p_white=model.structure.p_value if model.structure else None,
-                held_out_rmse=held,
-                score=search.screening.score(model.numbers[0]) if len(model.numbers) == 1 else None,
-                refitted=True,
-                region=model.where,
-                aliases=tuple(search.candidates[j].name for j in others),
-                note=model.note,
-            )
-        )
-    fitted = {m.numbers for m in search.models}
-    for i, candidate in enumerate(search.candidates):
-        if i in alike:
-            model, share = alike[i]
-            own_fit = search.merged.get(i)
-            rows.append(
-                Hypothesis(
-                    (candidate.name,),
-                    model.log_evidence,
-                    share,
-                    estimates=() if own_fit is None else explain.estimates(own_fit.found, own_fit.candidate.own),
-                    physical=model.physical,
-                    misfit_removed=explain.removed(search, model),
-                    score=search.screening.score(i),
-                    refitted=own_fit is not None,
-                    note=f"the same as {model.names[0]} here",
-                )
-            )
-        elif (i,) not in fitted:
-            seen = candidate.blind or search.screening.best[i] >= 0
-            note = "" if seen else "already in the base model"
-            note = "no fit from any starting value" if i in search.failed else note
-            rows.append(Hypothesis((candidate.name,), -math.inf, 0.0, score=search.screening.score(i), note=note))
-    rows.append(
-        Hypothesis((), 0.0, decision.base, p_white=search.structure.p_value, refitted=True, note="the base alone")
-    )
-    if not search.exact:
-        rows.append(
-            Hypothesis(
-                NONE,
-                decision.none_evidence - math.log(PRIOR["none"]),
-                decision.none,
-                note="something unknown and smooth",
-            )
-        )
-    rows.sort(key=lambda row: (-row.probability, -row.log_evidence))
-    return Table(rows, COLUMNS)

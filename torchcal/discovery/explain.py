@@ -278,10 +278,10 @@ def other_minima(search: Search, model: Model) -> list[str]:
     sd, neutral = found.sd(), dict(zip(candidate.own, candidate.neutral.tolist(), strict=True))
     # Where the size is open, as the scale of an unseen state leaves it, there is a valley and no other minimum.
     places = [i for i in candidate.amplitudes if 0 < float(sd[i]) < abs(float(found.values[i]) - neutral[i])]
-    held = [i for i in range(len(found.values)) if i not in found.free]
-    begin = starts(found.problem, STARTS, search.seed, {i: float(found.values[i]) for i in (*held, *candidate.own)})
     if search.exact or not places:
         return []
+    held = [i for i in range(len(found.values)) if i not in found.free]
+    begin = starts(found.problem, STARTS, search.seed, {i: float(found.values[i]) for i in (*held, *candidate.own)})
     again = fit(found.problem, found.whitening, begin, found.free, max_steps=AGAIN, finish=0)
     if again is None or again.ends is None or again.ends_chi2 is None:
         return []

@@ -18,7 +18,7 @@ from torchcal.discovery.noise import GRID, LEAST, SHRINK, Noise, estimate, least
 from torchcal.discovery.problem import Whitening
 from torchcal.discovery.structure import Residual, evidences, responses_of
 
-__all__ = ["Tangents", "alone", "log_likelihood", "settled", "with_unknown"]
+__all__ = ["Tangents", "alone", "log_likelihood", "log_normal", "settled", "with_unknown"]
 
 #: Places in `GRID` of the coefficients that are tried beside something unknown, and how often for every output.
 TRIED, ROUNDS = (0, 8, 16, 24, 30, 36), 2
@@ -77,10 +77,16 @@ def log_likelihood(found: Fitted, noise: Noise, tangents: Tangents) -> float:
 
 
 def _log_density(w: Whitening, e: Tensor, noise: Noise, tangents: Tangents) -> float:
-    size = 0.5 * float(torch.log1p(-w.correlation.square()).sum()) + float(w.sd.log().sum())
+    found = log_normal(w, e) - SHRINK * float(noise.correlation.sum())
     if tangents.directions.shape[1]:
-        size += float(torch.linalg.qr(w(tangents.directions)).R.diagonal().abs().log().sum())
-    return -size - 0.5 * float(e.square().sum()) - SHRINK * float(noise.correlation.sum())
+        found -= float(torch.linalg.qr(w(tangents.directions)).R.diagonal().abs().log().sum())
+    return found
+
+
+def log_normal(w: Whitening, e: Tensor) -> float:
+    """Log density of data by their whitened residual ``(n,)``, without the constant of 2π."""
+    size = 0.5 * float(torch.log1p(-w.correlation.square()).sum()) + float(w.sd.log().sum())
+    return -size - 0.5 * float(e.square().sum())
 
 
 def alone(found: Fitted, noise: Noise, tangents: Tangents) -> tuple[Noise, float]:

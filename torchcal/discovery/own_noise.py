@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchcal.discovery.base import growing
 from torchcal.discovery.fitting import Fitted, refit
-from torchcal.discovery.likeliest import alone, log_likelihood, settled
+from torchcal.discovery.likeliest import alone, log_likelihood, log_normal, settled
 from torchcal.discovery.model import PRIOR, Model
 from torchcal.discovery.noise import Noise, mine
 from torchcal.discovery.outliers import lone, spikes
@@ -159,9 +159,8 @@ def outdone(search: "Search", every: "Search", detected: bool) -> tuple[float, i
         detected: Whether ``search`` has more than noise.
 
     Returns:
-        Log odds, and how many more data the model of ``every`` explains than it has
-        parameters: one datum that shows one parameter alone is always explained by it. An outlier is drawn evenly from
-        the range of its output's data.
+        Log odds, and how many more data the model of ``every`` explains than it has parameters: one datum that shows
+        one parameter alone is always explained by it. An outlier is drawn evenly from the range of its output's data.
     """
     best, other = every.physical_leader, search.physical_leader if detected else None
     if best is None:
@@ -180,8 +179,7 @@ def _density(search: "Search", found: Fitted) -> float:
     that they are told by, is not the same for other data.
     """
     w = alone(found, search.noise, search.tangents)[0].whitening(found.problem)
-    size = 0.5 * float(torch.log1p(-w.correlation.square()).sum()) + float(w.sd.log().sum())
-    return _of_outliers(search) - size - 0.5 * float(w.vector(found.residual).square().sum())
+    return _of_outliers(search) + log_normal(w, w.vector(found.residual))
 
 
 def _of_outliers(search: "Search") -> float:

@@ -47,7 +47,7 @@ def refit_several(search: Search) -> None:
         lead = search.twins[lead] if lead in search.gone else lead  # in a window they may differ, beside others not
         for j in [j for j in _next_terms(search, model) if j != lead][:5]:
             wanted.setdefault(tuple(sorted((lead, j))), None)
-    pairs = [pair for pair in wanted if len(set(pair)) == 2][: FEWER if enough else MOST]
+    pairs = list(wanted)[: FEWER if enough else MOST]
     prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))
     fitted = _refit_sets(search, [(pair, wanted[pair]) for pair in pairs], prior)
     search.models += fitted

@@ -222,7 +222,7 @@ def _named(d: Any) -> list[str]:
     parts.append(_proof(d))
     if d.tied:
         parts += _larger(d)
-    if d.remaining > 0.005:
+    if d.remaining > LITTLE:
         parts.append(f"{percent(d.remaining)} of the misfit remains unexplained.")
     return parts
 

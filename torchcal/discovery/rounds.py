@@ -1,0 +1,82 @@
+"""Screening and refitting again, where the best model tells other outliers, or other noise, than the base did."""
+
+import dataclasses
+
+import torch
+
+from torchcal.discovery.own_noise import EXPLAINED, fits_by_chance, other_growth, outdone, outliers
+from torchcal.discovery.problem import Problem
+from torchcal.discovery.search import Search
+from torchcal.discovery.verdict import base_alone
+from torchcal.discovery.windows import refit_local
+
+__all__ = ["settle", "with_all"]
+
+#: How often everything is fitted again because other data turned out to be outliers.
+ROUNDS = 3
+#: Share of the level at which a fit to few data counts as more than noise by itself.
+FEW_DATA = 0.1
+#: Times the level up to which a misfit that noise alone gives counts as more than that where the base, beside the
+#: refitted candidates, is as improbable as the level: a statistic for all kinds of misfit sees each kind less well.
+OFTEN = 5.0
+
+
+def settle(search: Search, observed: Problem, confidence: float) -> tuple[Search, bool]:
+    """Screen and refit, again where others of the observed data turn out to be outliers, or the noise to grow."""
+    detected = _refit(search, confidence)
+    seen = [search.problem.keep]
+    for _ in range(ROUNDS):
+        sticking = outliers(search, observed.keep) if detected else None
+        unit = other_growth(search) if detected else None
+        if sticking is not None and any(torch.equal(keep, observed.keep & ~sticking) for keep in seen):
+            sticking = None
+        if sticking is None and unit is None:
+            break
+        # Others than at the base, whose misfit hides them and looks like some; and noise that grows, or does not.
+        kept = search.problem if sticking is None else observed.keeping(~sticking)
+        search = dataclasses.replace(search, problem=kept, clean=True, unit=search.unit if unit is None else unit)
+        seen.append(search.problem.keep)
+        search.calibrate_base()
+        detected = _refit(search, confidence)
+    return search, detected
+
+
+def with_all(
+    search: Search, observed: Problem, detected: bool, confidence: float
+) -> tuple[Search | None, tuple[str, ...]]:
+    """The search of all observed data, where its best model is clearly likelier than outliers.
+
+    Where they are too few to prove it, the names of what may explain them are returned instead.
+    """
+    every = dataclasses.replace(search, problem=observed, clean=True, unit=None)
+    every.calibrate_base()
+    every.screen_all()
+    every.refit_singles()
+    odds, spare = outdone(search, every, detected)
+    if odds <= EXPLAINED or spare <= 0:
+        sticking = outliers(every, observed.keep)
+        if sticking is None or not 0 < int(sticking.sum()) < observed.n - search.problem.n:
+            best = every.physical_leader
+            return None, best.names if best is not None and odds > 0 else ()
+    every, _ = settle(every, observed, confidence)
+    odds, spare = outdone(search, every, detected)
+    return (every if odds > EXPLAINED and spare > 0 else None), ()
+
+
+def _refit(search: Search, confidence: float) -> bool:
+    """Screen and refit single terms, and local ones where there is more than noise, which is returned."""
+    search.screen_all()
+    detected = at_once = search.exact or search.p_detect < 1.0 - confidence
+    if search.terms:
+        search.refit_singles(detected=detected)
+        level = 1.0 - confidence
+        if not detected and search.few and (p := fits_by_chance(search)) < FEW_DATA * level:
+            detected, search.p_detect = True, min(p, search.p_detect)
+        elif not detected:
+            detected = search.p_detect < OFTEN * level and base_alone(search) < level
+        if detected and not at_once:
+            search.models = []
+            search.refit_singles()
+        if detected:
+            refit_local(search)
+    return detected
