@@ -15,6 +15,8 @@ __all__ = ["Fitted", "fit", "starts"]
 #: Relative change of χ² below which a fit has converged.
 TOLERANCE = 1e-7
 MAX_STEPS = 60
+#: Change of χ², in the residual's variance but at most in that of the noise, below which so many steps lead nowhere.
+CREEPING, STEPS = 0.02, 20
 #: More steps of the best alone, where it has not converged in those: along a bent valley they are short.
 FINISH = 240
 #: Samples that the slope at the beginning is taken from.
@@ -217,6 +219,7 @@ def fit(
     done = torch.zeros(len(values), dtype=torch.bool)
     lost = torch.zeros(len(values), dtype=torch.long)
     eager = torch.full_like(chi2, 0.2)
+    passed = [chi2.clone()]
     for _ in range(max_steps):
         if not free:
             break
@@ -279,6 +282,9 @@ def fit(
         )
         damping = torch.where(better, damping * ease, damping * 4.0)
         damping = damping.clamp(1e-9, 1e12)
+        passed.append(chi2.clone())
+        if len(passed) > STEPS:  # along a valley that is nearly flat
+            done = done | (passed[-1 - STEPS] - chi2 < CREEPING * (chi2 / problem.n).clamp_max(1.0))
         if bool(done.all()):
             break
     best = int(chi2.argmin())

@@ -12,7 +12,7 @@ from torchcal.discovery.base import growing
 from torchcal.discovery.fitting import Fitted, refit
 from torchcal.discovery.likeliest import alone, log_likelihood, log_normal, settled
 from torchcal.discovery.model import PRIOR, Model
-from torchcal.discovery.noise import Noise, mine
+from torchcal.discovery.noise import Noise, mine, orthonormal
 from torchcal.discovery.outliers import lone, spikes
 from torchcal.discovery.problem import Problem
 
@@ -23,6 +23,7 @@ __all__ = [
     "EXPLAINED",
     "explains",
     "fits_by_chance",
+    "isolated",
     "other_growth",
     "outdone",
     "outliers",
@@ -32,12 +33,14 @@ __all__ = [
 
 #: Log evidence of a model from which on what sticks out of it alone are outliers, and how many these may be.
 CLEAR, MOST_OUTLIERS = 10.0, 0.1
-#: Models that are fitted again with their own noise at the end.
-SETTLED = 10
+#: Models that are fitted again with their own noise at the end, those that are less far behind in log evidence.
+SETTLED, BEHIND = 10, 20.0
 #: How often what sticks out is judged anew without it.
 TRIMS = 3
 #: Share of outliers among data, and log odds from which on physics explains better what had been taken for some.
 RARE, EXPLAINED = 0.05, 5.0
+#: Share of its variance that a fit leaves of any datum at least, where residuals are scaled by it.
+LEAST_FREE = 0.05
 #: Log odds from which on something unknown is clearly likelier than the best model.
 LIKELIER = 3.0
 #: χ² a datum below which the noise estimated is its least, not the misfit's size: a residual so far below is rounding.
@@ -66,10 +69,13 @@ def weigh_alone(search: "Search") -> tuple[float, float]:
     """
     base = settled(search.base, search.noise, search.tangents)[1]
     here = log_likelihood(search.base, search.noise, search.tangents) - base
+    own = {id(m): alone(m.found, search.noise, search.tangents)[1] - base for m in search.models}
+    near = max((own[id(m)] + m.price + m.prior for m in search.models), default=0.0) - BEHIND
     leading = sorted(search.models, key=lambda m: -m.weight)[:SETTLED]
     for model in search.models:
-        judge = settled if model in leading else alone  # fitted again with its own noise, as the base is
-        found = judge(model.found, search.noise, search.tangents)[1] - base
+        found = own[id(model)]
+        if model in leading and found + model.price + model.prior > near:  # fitted again with its noise, as the base is
+            found = settled(model.found, search.noise, search.tangents)[1] - base
         model.in_use = search.gain(model.found.chi2) + here + model.price
         model.log_evidence = max(found + model.price, model.in_use)
     best = search.leader
@@ -145,6 +151,21 @@ def outliers(search: "Search", observed: Tensor) -> Tensor | None:
     return sticking if float(sticking.sum()) <= MOST_OUTLIERS * float(observed.sum()) else None
 
 
+def isolated(search: "Search") -> Tensor | None:
+    """Data that the base misses by far and alone, bool ``(n_total,)``; None where there are none, or too many.
+
+    With the ends of recordings: whether such data are outliers or all that is seen of some physics is to be weighed.
+    Residuals are scaled to one variance by their leverage: an unknown initial state follows the first sample.
+    """
+    if search.exact:
+        return None
+    base = search.base
+    basis = orthonormal(base.whitening(base.jacobian), cut=1e-7)
+    free = (1 - basis.square().sum(1)).clamp_min(LEAST_FREE).sqrt()
+    found = _sticking(search, base.problem, base.residual / free, ends=True)
+    return found if 0 < float(found.sum()) <= MOST_OUTLIERS * float(search.problem.n) else None
+
+
 def explains(search: "Search") -> bool:
     """Whether one model explains enough to tell what it leaves from outliers."""
     return search.leader is not None and search.leader.log_evidence >= CLEAR
@@ -194,12 +215,12 @@ def _of_outliers(search: "Search") -> float:
     return value
 
 
-def _sticking(search: "Search", problem: Problem, residual: Tensor) -> Tensor:
-    """Data that stick out alone of what a model leaves, bool ``(n_total,)``."""
+def _sticking(search: "Search", problem: Problem, residual: Tensor, ends: bool = False) -> Tensor:
+    """Data that stick out alone of what a model leaves, bool ``(n_total,)``; `lone` ones at ``ends`` too if wanted."""
     given = problem.recording.noise
     sd = given if isinstance(given, Tensor) else None
     if search.noise.open:
         residual = residual / search.noise.unit[problem.index]
     found = torch.zeros_like(problem.keep)
-    found[problem.index] = spikes(problem, residual, sd) | lone(problem, residual, sd)
+    found[problem.index] = spikes(problem, residual, sd) | lone(problem, residual, sd, ends)
     return found

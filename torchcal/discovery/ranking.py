@@ -12,8 +12,8 @@ from torchcal.discovery.verdict import Decision
 
 __all__ = ["ranking"]
 
-#: Models that get a row, and those of them that are scored on held-out data.
-LISTED, SCORED = 60, 3
+#: Models that get a row, those of them that are scored on held-out data, and how probable they must be.
+LISTED, SCORED, PROBABLE = 60, 3, 1e-3
 
 COLUMNS = (
     "terms", "region", "log_evidence", "probability", "misfit_removed", "p_white", "physical", "estimates",
@@ -27,7 +27,7 @@ def ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[Hy
     Args:
         search: The finished one.
         decision: With the probabilities.
-        mask: Held-out data, bool ``(n_total,)``, that the first models are scored on; None for none.
+        mask: Held-out data, bool ``(n_total,)``, that the first probable models are scored on; None for none.
     """
     ordered = sorted(search.models, key=lambda m: -decision.probability.get(id(m), 0.0))
     listed = ordered[:LISTED]
@@ -39,7 +39,7 @@ def ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[Hy
         others = search.aliases.get(model.numbers[0], []) if model in search.plain.values() else []
         share = decision.probability.get(id(model), 0.0) / (1 + len(others))  # nothing tells which of them it is
         alike |= {j: (model, share) for j in others}
-        scored = place < SCORED or model is decision.best
+        scored = model is decision.best or (place < SCORED and share > PROBABLE)
         rows.append(_refitted(search, model, share, others, _held_out(search, model, mask) if scored else None))
     fitted = {m.numbers for m in search.models}
     for i in range(len(search.candidates)):

@@ -4,7 +4,8 @@ import dataclasses
 
 import torch
 
-from torchcal.discovery.own_noise import EXPLAINED, fits_by_chance, other_growth, outdone, outliers
+from torchcal.discovery.base import MOST
+from torchcal.discovery.own_noise import EXPLAINED, fits_by_chance, isolated, other_growth, outdone, outliers
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.search import Search
 from torchcal.discovery.verdict import base_alone
@@ -22,8 +23,24 @@ OFTEN = 5.0
 
 
 def settle(search: Search, observed: Problem, confidence: float) -> tuple[Search, bool]:
-    """Screen and refit, again where others of the observed data turn out to be outliers, or the noise to grow."""
+    """Screen and refit, again without data that the base misses alone, as they may be all that was detected.
+
+    Returns:
+        The search, and whether there is more than noise.
+    """
     detected = _refit(search, confidence)
+    apart = isolated(search) if detected else None
+    if apart is not None:
+        kept = search.problem.keep & ~apart
+        if float(kept.sum()) >= (1 - MOST) * observed.n:
+            search = dataclasses.replace(search, problem=observed.keeping(kept), clean=True)
+            search.calibrate_base()
+            detected = _refit(search, confidence)
+    return _again(search, observed, detected, confidence)
+
+
+def _again(search: Search, observed: Problem, detected: bool, confidence: float) -> tuple[Search, bool]:
+    """Refit once more where others of the observed data turn out to be outliers of the best model, or noise to grow."""
     seen = [search.problem.keep]
     for _ in range(ROUNDS):
         sticking = outliers(search, observed.keep) if detected else None
@@ -58,7 +75,7 @@ def with_all(
         if sticking is None or not 0 < int(sticking.sum()) < observed.n - search.problem.n:
             best = every.physical_leader
             return None, best.names if best is not None and odds > 0 else ()
-    every, _ = settle(every, observed, confidence)
+    every, _ = _again(every, observed, _refit(every, confidence), confidence)
     odds, spare = outdone(search, every, detected)
     return (every if odds > EXPLAINED and spare > 0 else None), ()
 
