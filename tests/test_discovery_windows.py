@@ -52,7 +52,9 @@ def library(*names):
 @pytest.mark.parametrize(
     ("extra", "driver", "term", "span"),
     [
-        (lambda t, x, v: -1.5 * v**3 if 4 < t < 9 else 0.0, "t", "cubic drag", (4.0, 9.0)),
+        pytest.param(
+            lambda t, x, v: -1.5 * v**3 if 4 < t < 9 else 0.0, "t", "cubic drag", (4.0, 9.0), marks=pytest.mark.slow
+        ),
         (lambda t, x, v: -6.0 * x**3 if 0.3 < x < 0.8 else 0.0, "x", "cubic stiffness", (0.3, 0.8)),
     ],
 )

@@ -113,7 +113,7 @@ def plane() -> Field:
             "bias force along vx": {"b": 0.4},
             "bias force along vy": {"b": 0.4},
         },
-        ("Magnus force", "bias force along vy"),
+        ("quadratic drag", "bias force along vy"),
         ("bias force along vy",),
     )
 
@@ -334,7 +334,7 @@ def orbital() -> Field:
             "uniform acceleration along vx": {"b": 0.002},
             "uniform acceleration along vy": {"b": 0.002},
         },
-        ("relativity", "radiation pressure"),
+        ("oblateness", "radiation pressure"),
         ("radiation pressure",),
     )
 
