@@ -37,10 +37,9 @@ def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
         if sd is not None:
             r = r / sd[problem.index[places]]
         if problem.order is None:
-            left = _robust_left(smooth_columns(problem, places), r)
-            size = max(1.4826 * float(left.abs().median()), 0.0 if sd is None else 1.0)
-            high = left.abs() > SPIKE * size if size > 0 else torch.zeros_like(left, dtype=torch.bool)
-            found[places] = high if not _clustered(problem, places, high) else False
+            left, scale = _robust_left(smooth_columns(problem, places), r)
+            high, far = (_high(values, sd is not None) for values in (left, left / scale))
+            found[places] = high & far if not _clustered(problem, places, high) else False
             continue
         off = _off_neighbours(r)
         bend = r[1:-1] - 0.5 * (r[:-2] + r[2:])  # a curve leaves its neighbours' range nowhere, but bends everywhere
@@ -163,11 +162,17 @@ def _one_level(column: Tensor, high: Tensor, chance: float) -> bool:
     return least * len(levels) < chance
 
 
-def _robust_left(columns: Tensor, values: Tensor) -> Tensor:
-    """What a smooth fit with Tukey's biweight leaves, scaled to the same variance everywhere.
+def _high(left: Tensor, known: bool) -> Tensor:
+    """Which residuals exceed `SPIKE` robust sd, or noise of unit size where that is ``known``."""
+    size = max(1.4826 * float(left.abs().median()), float(known))
+    return left.abs() > SPIKE * size if size > 0 else torch.zeros_like(left, dtype=torch.bool)
 
-    At an edge the fit follows a datum that it takes in, and is uncertain where it leaves one out: of white noise the
-    variance of what is left is near 1 + q (1 − 2 w²), with w the datum's weight and q σ² the variance of the curve.
+
+def _robust_left(columns: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+    """What a smooth fit with Tukey's biweight leaves, and the sd of that by white noise of unit size.
+
+    At an edge the fit follows a datum that it takes in, and is uncertain where it leaves one out: the variance is near
+    1 + q (1 − 2 w²), with w the datum's weight and q the variance of the curve.
     """
     columns = columns[:, : max(1, len(values) // 8)]
     weight = torch.ones_like(values)
@@ -178,4 +183,4 @@ def _robust_left(columns: Tensor, values: Tensor) -> Tensor:
         solution = torch.linalg.lstsq(columns * weight[:, None], (values * weight)[:, None], driver="gelsd").solution
         left = values - (columns @ solution)[:, 0]
     curve = (columns @ torch.linalg.pinv(columns * weight[:, None], rtol=1e-9)).square().sum(1)
-    return left / (1 + curve * (1 - 2 * weight.square())).clamp_min(0.1).sqrt()
+    return left, (1 + curve * (1 - 2 * weight.square())).clamp_min(0.1).sqrt()

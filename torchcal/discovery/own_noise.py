@@ -152,12 +152,13 @@ def outliers(search: "Search", observed: Tensor) -> Tensor | None:
 
 
 def isolated(search: "Search") -> Tensor | None:
-    """Data that the base misses by far and alone, bool ``(n_total,)``; None where there are none, or too many.
+    """Samples in time that the base misses by far and alone, bool ``(n_total,)``; None for none, or too many.
 
     With the ends of recordings: whether such data are outliers or all that is seen of some physics is to be weighed.
-    Residuals are scaled to one variance by their leverage: an unknown initial state follows the first sample.
+    Residuals are scaled to one variance by their leverage: an unknown initial state follows the first sample. Among
+    conditions, what a base lacks may well be seen in one datum first, the one at the edge.
     """
-    if search.exact:
+    if search.exact or not search.problem.in_time:
         return None
     base = search.base
     basis = orthonormal(base.whitening(base.jacobian), cut=1e-7)
