@@ -330,3 +330,25 @@ def test_a_datum_at_the_edge_of_two_conditions_is_rarely_an_outlier_by_chance():
         y = torch.randn(60, dtype=F64, generator=generator)
         seen += bool(spikes(Problem.of(base, tc.Recording(x={"u": u, "v": v}, y=y)), y, None).any())
     assert seen <= 6 + 3 * 6**0.5  # three standard deviations of a Poisson number
+
+
+def test_a_smooth_misfit_that_an_initial_state_takes_up_is_no_outlier():
+    # Without the first sample the unknown initial state takes up what a quadratic loss does: nothing would be missing.
+    t = np.linspace(0, 12, 40)
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"T": -p["k"] * (s["T"] - 20.0)}, {"T": "degC"}, [tc.Parameter("k", low=0.0, initial=0.2)]
+    )
+    loss = tc.Term(
+        "quadratic loss",
+        rates={"T": lambda t, s, p, u: -p["q"] * (s["T"] - 20.0) * (s["T"] - 20.0).abs()},
+        parameters=[tc.Parameter("q", low=0.0)],
+    )
+    terms = [loss, *(term for term in tc.terms.thermal(ambient=20.0, loss="k") if term.name == "internal heat source")]
+    clean = solve_ivp(lambda t, z: -0.3 * (z - 20) - 0.02 * (z - 20) ** 2, (0, 12), [80.0], t_eval=t, rtol=1e-9).y[0]
+    found = []
+    for seed in (0, 5):
+        y = clean + 1.5 * np.random.default_rng(seed).standard_normal(40)
+        found.append(diagnose(base, tc.Recording(runs=[tc.Run(t, {"T": y})], noise=1.5), terms))
+    assert found[0].terms == ["quadratic loss"]
+    assert found[0].noise.outliers == 0
+    assert found[1].verdict != "consistent"

@@ -243,6 +243,7 @@ def test_both_resistances_of_the_cell_are_named():
     assert 1.0 < found["n"][0] < 2.0
 
 
+@pytest.mark.slow
 def test_two_kinds_of_shunt_are_not_told_apart():
     # They leave 0.773 and 0.769 mA: an evidence ratio of 1.1.
     diagnosis = tc.diagnose(

@@ -151,7 +151,7 @@ def thermal() -> Field:
             "lag of T": {"a": 1.0, "t90": 1.5},
             "delay of T": {"a": 1.0, "D": 1.0},
         },
-        ("natural convection", "evaporation", "heater gain error", "second heat capacity", "lag of T", "drift of T"),
+        ("heater gain error", "second heat capacity", "lag of T", "drift of T"),
         ("Newton cooling", "heater gain error"),
     )
 
@@ -334,7 +334,7 @@ def orbital() -> Field:
             "uniform acceleration along vx": {"b": 0.002},
             "uniform acceleration along vy": {"b": 0.002},
         },
-        ("oblateness", "radiation pressure"),
+        ("radiation pressure",),
         ("radiation pressure",),
     )
 

@@ -15,8 +15,9 @@ __all__ = ["Fitted", "fit", "starts"]
 #: Relative change of χ² below which a fit has converged.
 TOLERANCE = 1e-7
 MAX_STEPS = 60
-#: Change of χ², in the residual's variance but at most in that of the noise, below which so many steps lead nowhere.
-CREEPING, STEPS = 0.02, 20
+#: Change of χ², in the residual's variance but at most in that of the noise, below which so many steps lead nowhere, of
+#: which so many at least were not taken back.
+CREEPING, STEPS, TAKEN = 0.02, 20, 5
 #: More steps of the best alone, where it has not converged in those: along a bent valley they are short.
 FINISH = 240
 #: Samples that the slope at the beginning is taken from.
@@ -188,8 +189,8 @@ def fit(
 
     Marquardt's scaling makes it independent of units. A parameter on a bound that the gradient pushes outward is held
     for the step. Parameters with ``transform="log"`` are stepped in their logarithm. With ``data`` (H, n) every start
-    is fitted to data of its own, and ``ends_chi2`` tells how well. Where the best has not converged after ``max_steps``
-    it goes on alone for at most ``finish`` more.
+    is fitted to data of its own, and ``ends_chi2`` tells how well. A start ends where it has converged, or creeps.
+    Where the best has done neither after ``max_steps`` it goes on alone for at most ``finish`` more.
     """
     low, high = problem.limits()
     low, high = low[free], high[free]
@@ -219,7 +220,7 @@ def fit(
     done = torch.zeros(len(values), dtype=torch.bool)
     lost = torch.zeros(len(values), dtype=torch.long)
     eager = torch.full_like(chi2, 0.2)
-    passed = [chi2.clone()]
+    passed, taken = [chi2.clone()], [torch.zeros_like(chi2)]
     for _ in range(max_steps):
         if not free:
             break
@@ -283,8 +284,10 @@ def fit(
         damping = torch.where(better, damping * ease, damping * 4.0)
         damping = damping.clamp(1e-9, 1e12)
         passed.append(chi2.clone())
+        taken.append(taken[-1] + better)
         if len(passed) > STEPS:  # along a valley that is nearly flat
-            done = done | (passed[-1 - STEPS] - chi2 < CREEPING * (chi2 / problem.n).clamp_max(1.0))
+            creeping = passed[-1 - STEPS] - chi2 < CREEPING * (chi2 / problem.n).clamp_max(1.0)
+            done = done | (creeping & (taken[-1] - taken[-1 - STEPS] >= TAKEN))
         if bool(done.all()):
             break
     best = int(chi2.argmin())

@@ -12,7 +12,7 @@ from torchcal.discovery.base import growing
 from torchcal.discovery.fitting import Fitted, refit
 from torchcal.discovery.likeliest import alone, log_likelihood, log_normal, settled
 from torchcal.discovery.model import PRIOR, Model
-from torchcal.discovery.noise import Noise, mine, orthonormal
+from torchcal.discovery.noise import Noise, mine
 from torchcal.discovery.outliers import lone, spikes
 from torchcal.discovery.problem import Problem
 
@@ -27,6 +27,7 @@ __all__ = [
     "other_growth",
     "outdone",
     "outliers",
+    "outliers_alone",
     "suited",
     "weigh_alone",
 ]
@@ -70,11 +71,11 @@ def weigh_alone(search: "Search") -> tuple[float, float]:
     base = settled(search.base, search.noise, search.tangents)[1]
     here = log_likelihood(search.base, search.noise, search.tangents) - base
     own = {id(m): alone(m.found, search.noise, search.tangents)[1] - base for m in search.models}
-    near = max((own[id(m)] + m.price + m.prior for m in search.models), default=0.0) - BEHIND
+    near = max((own[id(m)] + m.prior for m in search.models), default=0.0) - BEHIND
     leading = sorted(search.models, key=lambda m: -m.weight)[:SETTLED]
     for model in search.models:
         found = own[id(model)]
-        if model in leading and found + model.price + model.prior > near:  # fitted again with its noise, as the base is
+        if model in leading and found + model.prior > near:  # fitted again with its noise, as the base is
             found = settled(model.found, search.noise, search.tangents)[1] - base
         model.in_use = search.gain(model.found.chi2) + here + model.price
         model.log_evidence = max(found + model.price, model.in_use)
@@ -161,8 +162,9 @@ def isolated(search: "Search") -> Tensor | None:
     if search.exact or not search.problem.in_time:
         return None
     base = search.base
-    basis = orthonormal(base.whitening(base.jacobian), cut=1e-7)
-    free = (1 - basis.square().sum(1)).clamp_min(LEAST_FREE).sqrt()
+    slope = base.jacobian[:, ~base.at_bound]
+    curve = (slope @ torch.linalg.pinv(base.whitening(slope), rtol=1e-7)).square().sum(1)  # the variance of the fit
+    free = (1 - curve / base.whitening.sd.square()).clamp_min(LEAST_FREE).sqrt()
     found = _sticking(search, base.problem, base.residual / free, ends=True)
     return found if 0 < float(found.sum()) <= MOST_OUTLIERS * float(search.problem.n) else None
 
@@ -192,6 +194,20 @@ def outdone(search: "Search", every: "Search", detected: bool) -> tuple[float, i
         known = max(known, _density(search, other.found) + other.prior)
     odds = _density(every, best.found) + best.prior - known
     return odds, every.problem.n - search.problem.n - len(best.candidate.own)
+
+
+def outliers_alone(fewer: "Search", search: "Search", detected: bool) -> bool:
+    """Whether outliers are a likelier reason for what a search has detected than its models or something unknown.
+
+    Args:
+        fewer: The search without the supposed outliers.
+        search: That with them.
+        detected: Whether ``fewer`` has more than noise.
+    """
+    unknown = search.with_unknown(search.base)[1] - settled(search.base, search.noise, search.tangents)[1]
+    known = _density(fewer, fewer.base) + math.log(PRIOR["base"])
+    odds = _density(search, search.base) + unknown + math.log(PRIOR["none"]) - known
+    return max(odds, outdone(fewer, search, detected)[0]) < 0
 
 
 def _density(search: "Search", found: Fitted) -> float:

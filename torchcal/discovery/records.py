@@ -158,7 +158,7 @@ class Hypothesis:
         physical: Whether signs and ranges are physically possible.
         misfit_removed: Share of the squared misfit beyond noise that it removes.
         p_white: Probability of so much structure in what is left by noise alone.
-        held_out_rmse: RMSE on held-out data; None where it was not tried.
+        held_out_rmse: RMSE on held-out data; None where it was not tried, as for what is improbable.
         score: Screening statistic z of its tangent.
         refitted: Whether base and terms were refitted together; otherwise the numbers are the screening's.
         region: Where a local term acts, in words; None where it acts everywhere.

@@ -5,7 +5,15 @@ import dataclasses
 import torch
 
 from torchcal.discovery.base import MOST
-from torchcal.discovery.own_noise import EXPLAINED, fits_by_chance, isolated, other_growth, outdone, outliers
+from torchcal.discovery.own_noise import (
+    EXPLAINED,
+    fits_by_chance,
+    isolated,
+    other_growth,
+    outdone,
+    outliers,
+    outliers_alone,
+)
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.search import Search
 from torchcal.discovery.verdict import base_alone
@@ -23,7 +31,7 @@ OFTEN = 5.0
 
 
 def settle(search: Search, observed: Problem, confidence: float) -> tuple[Search, bool]:
-    """Screen and refit, again without data that the base misses alone, as they may be all that was detected.
+    """Screen and refit, and without data that the base misses alone, where outliers are the likelier reason.
 
     Returns:
         The search, and whether there is more than noise.
@@ -33,9 +41,11 @@ def settle(search: Search, observed: Problem, confidence: float) -> tuple[Search
     if apart is not None:
         kept = search.problem.keep & ~apart
         if float(kept.sum()) >= (1 - MOST) * observed.n:
-            search = dataclasses.replace(search, problem=observed.keeping(kept), clean=True)
-            search.calibrate_base()
-            detected = _refit(search, confidence)
+            fewer = dataclasses.replace(search, problem=observed.keeping(kept), clean=True)
+            fewer.calibrate_base()
+            still = _refit(fewer, confidence)
+            if outliers_alone(fewer, search, still):
+                search, detected = fewer, still
     return _again(search, observed, detected, confidence)
 
 
@@ -75,6 +85,7 @@ def with_all(
         if sticking is None or not 0 < int(sticking.sum()) < observed.n - search.problem.n:
             best = every.physical_leader
             return None, best.names if best is not None and odds > 0 else ()
+    every.models = []
     every, _ = _again(every, observed, _refit(every, confidence), confidence)
     odds, spare = outdone(search, every, detected)
     return (every if odds > EXPLAINED and spare > 0 else None), ()
