@@ -85,7 +85,6 @@ def with_all(
         if sticking is None or not 0 < int(sticking.sum()) < observed.n - search.problem.n:
             best = every.physical_leader
             return None, best.names if best is not None and odds > 0 else ()
-    every.models = []
     every, _ = _again(every, observed, _refit(every, confidence), confidence)
     odds, spare = outdone(search, every, detected)
     return (every if odds > EXPLAINED and spare > 0 else None), ()
@@ -93,6 +92,7 @@ def with_all(
 
 def _refit(search: Search, confidence: float) -> bool:
     """Screen and refit single terms, and local ones where there is more than noise, which is returned."""
+    search.models = []
     search.screen_all()
     detected = at_once = search.exact or search.p_detect < 1.0 - confidence
     if search.terms:
