@@ -12,6 +12,7 @@ from torch import Tensor
 import torchcal as tc
 from torchcal.errors import DomainError, RecordingError, SimulatorError
 from torchcal.simulators import Trajectories
+from torchcal.simulators.steps import Steps
 from torchcal.terms import extend
 
 F64 = torch.float64
@@ -393,9 +394,9 @@ def test_many_rows_are_cut_into_pieces_that_change_nothing(monkeypatch: pytest.M
 def test_a_warm_start_gives_the_stepwise_solution(monkeypatch: pytest.MonkeyPatch) -> None:
     bound = oscillator().bind(tc.Recording(runs=[run_of(np.linspace(0, 10, 80), {"x": 1.0})]))
     near, there = tensor(4.0, 0.2, 0.1)[None], tensor(4.1, 0.25, 0.2)[None]
-    warm, right = bound._march(near), bound._march(there)
+    warm, right = bound.steps._march(near), bound.steps._march(there)
     cold = bound.linearise(bound.x, there)
-    monkeypatch.setattr(bound, "_march", lambda values: pytest.fail("Newton's method did not settle"))
+    monkeypatch.setattr(type(bound.steps), "_march", lambda self, values: pytest.fail("Newton's method did not settle"))
     hot = bound.linearise(bound.x, there, warm=warm)
     torch.testing.assert_close(hot.warm, right, rtol=1e-8, atol=1e-8)
     torch.testing.assert_close(hot.jacobian, cold.jacobian, rtol=1e-6, atol=1e-7)
@@ -405,7 +406,7 @@ def test_a_warm_start_gives_the_stepwise_solution(monkeypatch: pytest.MonkeyPatc
 def test_newton_from_a_bad_guess_falls_back_to_steps(guess: float) -> None:
     bound = oscillator().bind(tc.Recording(runs=[run_of(np.linspace(0, 10, 80), {"x": 1.0})]))
     point = tensor(4.0, 0.2, 0.1)[None]
-    right = bound._march(point)
+    right = bound.steps._march(point)
     generator = torch.Generator().manual_seed(0)
     bad = guess * torch.randn(right.shape, generator=generator, dtype=F64)
     for warm in (bad, bad[:, :, :-1].expand(2, -1, -1, -1)):  # the second is of another batch, and not looked at
@@ -414,10 +415,52 @@ def test_newton_from_a_bad_guess_falls_back_to_steps(guess: float) -> None:
     torch.testing.assert_close(found.warm, torch.cat([right, right]), rtol=1e-8, atol=1e-8)
 
 
+def swinging(t, s, p, u):
+    return {"x": s["v"], "v": -p["k"] * torch.sin(s["x"]) - p["c"] * s["v"].abs() * s["v"]}
+
+
+def relaxing(t, s, p, u):  # stiff at the beginning, then slow
+    return {"x": -p["k"] * s["x"] * s["x"] + 1e-4 * s["v"], "v": p["c"] * (s["x"] - s["v"]).clamp_min(-0.1)}
+
+
+def bursting(t, s, p, u):
+    return {"x": p["k"] * s["x"] * s["x"], "v": p["c"] * s["x"].clamp_max(1e6)}
+
+
+@pytest.mark.parametrize(
+    ("rates", "initial", "values"),
+    [
+        (swinging, {"x": 2.5, "v": 0.0}, [(9.0, 0.01), (4.0, 0.3)]),
+        (swinging, {"x": 0.0, "v": 0.0}, [(9.0, 0.01)]),  # at rest for good
+        (relaxing, {"x": 20.0, "v": 1e-9}, [(0.5, 0.2), (0.01, 0.0)]),
+        (bursting, {"x": 1.0, "v": 0.0}, [(0.01, 0.2), (0.05, 0.1)]),  # the second is infinite at t = 20
+    ],
+)
+def test_spans_give_what_single_steps_give(rates, initial, values, monkeypatch: pytest.MonkeyPatch) -> None:
+    simulator = tc.ODESimulator(
+        rates, {"x": None, "v": None}, [tc.Parameter("k"), tc.Parameter("c")], observe=("x",), max_step=0.05
+    )
+    short = run_of(np.linspace(0, 7, 30), initial)
+    bound = simulator.bind(tc.Recording(runs=[run_of(np.linspace(0, 40, 200), initial), short]))
+    point = tensor(*values)
+    passes = []
+    newton = Steps._newton
+    monkeypatch.setattr(Steps, "_newton", lambda *args: passes.append(args[0].grid.num_steps) or newton(*args))
+    found = bound.solve(point)
+    single = bound.steps._one_by_one(point, bound.layout.start(point))
+    right = torch.where(torch.isfinite(single), single, torch.full_like(single, math.inf))
+    near = right.abs() < 1e6  # beyond, on the way to infinity, every step multiplies the last digit
+    size = torch.where(near, right, torch.zeros_like(right)).abs().amax((1, 2), keepdim=True)
+    assert max(passes) > 100  # most of it is not solved step by step
+    assert bool((torch.isfinite(found).all(-1) == torch.isfinite(right).all(-1)).all())
+    gap = torch.where(near & torch.isfinite(found), found - right, torch.zeros_like(right)).abs()
+    assert bool((gap <= 1e-8 * size).all())
+
+
 def test_without_steps_what_newton_does_not_reach_is_infinite() -> None:
     bound = oscillator().bind(tc.Recording(runs=[run_of(np.linspace(0, 10, 80), {"x": 1.0})]))
     point = tensor(4.0, 0.2, 0.1).expand(2, -1)
-    warm = bound._march(point)
+    warm = bound.steps._march(point)
     warm[1] = math.nan
     found = bound.linearise(bound.x, point, warm=warm, march=False)
     assert bool(torch.isfinite(found.y[0]).all())
@@ -445,7 +488,7 @@ def bad_rates(rates) -> tc.ODESimulator:
         (lambda t, s, p, u: {"x": s["v"], "v": torch.ones(5, 7)}, r"rate of 'v' of shape .* Write the rates element"),
         (lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * (1.0 if t > 1 else 2.0)}, "It raised RuntimeError"),
         (lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"].mean()}, "in a batch|at many times at once"),
-        (lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"].mean(-1, keepdim=True)}, "at many times at once"),
+        (lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"].mean(-1, keepdim=True)}, "in a batch|at many times"),
         (lambda t, s, p, u: {"x": s["v"], "v": -p["k"].detach() * s["x"]}, "'k' through torch operations"),
     ],
 )

@@ -159,7 +159,7 @@ def definitions(bound: Trajectories, values: Tensor, states: Tensor) -> set[str]
         here = torch.stack([moved(column) for column in states[0, :, node].unbind(-1)], dim=-1)[None]  # (1, R, S)
         others = torch.stack([moved(value[None])[0] for value in values])  # each by its own size, and none stays 0
         u = {name: moved(table[0, :, node]) for name, table in bound.grid.u.items()}
-        rates.append(bound.rates_at(bound.grid.t[:, node], here, bound.layout.by_name(others[None]), u))
+        rates.append(bound.steps.rates(bound.grid.t[:, node], here, bound.layout.by_name(others[None]), u))
         there.append(here)
     slopes, here = torch.cat(rates), torch.cat(there)
     names = list(bound.ode.states)
@@ -180,7 +180,7 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
         states = found.warm if found.warm is not None else bound.solve(found.values[None])
         own = [i for i in found.free if names[i] not in bound.initial_names and not is_window(names[i])]
         size = len(bound.ode.states)
-        _, _, by_parameter = bound.step_derivatives(found.values[None], states, own)
+        _, _, by_parameter = bound.steps.derivatives(found.values[None], states, own)
         kicks = torch.diag_embed(bound.grid.h[..., None].expand(-1, -1, size))
         forcing = torch.cat([kicks, by_parameter[0]], dim=-1)
         response, drivers, time = responses(problem, found, forcing)

@@ -145,7 +145,7 @@ def contributions(
         elif not any(term.outputs for term in candidate.terms) and found.warm is not None:
             chosen.append(i)
             with torch.no_grad():
-                parts.append(extended.step_derivatives(values[None], found.warm, [place])[2][0])
+                parts.append(extended.steps.derivatives(values[None], found.warm, [place])[2][0])
     if not chosen:
         return {}, {}
     if isinstance(bound, Trajectories):

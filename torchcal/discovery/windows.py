@@ -171,7 +171,7 @@ def _around(search: Search, model: Model) -> list[Window]:
     if isinstance(bound, Trajectories):
         with torch.no_grad():
             forcing, present = (
-                bound.step_derivatives(values[None], found.warm, [place])[2][0]
+                bound.steps.derivatives(values[None], found.warm, [place])[2][0]
                 for values in (everywhere, found.values)
             )
         response, drivers, _ = responses(found.problem, found, torch.cat([forcing, present], dim=-1))

@@ -1,7 +1,7 @@
 """Time steps of every run of a recording, and which of their ends the samples are."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -92,6 +92,13 @@ class Grid:
     def num_steps(self) -> int:
         """K."""
         return self.h.shape[1]
+
+    def part(self, first: int, last: int) -> "Grid":
+        """The steps from one to another, those of samples left out."""
+        steps = slice(first, last)
+        u = {name: table[:, :, steps] for name, table in self.u.items()}
+        nodes = self.nodes[:, first : last + 1]
+        return replace(self, t=self.t[:, steps], h=self.h[:, steps], nodes=nodes, u=u)
 
     @property
     def step_run(self) -> Tensor:

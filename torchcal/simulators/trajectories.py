@@ -1,9 +1,4 @@
-"""An ODE simulator bound to the runs of a recording: outputs and exact sensitivities, parallel in time.
-
-Runge–Kutta steps are all taken at once from a guessed trajectory; Newton's method on the whole trajectory removes the
-gaps between them. Each pass costs one batched step, whatever the length of the recording, and its derivatives are the
-exact derivatives of the discrete solution.
-"""
+"""An ODE simulator bound to the runs of a recording: outputs and the exact derivatives of the discrete solution."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -18,23 +13,13 @@ from torchcal.simulators.grid import Grid
 from torchcal.simulators.layout import Layout
 from torchcal.simulators.recurrence import recur
 from torchcal.simulators.static import Conditions, Linearisation, Simulator
+from torchcal.simulators.steps import POINTS, Steps
 
 if TYPE_CHECKING:
     from torchcal.simulators.ode import ODESimulator
 
 __all__ = ["Trajectories"]
 
-#: Gaps in a trajectory, relative to the state's size, below which Newton's method stops.
-GAP = 1e-9
-#: Gaps whose square is below `GAP`, and corrections that are small enough for this to hold: after one more of them
-#: nothing is left to check. A larger one may cross a kink, such as a clamp at zero.
-QUADRATIC, SMALL = 1e-5, 1e-4
-#: Gaps, relative to the state's size, from which Newton's method is not tried.
-WILD = 1e3
-#: Newton passes before the trajectory is solved step by step instead.
-MAX_PASSES = 8
-#: Points whose derivatives are computed at once: about what a processor's cache holds.
-POINTS = 2**15
 #: Numbers of trajectories kept at once, 64 MiB.
 NUMBERS = 2**23
 #: How often steps are halved at most, and how much shorter they become at once where they err.
@@ -53,6 +38,7 @@ class Trajectories(Simulator):
     Attributes:
         grid: Its time steps.
         layout: What each parameter value is.
+        steps: The steps, and how trajectories are found.
     """
 
     def __init__(
@@ -82,6 +68,7 @@ class Trajectories(Simulator):
         self._states = tuple(ode.states)
         self.grid = Grid.of(self.runs, max_step=ode.max_step, subdivide=subdivide, denser=denser)
         self.layout = Layout(ode, recording, self.runs)
+        self.steps = Steps(ode, self.layout, self.grid)
         self.parameters = self.layout.parameters
         self.x = recording.x
 
@@ -144,9 +131,9 @@ class Trajectories(Simulator):
 
         p = self.layout.by_name(values[None], self.grid.step_run)
         begin = states[:, :, :-1].reshape(1, -1, size)
-        half = self._step(begin, t, 0.5 * h, p, inputs(first, middle))
-        twice = self._step(half, t + 0.5 * h, 0.5 * h, p, inputs(middle, last))
-        once = self._step(begin, t, h, p, u)
+        half = self.steps.step(begin, t, 0.5 * h, p, inputs(first, middle))
+        twice = self.steps.step(half, t + 0.5 * h, 0.5 * h, p, inputs(middle, last))
+        once = self.steps.step(begin, t, h, p, u)
         scale = states[0].abs().amax(dim=(0, 1)).clamp_min(1e-300)
         error = ((twice - once)[0].abs() / scale).amax(-1).reshape(runs, -1)
         number = [self.grid.steps_between(r) for r in range(runs)]
@@ -210,11 +197,8 @@ class Trajectories(Simulator):
         wanted = tuple(outputs) if outputs is not None else self.recording.outputs
         good = torch.isfinite(self.outputs_of(values, self.solve(values), wanted)).all(-1)
         point = values[good.nonzero()[:1, 0]].detach()
-        states = self.solve(point)
         with torch.no_grad():
-            ends = self.step_derivatives(point, states, ())[0]
-        size = states.abs().amax(dim=(0, 1, 2)).clamp_min(1e-300)
-        gap = float(((ends - states[:, :, 1:]).abs() / size).max())
+            gap = self.steps.difference(point)
         if not gap <= 1e-9:
             raise SimulatorError(
                 f"Expected the same rates at many times at once as at one time. Got a difference of {gap:.3g}. Write "
@@ -286,7 +270,7 @@ class Trajectories(Simulator):
         columns = list(range(values.shape[-1])) if columns is None else list(columns)
         found = []
         with torch.no_grad():
-            states = self._solve(values, warm, march=march)
+            states = self.steps.solve(values, warm, march=march)
             size = max(1, POINTS // self.grid.nodes.numel())
             for v, s in zip(values.split(size), states.split(size), strict=True):
                 tangents = self._sensitivities(v, s, columns) if columns else None
@@ -296,7 +280,7 @@ class Trajectories(Simulator):
     def solve(self, values: Tensor, warm: Any = None) -> Tensor:
         """States at the ends of all steps, ``(H, R, K + 1, states)``; infinite where the solution blows up."""
         with torch.no_grad():
-            return self._solve(values.detach(), warm)
+            return self.steps.solve(values.detach(), warm)
 
     def outputs_of(self, values: Tensor, states: Tensor, outputs: Sequence[str] | None = None) -> Tensor:
         """Outputs ``(H, n_total)`` of solved states."""
@@ -311,119 +295,6 @@ class Trajectories(Simulator):
         found |= {name: torch.cat([table[0], table[2][:, -1:]], dim=1) for name, table in self.grid.u.items()}
         return found
 
-    def rates_at(self, t: Tensor, s: Tensor, p: dict[str, Tensor], u: dict[str, Tensor]) -> Tensor:
-        """Rates ``(H, M, states)`` at states ``(H, M, states)``."""
-        named = {name: s[..., i] for i, name in enumerate(self._states)}
-        try:
-            rates = self.ode.rates(t, named, p, u)
-        except SimulatorError:
-            raise
-        except Exception as error:
-            raise SimulatorError(
-                f"Expected rates(t, s, p, u) to return the rates by state. It raised {type(error).__name__}: {error}. "
-                f"It was called with states of shape {tuple(s.shape[:-1])} and parameters "
-                f"{', '.join(p)} of shape {tuple(next(iter(p.values())).shape)}."
-            ) from error
-        if not isinstance(rates, Mapping) or set(rates) != set(self._states):
-            got = list(rates) if isinstance(rates, Mapping) else type(rates).__name__
-            raise SimulatorError(f"Expected the rates of {list(self._states)} as a dict. Got {got}.")
-        columns = []
-        for name in self._states:
-            rate = rates[name]
-            if not isinstance(rate, Tensor):
-                rate = torch.as_tensor(float(rate), dtype=s.dtype)
-            try:
-                columns.append(rate.expand(s.shape[:-1]) if rate.shape != s.shape[:-1] else rate)
-            except RuntimeError as error:
-                raise SimulatorError(
-                    f"Expected the rate of {name!r} of shape {tuple(s.shape[:-1])} (batch, runs). "
-                    f"Got {tuple(rate.shape)}. Write the rates elementwise."
-                ) from error
-        return torch.stack(columns, dim=-1)
-
-    def _step(self, s: Tensor, t: Tensor, h: Tensor, p: dict[str, Tensor], u: dict[str, Tensor]) -> Tensor:
-        """One Runge–Kutta step of every point ``(H, M, states)``; t, h ``(M,)``, u ``(3, M)``."""
-        first, middle, last = ({name: table[i] for name, table in u.items()} for i in range(3))
-        half, full = (0.5 * h)[:, None], h[:, None]
-        k1 = self.rates_at(t, s, p, first)
-        k2 = self.rates_at(t + 0.5 * h, s + half * k1, p, middle)
-        k3 = self.rates_at(t + 0.5 * h, s + half * k2, p, middle)
-        k4 = self.rates_at(t + h, s + full * k3, p, last)
-        return s + (full / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
-
-    def _solve(self, values: Tensor, warm: Any = None, *, march: bool = True) -> Tensor:
-        if warm is None or warm.shape[0] != values.shape[0]:
-            if len(values) * self.grid.h.numel() > POINTS:  # of many trajectories a step costs less than a pass
-                return self._march(values)
-            # Trajectories that stand still are a poor guess, but cost little to try.
-            warm = self.layout.start(values).unsqueeze(2).expand(-1, -1, self.num_steps + 1, -1)
-            march = True
-        states, settled = self._newton(values, warm)
-        if march and not bool(settled.all()):
-            states[~settled] = self._march(values[~settled])
-        elif not march:
-            states[~settled] = math.inf
-        return states
-
-    def _march(self, values: Tensor) -> Tensor:
-        """Step by step."""
-        state = self.layout.start(values)
-        p = self.layout.by_name(values)
-        found = [state]
-        for k in range(self.num_steps):
-            u = {name: table[:, :, k] for name, table in self.grid.u.items()}
-            state = self._step(state, self.grid.t[:, k], self.grid.h[:, k], p, u)
-            found.append(state)
-        states = torch.stack(found, dim=-2)
-        return torch.where(torch.isfinite(states), states, torch.full_like(states, math.inf))
-
-    def _newton(self, values: Tensor, guess: Tensor) -> tuple[Tensor, Tensor]:
-        """Newton's method on whole trajectories, and which rows ``(H,)`` settled."""
-        states = guess.clone()
-        states[:, :, 0] = self.layout.start(values)
-        size = states.abs().amax(dim=(1, 2), keepdim=True).clamp_min(1e-300)
-        settled = torch.zeros(len(values), dtype=torch.bool)
-        active = torch.isfinite(states).flatten(1).all(-1)
-        last = torch.full((len(values),), math.inf, dtype=torch.float64)
-        for _ in range(MAX_PASSES):
-            rows = active.nonzero()[:, 0]
-            if len(rows) == 0:
-                break
-            now = states[rows]
-            ends, flow, _ = self.step_derivatives(values[rows], now, ())
-            gap = ends - now[:, :, 1:]
-            worst = (gap.abs() / size[rows]).flatten(1).amax(-1)
-            good = torch.isfinite(worst) & (worst < 4.0 * last[rows]) & (worst < WILD)
-            last[rows] = worst
-            change = recur(flow, torch.nan_to_num(gap).unsqueeze(-1))[..., 0]
-            moved = torch.cat([now[:, :, :1], now[:, :, 1:] + change], dim=2)
-            good &= torch.isfinite(moved).flatten(1).all(-1)
-            states[rows] = torch.where((good & (worst >= GAP))[:, None, None, None], moved, now)
-            step = (change.abs() / size[rows]).flatten(1).amax(-1)
-            last_one = (worst < GAP) | ((worst < QUADRATIC) & (step < SMALL))
-            settled[rows] = good & last_one
-            active[rows] = good & ~last_one
-        return states, settled
-
-    def step_derivatives(
-        self, values: Tensor, states: Tensor, columns: Sequence[int]
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Ends of all steps begun at ``states``, and their derivatives by the states and by some parameters.
-
-        Returns ends ``(H, R, K, S)``, flow ``(H, R, K, S, S)`` and forcing ``(H, R, K, S, len(columns))``.
-        """
-        hyper, runs, _, size = states.shape
-        steps = self.num_steps
-        run_of = self.grid.step_run
-        t, h, u = self.grid.flat
-        with torch.enable_grad():
-            begin = states[:, :, :-1].reshape(hyper, runs * steps, size).detach().requires_grad_(True)
-            leaves = self.layout.leaves(values, run_of, columns)
-            ends = self._step(begin, t, h, leaves, u)
-            flow, forcing = self.layout.derivatives(ends, begin, leaves, run_of, columns)
-        shape = (hyper, runs, steps, size)
-        return ends.detach().reshape(shape), flow.reshape(*shape, size), forcing.reshape(*shape, len(columns))
-
     def rates_by(self, values: Tensor, states: Tensor, columns: Sequence[int]) -> Tensor:
         """Derivatives of the rates by some parameters where steps begin, ``(H, R, K, S, len(columns))``."""
         hyper, runs, _, size = states.shape
@@ -432,13 +303,13 @@ class Trajectories(Simulator):
         with torch.enable_grad():
             begin = states[:, :, :-1].reshape(hyper, -1, size).detach().requires_grad_(True)
             leaves = self.layout.leaves(values, run_of, columns)
-            rates = self.rates_at(t, begin, leaves, {name: table[0] for name, table in u.items()})
+            rates = self.steps.rates(t, begin, leaves, {name: table[0] for name, table in u.items()})
             _, found = self.layout.derivatives(rates, begin, leaves, run_of, columns)
         return found.reshape(hyper, runs, self.num_steps, size, len(columns))
 
     def _sensitivities(self, values: Tensor, states: Tensor, columns: Sequence[int]) -> Tensor:
         """∂ states / ∂ parameters at the ends of all steps, ``(H, R, K + 1, S, len(columns))``."""
-        _, flow, forcing = self.step_derivatives(values, states, columns)
+        _, flow, forcing = self.steps.derivatives(values, states, columns)
         begin = self.layout.start_slopes(values)[..., list(columns)]
         forcing = forcing.clone()
         forcing[:, :, 0] += flow[:, :, 0] @ begin
@@ -447,7 +318,7 @@ class Trajectories(Simulator):
     def flow(self, values: Tensor, states: Tensor) -> Tensor:
         """Derivative of the end of every step by its beginning, ``(H, R, K, S, S)``."""
         with torch.no_grad():
-            return self.step_derivatives(values, states, ())[1]
+            return self.steps.derivatives(values, states, ())[1]
 
     def _observe(
         self,
@@ -485,7 +356,7 @@ class Trajectories(Simulator):
     def slopes(self, values: Tensor, start: Tensor) -> Tensor:
         """Rates of all states at the beginning of every run, ``(H, R, states)``, at states ``(H, R, states)``."""
         u = {name: table[0, :, 0] for name, table in self.grid.u.items()}
-        return self.rates_at(self.grid.t[:, 0], start, self.layout.by_name(values), u)
+        return self.steps.rates(self.grid.t[:, 0], start, self.layout.by_name(values), u)
 
     def _measure(self, p: dict[str, Tensor], seen: Tensor, outputs: Sequence[str]) -> Tensor:
         s = {name: seen[..., i] for i, name in enumerate(self._states)}

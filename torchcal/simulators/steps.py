@@ -1,0 +1,212 @@
+"""Runge–Kutta steps on a grid of times, and the trajectories that they make up.
+
+All steps of a span are taken at once from a guessed trajectory; Newton's method on the whole span removes the gaps
+between them. What it does not reach is solved step by step.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from torchcal.errors import SimulatorError
+from torchcal.simulators.grid import Grid
+from torchcal.simulators.layout import Layout
+from torchcal.simulators.recurrence import recur
+
+if TYPE_CHECKING:
+    from torchcal.simulators.ode import ODESimulator
+
+__all__ = ["POINTS", "Steps"]
+
+#: Gaps in a trajectory, relative to the state's size, below which Newton's method stops.
+GAP = 1e-9
+#: Gaps whose square is below `GAP`, and corrections that are small enough for this to hold: after one more of them
+#: nothing is left to check. A larger one may cross a kink, such as a clamp at zero.
+QUADRATIC, SMALL = 1e-5, 1e-4
+#: Newton passes before the trajectory is solved step by step instead.
+MAX_PASSES = 8
+#: Points whose derivatives are computed at once: about what a processor's cache holds.
+POINTS = 2**15
+#: Steps of the first span that is tried where there is no guess.
+SPAN = 64
+#: Trajectories times the derivatives that a pass needs of each, above which a step costs less than its share of passes.
+CROWD = 200
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """The steps of a grid.
+
+    Attributes:
+        ode: Has the rates.
+        layout: What each parameter value is.
+        grid: Where steps begin and how long they are.
+    """
+
+    ode: "ODESimulator"
+    layout: Layout
+    grid: Grid
+
+    def rates(self, t: Tensor, s: Tensor, p: dict[str, Tensor], u: dict[str, Tensor]) -> Tensor:
+        """Rates ``(H, M, states)`` at states ``(H, M, states)``."""
+        names = tuple(self.ode.states)
+        named = {name: s[..., i] for i, name in enumerate(names)}
+        try:
+            rates = self.ode.rates(t, named, p, u)
+        except SimulatorError:
+            raise
+        except Exception as error:
+            raise SimulatorError(
+                f"Expected rates(t, s, p, u) to return the rates by state. It raised {type(error).__name__}: {error}. "
+                f"It was called with states of shape {tuple(s.shape[:-1])} and parameters "
+                f"{', '.join(p)} of shape {tuple(next(iter(p.values())).shape)}."
+            ) from error
+        if not isinstance(rates, Mapping) or set(rates) != set(names):
+            got = list(rates) if isinstance(rates, Mapping) else type(rates).__name__
+            raise SimulatorError(f"Expected the rates of {list(names)} as a dict. Got {got}.")
+        columns = []
+        for name in names:
+            rate = rates[name]
+            if not isinstance(rate, Tensor):
+                rate = torch.as_tensor(float(rate), dtype=s.dtype)
+            try:
+                columns.append(rate.expand(s.shape[:-1]) if rate.shape != s.shape[:-1] else rate)
+            except RuntimeError as error:
+                raise SimulatorError(
+                    f"Expected the rate of {name!r} of shape {tuple(s.shape[:-1])} (batch, runs). "
+                    f"Got {tuple(rate.shape)}. Write the rates elementwise."
+                ) from error
+        return torch.stack(columns, dim=-1)
+
+    def step(self, s: Tensor, t: Tensor, h: Tensor, p: dict[str, Tensor], u: dict[str, Tensor]) -> Tensor:
+        """One Runge–Kutta step of every point ``(H, M, states)``; t, h ``(M,)``, u ``(3, M)``."""
+        first, middle, last = ({name: table[i] for name, table in u.items()} for i in range(3))
+        half, full = (0.5 * h)[:, None], h[:, None]
+        k1 = self.rates(t, s, p, first)
+        k2 = self.rates(t + 0.5 * h, s + half * k1, p, middle)
+        k3 = self.rates(t + 0.5 * h, s + half * k2, p, middle)
+        k4 = self.rates(t + h, s + full * k3, p, last)
+        return s + (full / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
+
+    def derivatives(self, values: Tensor, states: Tensor, columns: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
+        """Ends of all steps begun at ``states``, and their derivatives by the states and by some parameters.
+
+        Returns ends ``(H, R, K, S)``, flow ``(H, R, K, S, S)`` and forcing ``(H, R, K, S, len(columns))``.
+        """
+        hyper, runs, _, size = states.shape
+        steps = self.grid.num_steps
+        run_of = self.grid.step_run
+        t, h, u = self.grid.flat
+        with torch.enable_grad():
+            begin = states[:, :, :-1].reshape(hyper, runs * steps, size).detach().requires_grad_(True)
+            leaves = self.layout.leaves(values, run_of, columns)
+            ends = self.step(begin, t, h, leaves, u)
+            flow, forcing = self.layout.derivatives(ends, begin, leaves, run_of, columns)
+        shape = (hyper, runs, steps, size)
+        return ends.detach().reshape(shape), flow.reshape(*shape, size), forcing.reshape(*shape, len(columns))
+
+    def difference(self, values: Tensor) -> float:
+        """Largest difference between the first steps taken one after another and all at once, relative to the states'.
+
+        Anything but rounding means that rates are not computed elementwise.
+        """
+        part = replace(self, grid=self.grid.part(0, SPAN))
+        states = part._one_by_one(values, self.layout.start(values))
+        ends = part.derivatives(values, states, ())[0]
+        size = states.abs().amax(dim=(0, 1, 2)).clamp_min(1e-300)
+        return float(((ends - states[:, :, 1:]).abs() / size).max())
+
+    def solve(self, values: Tensor, warm: Tensor | None = None, *, march: bool = True) -> Tensor:
+        """States at the ends of all steps, ``(H, R, K + 1, states)``; infinite where the solution blows up.
+
+        ``warm`` is a guess. Where Newton's method does not settle from there, the trajectory is solved from its
+        beginning; without ``march`` it is infinite instead.
+        """
+        if warm is None or warm.shape[0] != values.shape[0]:
+            return self._march(values)
+        start = self.layout.start(values)
+        states, settled = self._newton(values, torch.cat([start.unsqueeze(2), warm[:, :, 1:]], dim=2))
+        if march and not bool(settled.all()):
+            states[~settled] = self._march(values[~settled])
+        elif not march:
+            states[~settled] = math.inf
+        return states
+
+    def _march(self, values: Tensor) -> Tensor:
+        """From the beginning, span by span, in spans as long as Newton's method allows from states that stand still."""
+        start = self.layout.start(values)
+        hyper, runs, size = start.shape
+        if hyper * runs * (1 + size) > CROWD:
+            found = self._one_by_one(values, start)
+            return torch.where(torch.isfinite(found), found, torch.full_like(found, math.inf))
+        dead = ~torch.isfinite(start).all(-1, keepdim=True)
+        parts, begin, largest = [start.unsqueeze(2)], start, start.abs().amax(dim=1)[:, None, None]
+        longest = most = max(SPAN, POINTS // max(1, hyper * runs))
+        first, span, on_foot = 0, SPAN, SPAN // 2
+        while first < self.grid.num_steps:
+            part = replace(self, grid=self.grid.part(first, first + span))
+            still = begin.unsqueeze(2).expand(-1, -1, part.grid.num_steps + 1, -1)
+            states, settled = part._newton(values, still, largest)
+            if bool(settled.all()):
+                longest = min(longest + longest // 8, most)  # what has failed is tried again after a while
+                span, on_foot = min(2 * span, longest), SPAN // 2
+            elif span > SPAN:
+                span = longest = span // 2
+                continue
+            else:
+                on_foot = min(2 * on_foot, most)  # the longer Newton's method fails, the more rarely it is tried
+                part = replace(self, grid=self.grid.part(first, first + on_foot))
+                states = part._one_by_one(values, begin)
+            first += part.grid.num_steps
+            lost = dead.unsqueeze(2) | ~torch.isfinite(states)
+            parts.append(states.masked_fill(lost, math.inf)[:, :, 1:])
+            dead = dead | lost[:, :, -1].any(-1, keepdim=True)
+            begin = torch.where(dead, start, states[:, :, -1])  # what has blown up goes on, unseen
+            largest = torch.maximum(largest, states.masked_fill(lost, 0.0).abs().amax(dim=(1, 2), keepdim=True))
+        return torch.cat(parts, dim=2)
+
+    def _one_by_one(self, values: Tensor, begin: Tensor) -> Tensor:
+        """Step after step, from states ``(H, R, S)``."""
+        p = self.layout.by_name(values)
+        found = [begin]
+        for k in range(self.grid.num_steps):
+            u = {name: table[:, :, k] for name, table in self.grid.u.items()}
+            found.append(self.step(found[-1], self.grid.t[:, k], self.grid.h[:, k], p, u))
+        return torch.stack(found, dim=-2)
+
+    def _newton(self, values: Tensor, guess: Tensor, largest: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Newton's method on whole trajectories from their first states on, and which rows ``(H,)`` settled.
+
+        Gaps are relative to the largest values of each state, those before the trajectory, ``(H, 1, 1, S)``, included.
+        """
+        states = guess.clone()
+        settled = torch.zeros(len(values), dtype=torch.bool)
+        active = torch.isfinite(states).flatten(1).all(-1)
+        last = torch.full((len(values),), math.inf, dtype=torch.float64)
+        before = states.new_full((len(values), 1, 1, 1), 1e-300) if largest is None else largest.clamp_min(1e-300)
+        for number in range(MAX_PASSES):
+            rows = active.nonzero()[:, 0]
+            if len(rows) == 0:
+                break
+            now = states[rows]
+            ends, flow, _ = self.derivatives(values[rows], now, ())
+            gap = ends - now[:, :, 1:]
+            size = torch.maximum(now.abs().amax(dim=(1, 2), keepdim=True), before[rows])
+            if number == 0:  # a guess may be zero where the trajectory is not
+                size = torch.maximum(size, ends.abs().amax(dim=(1, 2), keepdim=True))
+            worst = (gap.abs() / size).flatten(1).amax(-1)
+            good = torch.isfinite(worst) & (worst < 4.0 * last[rows])
+            last[rows] = worst
+            change = recur(flow, torch.nan_to_num(gap).unsqueeze(-1))[..., 0]
+            moved = torch.cat([now[:, :, :1], now[:, :, 1:] + change], dim=2)
+            good &= torch.isfinite(moved).flatten(1).all(-1)
+            states[rows] = torch.where(good[:, None, None, None], moved, now)
+            step = (change.abs() / size).flatten(1).amax(-1)
+            last_one = (worst < GAP) | ((worst < QUADRATIC) & (step < SMALL))
+            settled[rows] = good & last_one
+            active[rows] = good & ~last_one
+        return states, settled
