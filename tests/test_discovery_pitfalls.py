@@ -1,5 +1,7 @@
 """What a diagnosis did wrong on recordings that others brought: each case once."""
 
+import dataclasses
+import math
 import warnings
 
 import numpy as np
@@ -483,3 +485,84 @@ def test_runs_of_two_samples_tell_nothing_of_growing_noise():
         lambda t, s, p, u: {"A": -p["k"] * s["A"]}, {"A": None}, [tc.Parameter("k", low=0.0, initial=0.3)]
     )
     assert diagnose(base, tc.Recording(runs=runs), tc.terms.kinetics("A")).verdict == "consistent"
+
+
+# --- windows of few levels, limits within bounds, and noise that takes a misfit up -------------------------
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_window_of_one_row_of_a_grid_is_no_name(seed):
+    inverse, rate = (a.ravel() for a in np.meshgrid(1000 / np.linspace(260, 400, 12), np.geomspace(0.1, 100, 6)))
+    y = -8.0 + 3.0 * inverse
+    y = y - 0.004 * rate * np.exp(y - 3.0)  # heated by shear, which is not in the list
+    y = y + 0.032 * np.random.default_rng(seed).standard_normal(72)
+    base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x["z"] + 0 * x["g"], [tc.Parameter("a"), tc.Parameter("b")])
+    terms = [
+        tc.Term("thinning", outputs={"y": lambda x, p, y: y + p["m"] * torch.log(x["g"])}, parameters=[tc.Parameter("m")]),
+        tc.Term("bend", outputs={"y": lambda x, p, y: y + p["c"] * (x["z"] - 3) ** 2}, parameters=[tc.Parameter("c")]),
+        tc.Term("square", outputs={"y": lambda x, p, y: y + p["q"] * y**2}, parameters=[tc.Parameter("q")]),
+        tc.Term("offset", outputs={"y": lambda x, p, y: y + p["o"]}, parameters=[tc.Parameter("o")]),
+    ]
+    found = diagnose(base, tc.Recording(x={"z": inverse, "g": rate}, y=y), terms)
+    assert found.verdict in ("ambiguous", "unexplained")
+    assert found.verdict == "unexplained" or ["none of these"] in found.tied
+
+
+def test_limits_stay_within_a_parameters_bounds():
+    stress = np.repeat([180.0, 200, 225, 250, 280, 320, 360, 400], 6)
+    terms = [tc.Term("fatigue limit", frees=("limit",))]
+    base = tc.Simulator(
+        lambda x, p: p["a"] - p["b"] * torch.log10((x - p["limit"]).clamp_min(1.0)),
+        [
+            tc.Parameter("a", initial=20.0),
+            tc.Parameter("b", low=0.0, initial=6.0),
+            tc.Parameter("limit", low=0.0, high=170.0, neutral=0.0),
+        ],
+    )
+    noise = 0.1 * np.random.default_rng(3).standard_normal(48)
+
+    def recording(limit):
+        return tc.Recording(x=stress, y=25.0 - 8.0 * np.log10(stress - limit) + noise, noise=0.1)
+
+    weak, strong = (diagnose(base, recording(limit), terms) for limit in (0.0, 150.0))
+    assert weak.verdict == "consistent"
+    assert strong.terms == ["fatigue limit"]
+    for found in (weak, strong):
+        assert 0 < found.detection_limit[0].smallest < 150.0
+    narrow = dataclasses.replace(base.parameters[2], high=20.0)
+    base.parameters = (*base.parameters[:2], narrow)
+    hidden = diagnose(base, recording(0.0), terms).detection_limit[0]
+    assert hidden.smallest == math.inf
+    assert hidden.note == "calibration hides effects of 20, the largest that was tried"
+
+
+def test_noise_that_grows_does_not_take_up_what_a_term_explains():
+    names = ("c", "depot")
+    t, rng, runs = np.linspace(0, 12, 50), np.random.default_rng(5), []
+    for dose in (100.0, 300.0):
+        u = dose * np.exp(-(((t - 1.0) / 0.5) ** 2))
+
+        def rate(at, s, u=u):
+            return [s[1] - 0.3 * s[0], (np.interp(at, t, u) / 12.0 - s[1]) / 0.8]
+
+        c = solve(rate, [0.0, 0.0], t, max_step=0.1)[0] + 0.4 * rng.standard_normal(50)
+        c[30] += 4.0
+        runs.append(tc.Run(time=t, outputs={"c": c}, inputs={"u": u}, initial={"c": 0.0}))
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"c": u["u"] / p["V"] - p["k"] * s["c"]},
+        {"c": None},
+        [tc.Parameter("k", low=0.0, initial=0.2), tc.Parameter("V", low=1.0, high=100.0, initial=12.0)],
+    )
+    lag = tc.Term(
+        "absorption",
+        rates={
+            "c": lambda t, s, p, u: p["g"] * (s[names[1]] - u["u"] / p["V"]),
+            "depot": lambda t, s, p, u: (u["u"] / p["V"] - s["depot"]) / p["tau"],
+        },
+        states={"depot": None},
+        initial={"depot": 0.0},
+        parameters=[tc.Parameter("g", low=0.0, high=1.2), tc.Parameter("tau", low=0.05, high=5.0)],
+    )
+    found = diagnose(base, tc.Recording(runs=runs), [lag, *tc.terms.sensor("c")])
+    assert found.verdict != "consistent"
+    assert found.terms == ["absorption"] or ["absorption"] in found.tied

@@ -535,7 +535,7 @@ def test_detection_limits_are_ratios():
 def test_detection_limits_show_the_number_beside_what_there_is_to_say():
     rows = [
         Limit("yield stress", "tau0", 0.283, "Pa", 0.9, 1.5, "also: offset of tau"),
-        Limit("hidden", "a", math.inf, "Pa", 0.9, None, "calibration hides effects of any size"),
+        Limit("hidden", "a", math.inf, "Pa", 0.9, None, "calibration hides effects of 310, the largest that was tried"),
         Limit("lag", "a", math.inf, "s", 0.9),
         Limit("loss", "h", 2.83e-5, "W/(m^2 K)", 0.9, None, "also: some other loss of heat"),
         Limit("price", "c", 2.0, "$", 0.9),

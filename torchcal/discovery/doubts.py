@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchcal.discovery.local import is_window
+from torchcal.discovery.local import force, is_window
 from torchcal.discovery.model import Model
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.search import Search
@@ -22,6 +22,11 @@ EVEN, MANY = 0.55, 30
 ALONG = 3.3
 #: Distance of a term's amplitudes from neutral, in their joint sd, up to which the data leave them open.
 OPEN = 0.1
+#: The same of a term that acts in a window, where most terms can do what a few data want.
+OPEN_IN_WINDOW = 2.0
+#: Distinct values of its driver at which a window must be open, and at which closed: its height, end and slope can be
+#: drawn through fewer, whatever they are. And the share of a term that may be missing, or left.
+LEVELS, NEARLY = 3, 0.2
 #: Share of the largest effect of the base's parameters below which a direction of them moves no datum.
 UNSEEN = 1e-7
 
@@ -38,12 +43,30 @@ def left_open(search: Search, model: Model) -> str:
         own = {*(term.full(q.name) for q in term.parameters), *term.frees}
         shapes = [i for i in model.candidate.own if names[i] in own and not is_window(names[i])]
         places = [i for i in model.candidate.amplitudes if names[i] in own]
-        if places and _distance(model, places, shapes) <= OPEN:
+        if places and _distance(model, places, shapes) <= (OPEN if model.window is None else OPEN_IN_WINDOW):
             return "The data leave the size of what it adds open: more conditions would tell."
+    if model.window is not None and _levels(model) < LEVELS:
+        return (
+            f"It acts in full, or not at all, at hardly more than one value of {model.window.driver}, where something "
+            f"else may be missing as well: more values of {model.window.driver} would tell."
+        )
     # As many to spare as are added: else there is a curve through the data, whatever they are.
     if distinct(search.problem) - len(model.found.free) <= len(model.candidate.own):
         return "There are hardly more distinct conditions than parameters: more conditions would tell."
     return ""
+
+
+def _levels(model: Model) -> int:
+    """Distinct values of a window's driver, at data in use, at which it is nearly open, or nearly closed if these are
+    fewer."""
+    found, w = model.found, model.window
+    if w is None or w.span is None:
+        return 0
+    driver = found.problem.drivers_at_data(found.values[None], found.warm)[w.driver]
+    p = {q.name.rsplit(".", 1)[-1]: value
+         for q, value in zip(found.problem.parameters, found.values, strict=True) if is_window(q.name)}  # fmt: skip
+    share = force(w.span, driver, p)
+    return min(len(driver[there].unique()) for there in (share >= 1 - NEARLY, share <= NEARLY))
 
 
 def _distance(model: Model, places: Sequence[int], shapes: Sequence[int]) -> float:

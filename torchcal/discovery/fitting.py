@@ -199,14 +199,16 @@ def fit(
     values = begin.clone()
     values[:, free] = values[:, free].clamp(low, high)
 
-    def evaluate(points: Tensor, warm: Any, march: bool = True) -> tuple[Tensor, Tensor, Tensor, Tensor, Any]:
+    def evaluate(
+        points: Tensor, target: Tensor, warm: Any, march: bool = True
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Any]:
         y, jacobian, warm = problem.evaluate(points, free, warm, march=march)
         residual = target - whitening.vector(y)
         chi2 = residual.square().sum(-1)
         bad = ~torch.isfinite(chi2) | ~torch.isfinite(jacobian).flatten(1).all(-1)
         return y, jacobian, residual, torch.where(bad, torch.full_like(chi2, torch.inf), chi2), warm
 
-    y, jacobian, residual, chi2, warm = evaluate(values, warm)
+    y, jacobian, residual, chi2, warm = evaluate(values, target, warm)
     alive = torch.isfinite(chi2)
     if not bool(alive.any()):
         return None
@@ -257,7 +259,14 @@ def fit(
         reach = (slope @ step.unsqueeze(-1))[..., 0]
         predicted = 2 * (step * gradient).sum(-1) - reach.square().sum(-1)
         # A step from which the trajectory cannot be mended at once is too long; only if that goes on is it marched.
-        y_new, jacobian_new, residual_new, chi2_new, warm_new = evaluate(trial, warm, bool((lost >= 3).any()))
+        rows = (~done).nonzero()[:, 0]  # the others are not evaluated again
+        part = warm[rows] if isinstance(warm, Tensor) else warm
+        *found, warm_part = evaluate(
+            trial[rows], target[rows] if target.ndim == 2 else target, part, bool((lost[rows] >= 3).any())
+        )
+        y_new, jacobian_new, residual_new, chi2_new = (
+            old.index_copy(0, rows, new) for old, new in zip((y, jacobian, residual, chi2), found, strict=True)
+        )
         lost = torch.where(torch.isfinite(chi2_new) | (lost >= 3), torch.zeros_like(lost), lost + 1)
         gain = (chi2 - chi2_new) / predicted.clamp_min(1e-300)
         better = (chi2_new < chi2) & ~done
@@ -271,11 +280,11 @@ def fit(
             (chi2, chi2_new),
         ):
             old[better] = new[better]
-        if isinstance(warm, Tensor) and isinstance(warm_new, Tensor):
+        if isinstance(warm, Tensor) and isinstance(warm_part, Tensor):
             warm = warm.clone()
-            warm[better] = warm_new[better]
+            warm[better] = warm_part[better[rows]]
         else:
-            warm = warm_new if bool(better.all()) else warm
+            warm = warm_part if bool(better.all()) else warm
         # A step that had to be taken back teaches caution: along a bent valley the damping would swing otherwise.
         eager = torch.where(better, (eager * 0.9).clamp_min(0.2), (eager * 2.0).clamp_max(0.8))
         ease = torch.where(

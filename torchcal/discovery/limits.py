@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchcal.discovery.candidates import Candidate
 from torchcal.discovery.fitting import fit
 from torchcal.discovery.model import PRIOR
 from torchcal.discovery.records import Limit, Table
@@ -17,17 +18,17 @@ from torchcal.terms import Term
 __all__ = ["limits"]
 
 #: Times that a limit is corrected by what calibration makes of an effect of its size, and by how much at most each.
-ROUNDS, MOST = 4, 4.0
-#: Where it is close enough, as a logarithm; and by how much it may be too small in the end.
-CLOSE, SHORT = 0.05, 1.2
+ROUNDS, MOST = 8, 4.0
+#: Where it is close enough, as a logarithm.
+CLOSE = 0.05
 
 
 def limits(search: Search, alpha: float, power: float, contained: Sequence[Term] = ()) -> Table[Limit]:
     """Smallest detectable effects.
 
     The linear limit, from the norm of the projected tangent, is checked: an effect of its size is simulated without
-    noise, the base is calibrated to that, and the size is scaled until what calibration cannot hide is just large
-    enough. Infinite where calibration hides ever larger effects.
+    noise, the base is calibrated to that, and the size is changed until what calibration cannot hide is just large
+    enough. Infinite where calibration hides ever larger effects, or all within the parameter's bounds.
 
     Args:
         search: With its screening.
@@ -54,8 +55,9 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
             doubt = math.sqrt(1 + wanted**2 / (2 * search.noise.freedom))
         effects[i] = _Effect(column, wanted + doubt * from_power, float(screening.norm[column]))
     sizes = {i: effect.distance / effect.norm for i, effect in effects.items()}
+    hidden: dict[int, float] = {}
     if not search.exact:
-        sizes = _corrected(search, effects, sizes)
+        sizes, hidden = _corrected(search, effects, sizes)
     rows = []
     for i, candidate in enumerate(search.candidates):
         column = screening.best[i]
@@ -70,7 +72,7 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
         others = [search.candidates[j].name for j in search.aliases.get(i, ())]
         note = f"also: {', '.join(others)}" if others else ""
         if math.isinf(sizes[i]):
-            note = "calibration hides effects of any size"
+            note = f"calibration hides effects of {hidden[i]:.3g}, the largest that was tried"
         rows.append(Limit(candidate.name, q.name, sizes[i], q.unit, power, estimate, note))
     for term in contained:
         name = term.full(term.parameters[0].name) if term.parameters else term.frees[0]
@@ -93,47 +95,76 @@ class _Effect:
     norm: float
 
 
-def _corrected(search: Search, effects: dict[int, _Effect], sizes: dict[int, float]) -> dict[int, float]:
-    """Sizes whose effects remain large enough when the base is calibrated to them; of two signs the worse."""
+def _corrected(
+    search: Search, effects: dict[int, _Effect], sizes: dict[int, float]
+) -> tuple[dict[int, float], dict[int, float]]:
+    """Sizes whose effects remain just large enough when the base is calibrated to them, of two signs the larger one.
+
+    With them the largest size that is not seen, where no larger one was found that is.
+    """
     base = search.base
-    trials: list[tuple[int, int]] = []
+    now: dict[tuple[int, int], float] = {}
+    room: dict[tuple[int, int], float] = {}
     for i, effect in effects.items():
         candidate = search.candidates[i]
-        sided = candidate.one_sided(candidate.amplitudes[int(search.screening.amplitude[effect.column])])
-        trials += [(i, sign) for sign in ((sided,) if sided else (1, -1))]
-    now = {trial: sizes[trial[0]] for trial in trials}
-    good = dict(now)
-    short = dict.fromkeys(trials, 1.0)
+        place = candidate.amplitudes[int(search.screening.amplitude[effect.column])]
+        sided = candidate.one_sided(place)
+        for sign in (sided,) if sided else (1, -1):
+            room[i, sign] = _room(candidate, place, sign)
+            now[i, sign] = min(sizes[i], room[i, sign])
+    unseen, seen = dict.fromkeys(now, 0.0), dict.fromkeys(now, math.inf)
+    trials = list(now)
     for _ in range(ROUNDS):
         data, known = [], []
         for trial in trials:
             y = _simulated(search, trial[0], effects[trial[0]].column, trial[1] * now[trial])
-            if y is None:  # what blows up is seen: somewhere between
-                now[trial], short[trial] = math.sqrt(good[trial] * now[trial]), 1.0
-                continue
-            data.append(y)
-            known.append(trial)
-            good[trial] = now[trial]
-        if not known:
-            break
-        warm: Any = base.warm.expand(len(known), *base.warm.shape[1:]) if isinstance(base.warm, Tensor) else None
-        begin = base.values.expand(len(known), -1)
-        found = fit(
-            base.problem, base.whitening, begin, base.free, warm=warm, data=torch.stack(data), max_steps=30, finish=0
-        )
-        if found is None or found.ends_chi2 is None or len(found.ends_chi2) != len(known):
-            break
-        for trial, chi2 in zip(known, found.ends_chi2.tolist(), strict=True):
-            short[trial] = effects[trial[0]].distance / max(math.sqrt(chi2), 1e-300)
-        trials = [trial for trial in known if abs(math.log(short[trial])) > CLOSE]
+            if y is None:  # what blows up is seen
+                seen[trial] = now[trial]
+                now[trial] = math.sqrt(unseen[trial] * now[trial]) if unseen[trial] else now[trial] / MOST
+            else:
+                data.append(y)
+                known.append(trial)
+        if known:
+            warm: Any = base.warm.expand(len(known), *base.warm.shape[1:]) if isinstance(base.warm, Tensor) else None
+            found = fit(
+                base.problem,
+                base.whitening,
+                base.values.expand(len(known), -1),
+                base.free,
+                warm=warm,
+                data=torch.stack(data),
+                max_steps=30,
+                finish=0,
+            )
+            if found is None or found.ends_chi2 is None or len(found.ends_chi2) != len(known):
+                break
+            for trial, chi2 in zip(known, found.ends_chi2.tolist(), strict=True):
+                short = effects[trial[0]].distance / max(math.sqrt(chi2), 1e-300)
+                if abs(math.log(short)) <= CLOSE:
+                    seen[trial] = now[trial]
+                    trials.remove(trial)
+                    continue
+                (unseen if short > 1 else seen)[trial] = now[trial]
+                if unseen[trial] >= room[trial]:
+                    trials.remove(trial)
+                    continue
+                wanted = min(now[trial] * min(max(short, 1 / MOST), MOST), room[trial])
+                if not unseen[trial] < wanted < seen[trial]:
+                    wanted = math.sqrt(unseen[trial] * seen[trial])
+                now[trial] = wanted
         if not trials:
             break
-        for trial in trials:
-            now[trial] *= min(max(short[trial], 1 / MOST), MOST)
-    return {
-        i: max(size if short[i, sign] < SHORT else math.inf for (j, sign), size in now.items() if j == i)
-        for i in effects
-    }
+    return (
+        {i: max(size for (j, _), size in seen.items() if j == i) for i in effects},
+        {i: max(size for (j, _), size in unseen.items() if j == i) for i in effects},
+    )
+
+
+def _room(candidate: Candidate, place: int, sign: int) -> float:
+    """How far an amplitude's bounds let it be from neutral, to one side."""
+    q, neutral = candidate.problem.parameters[place], float(candidate.neutral[candidate.own.index(place)])
+    end = q.high if sign > 0 else q.low
+    return math.inf if end is None else max(sign * (end - neutral), 0.0)
 
 
 def _simulated(search: Search, i: int, column: int, size: float) -> Tensor | None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchcal.simulators import Parameter
 from torchcal.terms import Term
 
-__all__ = ["EDGE", "ENDS", "WIDTHS", "Span", "beyond", "is_window", "localised", "region_text"]
+__all__ = ["EDGE", "ENDS", "WIDTHS", "Span", "beyond", "force", "is_window", "localised", "region_text"]
 
 #: Width of a window's edges, as a share of the driver's range: wide enough for a fit to move them; and the limits
 #: between which it is fitted, from nearly a step.
@@ -22,7 +22,7 @@ DECADES = 30.0
 
 #: Names of the parameters of a window's ends.
 ENDS = {"from": "window from", "to": "window to"}
-_EDGE = "window edge"
+WIDTH_OF_EDGE = "window edge"
 
 
 @dataclass(frozen=True)
@@ -85,16 +85,10 @@ def localised(
     size = span.size
     if edge:
         least, most = (share * size for share in WIDTHS)
-        ends.append(Parameter(_EDGE, low=least, high=most, initial=EDGE * size, transform="log"))
+        ends.append(Parameter(WIDTH_OF_EDGE, low=least, high=most, initial=EDGE * size, transform="log"))
 
-    def inside(d: Tensor, p: Mapping[str, Tensor]) -> Any:
-        width = p[_EDGE] if edge else EDGE * size
-        w: Any = 1.0
-        if math.isfinite(low):
-            w = w * torch.sigmoid(span.distance(d, p[ENDS["from"]]) / width)
-        if math.isfinite(high):
-            w = w * torch.sigmoid(-span.distance(d, p[ENDS["to"]]) / width)
-        return w
+    def inside(d: Tensor, p: Mapping[str, Any]) -> Any:
+        return force(span, d, p)
 
     def moving(function: Callable[..., Any]) -> Callable[..., Any]:
         return lambda t, s, p, u: (
@@ -127,15 +121,27 @@ def localised(
     )
 
 
+def force(span: Span, d: Tensor, p: Mapping[str, Any]) -> Any:
+    """Share of a term that its window lets through, from 0 to 1, at values of the driver; p holds the window's own
+    parameters."""
+    width = p.get(WIDTH_OF_EDGE, EDGE * span.size)
+    w: Any = 1.0
+    if ENDS["from"] in p:
+        w = w * torch.sigmoid(span.distance(d, p[ENDS["from"]]) / width)
+    if ENDS["to"] in p:
+        w = w * torch.sigmoid(-span.distance(d, p[ENDS["to"]]) / width)
+    return w
+
+
 def is_window(name: str) -> bool:
     """Whether a parameter is an end or the edge of a window, by its qualified name."""
-    return name.rsplit(".", 1)[-1] in (*ENDS.values(), _EDGE)
+    return name.rsplit(".", 1)[-1] in (*ENDS.values(), WIDTH_OF_EDGE)
 
 
 def beyond(parameter: Parameter) -> float:
     """A value of a window's parameter for a window that leaves nothing out; it has bounds."""
     low, high = parameter.low or 0.0, parameter.high or 0.0
-    if parameter.name.endswith(_EDGE):
+    if parameter.name.endswith(WIDTH_OF_EDGE):
         return low
     if parameter.transform == "log":
         low, high = low * low / high, high * high / low

@@ -28,6 +28,9 @@ FEW_DATA = 0.1
 #: Times the level up to which a misfit that noise alone gives counts as more than that where the base, beside the
 #: refitted candidates, is as improbable as the level: a statistic for all kinds of misfit sees each kind less well.
 OFTEN = 5.0
+#: Probability of the base beside the refitted candidates below which there is more than noise, whatever is left looks
+#: like: noise that grows with the value can take up what a term explains far better.
+HOPELESS = 1e-6
 
 
 def settle(search: Search, observed: Problem, confidence: float) -> tuple[Search, bool]:
@@ -101,7 +104,8 @@ def _refit(search: Search, confidence: float) -> bool:
         if not detected and search.few and (p := fits_by_chance(search)) < FEW_DATA * level:
             detected, search.p_detect = True, min(p, search.p_detect)
         elif not detected:
-            detected = search.p_detect < OFTEN * level and base_alone(search) < level
+            alone = base_alone(search)
+            detected = alone < HOPELESS or (search.p_detect < OFTEN * level and alone < level)
         if detected and not at_once:
             search.models = []
             search.refit_singles()

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchcal.discovery.candidates import Candidate
 from torchcal.discovery.channels import responses
+from torchcal.discovery.local import Span
 from torchcal.discovery.structure import Residual
 from torchcal.simulators import Trajectories
 
@@ -110,6 +111,7 @@ class Window:
         high: Upper end.
         z: Score statistic.
         amplitude: Linear estimate of the amplitude.
+        span: Scale on which its edges are laid out, once it is fitted.
     """
 
     candidate: int
@@ -118,6 +120,7 @@ class Window:
     high: float
     z: float
     amplitude: float
+    span: Span | None = None
 
 
 def contributions(

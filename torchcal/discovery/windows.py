@@ -246,7 +246,11 @@ def refit_window(
     begin = torch.tensor(list(itertools.product(*choices)), dtype=torch.float64)
     # Windows were searched on a grid of about 12 edges: the best of so many costs its logarithm.
     model = search._refit(
-        (w.candidate,), candidate, begin, prior - math.log(3.0 * len(search._drivers())), window=w
+        (w.candidate,),
+        candidate,
+        begin,
+        prior - math.log(3.0 * len(search._drivers())),
+        window=dataclasses.replace(w, span=span),
     )
     if model is None or model.window is None:
         return None

@@ -300,7 +300,9 @@ def _extend_static(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
             for name, sensor in term.outputs.items():
                 place = name if name in found else "y" if not isinstance(result, Mapping) else name
                 if place not in found:
-                    raise DomainError(f"Expected the term {term.name!r} on an output of {list(found)}. Got {name!r}.")
+                    raise SimulatorError(
+                        f"Expected the term {term.name!r} on an output of {list(found)}. Got {name!r}."
+                    )
                 found[place] = term.call(sensor, x, term.own(p), found[place])
         return found if isinstance(result, Mapping) else found["y"]
 
