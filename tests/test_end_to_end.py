@@ -19,6 +19,7 @@ from torchcal.errors import (
     ConvergenceWarning,
     DegenerateLikelihoodError,
     EmbeddingError,
+    IdentifiabilityWarning,
     ImproperPosteriorError,
     ToleranceWarning,
 )
@@ -153,7 +154,7 @@ def test_bounds_on_one_side_and_on_both_are_kept():
     """The unbounded best line is 1.5 + x: every bound here is in its way."""
     parameters = [tc.Parameter("a", low=-1.0, high=1.2), tc.Parameter("b", low=1.5), tc.Parameter("c", high=0.0)]
     simulator = tc.Simulator(lambda x, p: p["a"] + p["b"] * x + p["c"] * x**2, parameters)
-    with tiny_chains():
+    with tiny_chains(), pytest.warns(IdentifiabilityWarning, match="a at its upper bound 1.2, b at its lower bound 1.5"):
         result = tc.calibrate(simulator, tc.Recording(x=X, y=Y), likelihood=ABC(epsilon=0.2), **TINY)
         baseline = tc.calibrate_additive(simulator, tc.Recording(x=X, y=Y), **TINY)
     check_result(result, 5)
@@ -166,6 +167,7 @@ def test_bounds_on_one_side_and_on_both_are_kept():
         assert (values[:, 2] <= rounding).all()
 
 
+@pytest.mark.filterwarnings("ignore:The best density has")
 def test_a_map_on_a_bound_is_reached():
     parameters = [tc.Parameter("a", low=2.0), tc.Parameter("b", low=-3.0, high=0.5)]
     simulator = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, parameters)

@@ -80,7 +80,7 @@ class PropagationWarning(TorchcalWarning):
 
 
 class IdentifiabilityWarning(TorchcalWarning):
-    """The data say nothing about the value of a parameter."""
+    """The data say nothing about the value of a parameter, or a bound decides it."""
 
 
 class ToleranceWarning(TorchcalWarning):

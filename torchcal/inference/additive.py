@@ -14,7 +14,7 @@ from torchcal.inference.estimate import maximise
 from torchcal.inference.fitting import LeastSquares, least_squares, plain_propagation
 from torchcal.inference.sampling import Plan, draw
 from torchcal.inference.setup import check_inputs, check_run
-from torchcal.inference.summary import diagnose, settings_of, to_result, warn_of_box, warn_of_chains
+from torchcal.inference.summary import diagnose, settings_of, to_result, warn_of_bounds, warn_of_box, warn_of_chains
 from torchcal.models import Problem
 from torchcal.priors import CoefficientPrior, Flat
 from torchcal.propagation import NISP
@@ -124,6 +124,7 @@ def calibrate_additive(
     quality = diagnose(estimate, draws, samples, None, names, None)
     warn_of_chains(quality)
     warn_of_box(simulator, propagate, estimate.alpha[:-1])
+    warn_of_bounds(propagate, estimate.alpha[:-1])
     mean = propagate.scaling.physical(estimate.alpha[:-1])
     result = AdditiveCalibration(
         map=MapEstimate(

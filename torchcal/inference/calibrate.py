@@ -22,8 +22,10 @@ from torchcal.inference.summary import (
     mean_square,
     settings_of,
     to_result,
+    warn_of_bounds,
     warn_of_box,
     warn_of_chains,
+    warn_of_spike,
     warn_of_tolerance,
 )
 from torchcal.models import Problem
@@ -109,6 +111,7 @@ def calibrate(
         ToleranceWarning: If the tolerance rather than the model error sets the width of the prediction.
         PropagationWarning: If moments have not converged in nodes or order.
         ExtrapolationWarning: If the calibration leaves the box of a surrogate.
+        IdentifiabilityWarning: If the data do not determine a parameter, or its bound does.
 
     Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276.
     """
@@ -176,6 +179,8 @@ def calibrate(
     if propagate.pattern.num_germs:
         warn_of_tolerance(quality, problem.likelihood)
     warn_of_box(simulator, propagate, estimate.alpha)
+    warn_of_bounds(propagate, estimate.alpha)
+    warn_of_spike(problem, estimate.alpha)
     warn_of_chains(quality)
     mean, covariance = propagate.parameter_moments(estimate.alpha)
     return Calibration(

@@ -142,6 +142,11 @@ def embedded_problem(
         trial_spread=0.2,  # enough to start with: the rule is refined at the maximum
     )
     germs = propagate.pattern.num_germs
+    if order is not None and order < propagate.pattern.order:
+        raise DomainError(
+            f"Expected order= of at least the embedding's, {propagate.pattern.order}: outputs whose expansion is cut "
+            f"below it do not tell all coefficients. Got {order}."
+        )
     if germs == 0 and likelihood.needs != "mean":
         raise EmbeddingError(
             f"Expected an embedding with at least one uncertain parameter for the {likelihood.name} likelihood. "

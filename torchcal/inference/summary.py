@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchcal import likelihoods
 from torchcal.data import Recording
-from torchcal.errors import ConvergenceWarning, ExtrapolationWarning, ToleranceWarning
+from torchcal.errors import ConvergenceWarning, ExtrapolationWarning, IdentifiabilityWarning, ToleranceWarning
 from torchcal.inference import diagnostics as measure
 from torchcal.inference.draws import WORTH_CHAINS, Draws, most_divergences
 from torchcal.inference.estimate import Estimate
@@ -25,10 +25,17 @@ __all__ = [
     "mean_square",
     "settings_of",
     "to_result",
+    "warn_of_bounds",
     "warn_of_box",
     "warn_of_chains",
+    "warn_of_spike",
     "warn_of_tolerance",
 ]
+
+#: Distance from a bound, as a share of the room between bounds (or of the scale), up to which a mean lies at it.
+AT_BOUND = 1e-4
+#: Smallest sd of the outputs over their median below which a likelihood without noise has found a spike.
+SPIKE = 1e-2
 
 
 def diagnose(
@@ -145,6 +152,42 @@ def warn_of_tolerance(quality: Diagnostics, likelihood: likelihoods.Likelihood) 
             f"{quality.posterior_variance:.3g} against σ² = {quality.map_variance:.3g} at the MAP, means over the "
             "data. Use a smaller epsilon=, unless the model is as good as exact.",
             ToleranceWarning,
+            stacklevel=3,
+        )
+
+
+def warn_of_bounds(propagate: NISP, alpha: Tensor) -> None:
+    """Warn where a parameter's mean (the median, on a logarithmic scale) lies at a bound."""
+    low, high = (end.to(alpha) for end in propagate.scaling.bounds(propagate.free))
+    mean = alpha[: propagate.num_alpha][propagate.pattern.leading.to(alpha.device)]
+    width = torch.where(torch.isfinite(high - low), high - low, torch.ones_like(mean))
+    told = []
+    for i, q in enumerate(propagate.free):
+        for end, value, side in ((low, q.low, "lower"), (high, q.high, "upper")):
+            if float((mean[i] - end[i]).abs()) <= AT_BOUND * float(width[i]):
+                told.append(f"{q.name} at its {side} bound {value:g}")
+    if told:
+        warnings.warn(
+            f"The best density has {', '.join(told)}: the bound decides it, and the spreads make up for it. Widen "
+            "bounds that are not physical; others say that the model lacks something.",
+            IdentifiabilityWarning,
+            stacklevel=3,
+        )
+
+
+def warn_of_spike(problem: Problem, alpha: Tensor) -> None:
+    """Warn where a likelihood without noise or tolerance has found one of its spurious maxima (Fig. 6)."""
+    if problem.likelihood.name not in ("marginal", "gaussian_marginal") or problem.noise is not None:
+        return
+    with torch.no_grad():
+        sd = problem.propagate(alpha[: problem.propagate.num_alpha])[1]
+    sd = sd if problem.observed is None else sd[problem.observed]
+    if float(sd.min()) < SPIKE * float(sd.median()):
+        warnings.warn(
+            f"The best density is a spike: the output's sd is {float(sd.min()):.2g} at one datum and "
+            f"{float(sd.median()):.2g} at the median one, and the {problem.likelihood.name} likelihood grows without "
+            "limit as it vanishes there. Give the recording's noise=, or use ABC().",
+            ConvergenceWarning,
             stacklevel=3,
         )
 

@@ -32,6 +32,7 @@ class Basis:
 
     Attributes:
         name: ``"hermite"`` or ``"legendre"``.
+        most_points: Most nodes of a Gauss rule; None for no limit.
 
     Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 6-7.
     """
@@ -42,6 +43,7 @@ class Basis:
     _rule: Callable[[int], tuple[np.ndarray, np.ndarray]] = field(repr=False)
     _inverse_cdf: Callable[[Tensor], Tensor] = field(repr=False)
     _draw: Callable[..., Tensor] = field(repr=False)
+    most_points: int | None = None
 
     def evaluate(self, xi: Tensor, order: int) -> Tensor:
         r"""Evaluate :math:`\psi_0, \dots, \psi_p` by their three-term recurrence.
@@ -189,7 +191,13 @@ def _uniform_draw(
 
 # Named functions, not lambdas, so that a basis can be pickled with a result.
 HERMITE = Basis(
-    "hermite", _hermite_recurrence, _hermite_norm, _hermite_rule, torch.special.ndtri, torch.randn
+    "hermite",
+    _hermite_recurrence,
+    _hermite_norm,
+    _hermite_rule,
+    torch.special.ndtri,
+    torch.randn,
+    most_points=_MAX_HERMITE_POINTS,
 )
 LEGENDRE = Basis("legendre", _legendre_recurrence, _legendre_norm, leggauss, _uniform_icdf, _uniform_draw)
 

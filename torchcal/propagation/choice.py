@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 
 __all__ = ["choose", "exact_count"]
 
+#: Nodes a germ to begin with where no number of them is enough.
+ENOUGH = 16
+
 
 def choose(propagate: "NISP", rule: polychaos.Rule | RuleChoice | int | None) -> RuleChoice:
     """The rule a user asked for, or enough nodes: exactly enough for polynomials, found by trial otherwise."""
@@ -46,33 +49,43 @@ def choose(propagate: "NISP", rule: polychaos.Rule | RuleChoice | int | None) ->
 
 def exact_count(propagate: "NISP") -> int | None:
     """Gauss nodes per germ that integrate f² exactly: its degree is twice that of f in ξ."""
-    if propagate.simulator.degree is None or bool(propagate.scaling.log.any()):
+    if propagate.degree is None or bool(propagate.scaling.log.any()):
         return None
-    degree = propagate.simulator.degree * max(1, propagate.pattern.order)
+    degree = propagate.degree * max(1, propagate.pattern.order)
     # With a truncated expansion f Ψ_k is integrated, whose degree is lower.
     return degree + 1 if propagate.order is None else (degree + propagate.order) // 2 + 1
 
 
 def _by_trial(propagate: "NISP", counts: list[int]) -> RuleChoice:
-    """The smallest tensor rule whose moments at a few trial densities agree with the next one's."""
+    """The smallest tensor rule whose moments at a few trial densities agree with the next one's.
+
+    Where no two rules agree, as with a kink, or a pole that more nodes only come nearer to, it is one of `ENOUGH` nodes
+    a germ; and where outputs cease to be finite as the nodes spread, the largest rule before. The maximum that is found
+    with it is refined.
+    """
     alpha = _trial_alpha(propagate)
     order, propagate.order = propagate.order, None
     previous: tuple[Tensor, Tensor] | None = None
+    dead: Tensor | None = None
     try:
         for count, smaller in zip(counts, [0, *counts], strict=False):
             propagate.set_rule(RuleChoice("tensor", count))
             with torch.no_grad():
                 mean, variance = propagate.moments(alpha)
             sd = variance.sqrt()
+            lost = ~torch.isfinite(mean + sd)
+            dead = lost if dead is None else dead
+            if bool(dead.all()) or bool((lost & ~dead).any()):
+                return RuleChoice("tensor", max(smaller, 3))
             if previous is not None:
-                scale = propagate.largest(torch.maximum(mean.abs(), sd))
+                scale = propagate.largest(torch.nan_to_num(torch.maximum(mean.abs(), sd), posinf=0.0))
                 change = torch.maximum((mean - previous[0]).abs(), (sd - previous[1]).abs())
-                if bool((change <= 1e-9 * scale).all()):
+                if bool((change <= 1e-9 * scale)[~dead].all()):
                     return RuleChoice("tensor", smaller)
             previous = (mean, sd)
     finally:
         propagate.order = order
-    return RuleChoice("tensor", counts[-1])
+    return RuleChoice("tensor", max(count for count in counts if count <= ENOUGH))
 
 
 def _trial_alpha(propagate: "NISP") -> Tensor:

@@ -1,5 +1,6 @@
 """Whether output moments have converged in quadrature nodes and in the order of the expansion."""
 
+import math
 import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -36,7 +37,8 @@ class PropagationCheck:
 
 def compare(propagate: "NISP", alpha: Tensor) -> PropagationCheck:
     """Moments at α against those of a finer rule, and the expansion against the full variance."""
-    finer = propagate.copy(rule=propagate.rule_choice.finer(propagate.pattern.num_germs))
+    pattern = propagate.pattern
+    finer = propagate.copy(rule=propagate.rule_choice.finer(pattern.num_germs, pattern.basis))
     with torch.no_grad():
         mean, variance = propagate.moments(alpha)
         other_mean, other_variance = finer.moments(alpha)
@@ -61,13 +63,19 @@ def compare(propagate: "NISP", alpha: Tensor) -> PropagationCheck:
 def warn(result: PropagationCheck, order: int | None, tolerance: float, order_tolerance: float) -> None:
     """Warn of what has not converged, with the numbers."""
     if not max(result.mean_change, result.sd_change) <= tolerance:
-        warnings.warn(
-            f"With {result.nodes} quadrature nodes the output's mean is off by {result.mean_change:.2g} and "
-            f"its sd by {result.sd_change:.2g} of the output's scale, against {result.finer_nodes} nodes "
-            f"(tolerance {tolerance:.0e}). Pass a larger rule= or max_nodes=.",
-            PropagationWarning,
-            stacklevel=3,
-        )
+        if math.isnan(result.mean_change + result.sd_change):
+            told = (
+                f"The simulator has no finite output at some of {result.nodes} or {result.finer_nodes} quadrature "
+                "nodes, which lie where the parameters' density reaches. Give bounds or transform='log' that keep it "
+                "where the simulator works, or embed another parameter."
+            )
+        else:
+            told = (
+                f"With {result.nodes} quadrature nodes the output's mean is off by {result.mean_change:.2g} and "
+                f"its sd by {result.sd_change:.2g} of the output's scale, against {result.finer_nodes} nodes "
+                f"(tolerance {tolerance:.0e}). Pass a larger rule= or max_nodes=."
+            )
+        warnings.warn(told, PropagationWarning, stacklevel=3)
     if result.truncated > order_tolerance:
         warnings.warn(
             f"An expansion of order {order} leaves out {result.truncated:.1%} of the output's variance "

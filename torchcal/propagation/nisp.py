@@ -106,6 +106,7 @@ class NISP(nn.Module):
         self.free, self.held = free_parameters(simulator.parameters, fixed)
         self.pattern: Pattern = embedding.bind([parameter.name for parameter in self.free])
         self.scaling = scaling if scaling is not None else Scaling.from_parameters(self.free)
+        self._check_finite_moments()
         self.outputs = None if outputs is None else tuple(outputs)
         self.order = order
         self.max_nodes = max_nodes
@@ -125,7 +126,7 @@ class NISP(nn.Module):
         )
         self._evaluate: Callable[[Tensor], Tensor] | None = None
         self._polynomial: Tensor | None = None
-        found = polynomials.expansion(self)
+        found, self.degree = polynomials.expansion(self)
         self._is_polynomial = found is not None
         found = found if found is not None and found.pays else None
         self.register_buffer("_table", None if found is None else found.table, persistent=False)
@@ -343,8 +344,8 @@ class NISP(nn.Module):
         changed = False
         germs = self.pattern.num_germs
         while germs and self._choice.kind == "tensor" and choice.exact_count(self) is None:
-            finer = self._choice.finer(germs)
-            if finer.size**germs > self.max_nodes:
+            finer = self._choice.finer(germs, self.pattern.basis)
+            if finer.size**germs > self.max_nodes or finer.size < self._choice.size:
                 break
             result = self.check(alpha, warn=False)
             changes = (result.mean_change, result.sd_change)
@@ -355,6 +356,16 @@ class NISP(nn.Module):
         return changed
 
     # --- inside ------------------------------------------------------------------------------------------
+
+    def _check_finite_moments(self) -> None:
+        pattern = self.pattern
+        endless = [q.name for q in self.free if q.transform == "log" and q.name in pattern.embedded]
+        if pattern.basis.name == "hermite" and pattern.order > 2 and endless:
+            raise EmbeddingError(
+                f"Expected an expansion of order 2 at most in normal germs for {', '.join(endless)} with "
+                f"transform='log': exp of a cubic in a normal variable has no mean. Got order {pattern.order}. Use "
+                "germ='legendre', a lower order, or no transform."
+            )
 
     def _check_alpha(self, alpha: Tensor) -> None:
         if not isinstance(alpha, Tensor):
@@ -469,7 +480,7 @@ class NISP(nn.Module):
 
     def _whole_order(self, rule_choice: RuleChoice) -> int | None:
         """Degree of a polynomial's whole expansion in the germs, where the rule has nodes enough for it."""
-        exact, degree = choice.exact_count(self), self.simulator.degree
+        exact, degree = choice.exact_count(self), self.degree
         if not self._is_polynomial or exact is None or not degree:
             return None
         if rule_choice.kind != "tensor" or rule_choice.size < exact:

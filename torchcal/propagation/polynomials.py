@@ -7,6 +7,7 @@ of the many outputs:
 """
 
 import math
+import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchcal import polychaos
+from torchcal.errors import PropagationWarning
 from torchcal.simulators import ExternalSimulator, PolynomialSurrogate
 
 if TYPE_CHECKING:
@@ -49,18 +51,21 @@ class Expansion:
     pays: bool
 
 
-def expansion(propagate: "NISP") -> Expansion | None:
-    """The outputs as a polynomial, found at random points and held against others.
+def expansion(propagate: "NISP") -> tuple[Expansion | None, int | None]:
+    """The outputs as a polynomial, found at random points and held against others, and its degree in the parameters.
 
-    None where the simulator says nothing of a degree, a parameter is on a logarithmic scale, there are too many terms,
-    or what it says does not hold: then nodes are evaluated as of any other simulator.
+    None where the simulator says nothing of a degree, a parameter is on a logarithmic scale, or there are too many
+    terms: then nodes are evaluated as of any other simulator. Where what it says does not hold, the degree is None too.
+
+    Warns:
+        PropagationWarning: Where it does not hold.
     """
     degree, d = propagate.simulator.degree, len(propagate.free)
     if degree is None or d == 0 or bool(propagate.scaling.log.any()):
-        return None
+        return None, degree
     count = math.comb(degree + d, d)
     if count > MOST_TERMS:
-        return None
+        return None, degree
     terms = polychaos.multi_indices(d, degree)
     generator = torch.Generator().manual_seed(0)
     points = 2 * torch.rand(2 * count + _SPARE, d, dtype=torch.float64, generator=generator) - 1
@@ -70,13 +75,21 @@ def expansion(propagate: "NISP") -> Expansion | None:
     values = values.to(device="cpu", dtype=torch.float64)
     psi = polychaos.evaluate(polychaos.LEGENDRE, terms, points)
     if not bool(torch.isfinite(values).all()):
-        return None
+        return None, degree
     table = torch.linalg.lstsq(psi[_SPARE:], values[_SPARE:], driver="gelsd").solution
     error = (psi[:_SPARE] @ table - values[:_SPARE]).abs().amax(0)
     tolerance = max(TOLERANCE, 1e3 * torch.finfo(where.dtype).eps)
-    if not bool((error <= tolerance * propagate.largest(values.abs().amax(0))).all()):
-        return None
-    return Expansion(terms, table, count <= propagate._n or isinstance(propagate.simulator, _DEAR))
+    size = propagate.largest(values.abs().amax(0))
+    if not bool((error <= tolerance * size).all()):
+        warnings.warn(
+            f"Expected outputs that are polynomials of degree {degree} in the parameters, as degree= says. Got ones "
+            f"that differ from that by {float((error / size).max()):.2g} of their size. They are taken as any others: "
+            "drop degree=.",
+            PropagationWarning,
+            stacklevel=4,
+        )
+        return None, None
+    return Expansion(terms, table, count <= propagate._n or isinstance(propagate.simulator, _DEAR)), degree
 
 
 def interpolating(values: Tensor, weights: Tensor) -> Tensor:

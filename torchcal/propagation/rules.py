@@ -38,16 +38,18 @@ class RuleChoice:
             return polychaos.qmc_rule(basis, germs, self.size, seed=self.seed)
         return polychaos.tensor_rule(basis, germs, self.size)
 
-    def finer(self, germs: int) -> "RuleChoice":
-        """The rule to hold this one against."""
+    def finer(self, germs: int, basis: polychaos.Basis) -> "RuleChoice":
+        """The rule to hold this one against: a finer one, or a coarser one where Gauss rules have no more nodes."""
+        most = math.inf if basis.most_points is None else basis.most_points
         if self.given is not None:
             count = len(self.given.nodes)
-            return RuleChoice("tensor", max(2, math.ceil((2 * count) ** (1 / max(1, germs)))))
+            return RuleChoice("tensor", int(min(max(2, math.ceil((2 * count) ** (1 / max(1, germs)))), most)))
         if self.kind == "smolyak":
             return replace(self, size=self.size + 1)
         if self.kind == "qmc":
             return replace(self, size=2 * self.size, seed=self.seed + 1)
-        return replace(self, size=max(self.size + 2, math.ceil(1.3 * self.size)))
+        size = min(max(self.size + 2, math.ceil(1.3 * self.size)), most)
+        return replace(self, size=int(size if size > self.size else self.size / 1.3))
 
     def expansion_order(self, germs: int) -> int:
         """The highest total degree of an expansion that the rule projects on without much aliasing."""

@@ -32,7 +32,7 @@ def refine_in_time(propagate: NISP, alpha: Tensor) -> bool:
     while germs and propagate.rule_choice.kind == "tensor":
         result = propagate.check(alpha, warn=False)
         change = max(result.mean_change, result.sd_change, key=lambda number: (math.isnan(number), number))
-        finer = propagate.rule_choice.finer(germs)
+        finer = propagate.rule_choice.finer(germs, propagate.pattern.basis)
         if change <= NODE_TOLERANCE or not math.isfinite(change) or finer.size**germs > propagate.max_nodes:
             break
         propagate.set_rule(finer)

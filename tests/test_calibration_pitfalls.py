@@ -1,0 +1,125 @@
+"""What a calibration did wrong, or said nothing of, on problems that others brought: each case once."""
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+import torchcal as tc
+from torchcal.errors import (
+    DomainError,
+    EmbeddingError,
+    IdentifiabilityWarning,
+    PropagationWarning,
+)
+
+X = np.linspace(0, 6, 25)
+
+
+def line(**a) -> tc.Simulator:
+    return tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a", **a), tc.Parameter("b")])
+
+
+def mode(simulator, y, x=X, **options):
+    return tc.calibrate(simulator, tc.Recording(x=x, y=y), **{"num_samples": 0, "seed": 0, **options})
+
+
+@pytest.mark.parametrize(
+    ("function", "y"),
+    [
+        (lambda x, p: torch.relu(x - p["c"]), np.maximum(X - 2.0, 0) + 0.3 * np.sin(X)),
+        (lambda x, p: (x - p["c"]).abs(), np.abs(X - 2) + 0.2 * np.sin(3 * X)),
+    ],
+)
+def test_a_kink_takes_the_most_nodes_that_there_are(function, y):
+    with pytest.warns(PropagationWarning, match="With 369 quadrature nodes .* against 283 nodes"):
+        found = mode(tc.Simulator(function, [tc.Parameter("c", initial=2.0)]), y)
+    assert found.propagate.num_nodes == 369
+    assert 1.9 < float(found.map.mean[0]) < 2.2
+
+
+def test_a_pole_beside_the_data_does_not_hide_the_best_density():
+    simulator = tc.Simulator(lambda x, p: 1 / (p["a"] - 1) + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    x = np.linspace(0, 5, 11)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PropagationWarning)  # a density that reaches a pole has no sd
+        both = mode(simulator, 1 + 0.5 * x + 0.1 * x**2, x, num_starts=8)
+        one = mode(simulator, 1 + 0.5 * x + 0.1 * x**2, x, embedding=tc.embeddings.Gaussian(parameters=("b",)))
+    assert both.map.objective < one.map.objective  # of which it is a special case
+    assert float(both.map.mean[0]) == pytest.approx(2.7, abs=0.3)
+
+
+def test_a_range_without_answers_takes_few_nodes():
+    def function(x, p):
+        return torch.where(p["k"] < 0.4, p["e"] - p["k"] * x, math.nan)
+
+    x = np.linspace(0, 5, 15)
+    simulator = tc.Simulator(function, [tc.Parameter("e", low=2.0, high=5.0), tc.Parameter("k", low=0.0, high=1.0)])
+    found = mode(simulator, 3.4 - 0.18 * x + 0.01 * np.sin(4 * x), x)
+    assert found.propagate.num_nodes <= 16
+    assert float(found.map.mean[1]) == pytest.approx(0.18, abs=0.02)
+
+
+@pytest.mark.filterwarnings("ignore:Only 1 of")
+def test_nodes_without_an_answer_are_told_as_such():
+    simulator = tc.Simulator(lambda x, p: p["a"].sqrt() * (1 + x), [tc.Parameter("a", low=0.0, high=9.0)])
+    with pytest.warns(PropagationWarning, match="no finite output at some of .* Give bounds or transform='log'"):
+        mode(simulator, 0.3 * (1 + X) + 1.5 * np.sin(X))
+
+
+def test_a_wrong_degree_is_told_and_does_no_harm():
+    parameters = [tc.Parameter("v", low=0.5, high=5.0), tc.Parameter("k", low=0.2, high=5.0)]
+    simulator = tc.Simulator(lambda x, p: p["v"] * x / (p["k"] + x), parameters)
+    x = np.linspace(0.5, 8, 14)
+    y = 2 * x / (1 + x) * (1 - 0.02 * x)
+    right = mode(simulator, y, x)
+    simulator.degree = 1
+    with pytest.warns(PropagationWarning, match="polynomials of degree 1 .* drop degree="):
+        found = mode(simulator, y, x)
+    torch.testing.assert_close(found.map.sd, right.map.sd, rtol=1e-3, atol=1e-6)
+
+
+def test_an_output_expansion_shorter_than_the_embeddings_is_refused():
+    embedding = tc.embeddings.PolynomialChaos(parameters=("b",), order=3, germ="legendre")
+    with pytest.raises(DomainError, match=r"Expected order= of at least the embedding's, 3.* Got 1"):
+        mode(line(), X, embedding=embedding, order=1)
+
+
+def test_a_density_without_a_mean_is_refused():
+    simulator = tc.Simulator(
+        lambda x, p: x / (p["k"] + x), [tc.Parameter("k", low=0.05, high=5.0, transform="log")]
+    )
+    with pytest.raises(EmbeddingError, match=r"order 2 at most in normal germs for k .* Got order 3"):
+        mode(simulator, X / (1 + X), embedding=tc.embeddings.PolynomialChaos(order=3))
+    mode(simulator, X / (1 + X) + 0.1 * X, embedding=tc.embeddings.PolynomialChaos(order=3, germ="legendre"))
+
+
+def test_a_bound_that_decides_is_told():
+    with pytest.warns(IdentifiabilityWarning, match="a at its upper bound 0.5: the bound decides it"):
+        found = mode(line(low=0.0, high=0.5), 1 + X + 0.2 * np.sin(X))
+    assert float(found.map.mean[0]) == pytest.approx(0.5, abs=1e-3)
+    with pytest.warns(IdentifiabilityWarning, match="a at its upper bound 0.5: the bound decides it"):
+        tc.calibrate_additive(
+            line(low=0.0, high=0.5), tc.Recording(x=X, y=1 + X + 0.2 * np.sin(X)), num_samples=0, seed=0
+        )
+
+
+def test_a_spike_of_a_likelihood_without_noise_is_told():
+    y = 1 + 0.5 * X + 0.1 * X**2
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        mode(line(), y, likelihood=tc.likelihoods.GaussianMarginal())
+    spike = [str(w.message) for w in told if "is a spike" in str(w.message)]
+    assert len(spike) == 1
+    assert "Give the recording's noise=, or use ABC()." in spike[0]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        tc.calibrate(
+            line(),
+            tc.Recording(x=X, y=y, noise=0.1),
+            likelihood=tc.likelihoods.GaussianMarginal(),
+            num_samples=0,
+            seed=0,
+        )
