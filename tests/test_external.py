@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from torchcal import Recording, calibrate
 from torchcal.embeddings import Gaussian
 from torchcal.errors import DomainError, ShapeError, SimulatorError
 from torchcal.propagation import NISP
@@ -380,3 +381,36 @@ def test_arithmetic_without_an_answer_far_away_is_no_number_and_not_the_end():
     assert bool(found[1:].isnan().all())
     with pytest.raises(SimulatorError, match="no such file"):
         ExternalSimulator(broken, parameters).at(x)(far)
+
+
+@pytest.mark.parametrize("kind", ["plain", "named", "vectorized", "pool"])
+def test_where_no_point_has_an_answer_the_reason_is_named(kind, pool):
+    x = torch.linspace(0.1, 3.0, 5, dtype=torch.float64)
+    where = {"s": x, "t": x} if kind == "named" else x
+    simulator = ExternalSimulator(
+        divides, [Parameter("a", low=1.0, high=2.0)], vectorized=kind == "vectorized",
+        executor=pool if kind == "pool" else None,
+    )  # fmt: skip
+    with pytest.raises(SimulatorError, match=r"none of 3 .* raised ZeroDivisionError there: float division") as caught:
+        simulator.check(where, torch.tensor([[1.0], [1.5], [2.0]]).double())
+    assert isinstance(caught.value.__cause__, ZeroDivisionError)
+
+
+def divides(x, p):
+    return p["a"] / (p["a"] - p["a"])
+
+
+def test_a_calibration_without_any_answer_says_why():
+    def half(x, p):
+        return {"y": p["a"] * math.log(1.5 - x), "z": x * p["a"]}
+
+    x = torch.linspace(1.0, 2.0, 5, dtype=torch.float64)
+    simulator = ExternalSimulator(half, [Parameter("a", low=1.0, high=2.0)])
+    with pytest.raises(SimulatorError, match="raised ValueError there: math domain error"):
+        calibrate(simulator, Recording(x=x, y={"z": x, "y": x}), num_samples=0)
+
+
+def test_a_function_that_returns_nan_itself_is_not_said_to_raise(values):
+    with pytest.raises(SimulatorError, match=r"everywhere\. Check the simulator") as caught:
+        ExternalSimulator(lambda x, p: math.nan, PARAMETERS).check(X, values)
+    assert caught.value.__cause__ is None

@@ -307,6 +307,45 @@ def test_scores_are_scipys(noise):
     assert found.level == 0.9
 
 
+def test_missing_data_count_nowhere():
+    y, mean, sd = draw(40), draw(40, seed=2), draw(40, seed=3).abs() + 0.2
+    gaps = y.clone()
+    gaps[::3] = math.nan
+    known = ~gaps.isnan()
+    noise = draw(40, seed=4).abs()
+    there = scores(y[known], Moments(mean[known], sd[known]), noise=noise[known])
+    noise[~known] = math.nan
+    for moments in (Moments(mean, sd), Moments(mean, torch.where(known, sd, 0 * sd))):
+        assert scores(gaps, moments, noise=noise) == there
+    with pytest.raises(DomainError, match="at least one datum"):
+        scores(0 * y / 0, Moments(mean, sd))
+
+
+@pytest.mark.parametrize("noise", [0.7, 1, [0.7] * 6, np.full(6, 0.7), torch.full((6,), 0.7), torch.tensor(0.7)])
+def test_noise_is_a_number_or_one_for_each_datum(noise):
+    y, mean, sd = draw(6), draw(6, seed=2), draw(6, seed=3).abs() + 0.2
+    wanted = (sd.square() + (1.0 if isinstance(noise, int) else 0.49)).sqrt()
+    found, plain = scores(y.tolist(), Moments(mean, sd), noise=noise), scores(y, Moments(mean, wanted))
+    assert found.log_score == pytest.approx(plain.log_score, rel=1e-6)
+    assert found.coverage == plain.coverage
+
+
+@pytest.mark.parametrize(
+    ("noise", "error", "message"),
+    [
+        ([0.1, 0.1], ShapeError, r"noise of shape \(6,\).*Got \(2,\)"),
+        (torch.ones(6, 1), ShapeError, r"noise of shape \(6,\).*Got \(6, 1\)"),
+        ("none", DomainError, "noise as one number"),
+        (-0.1, DomainError, "noise >= 0"),
+        (math.nan, DomainError, "Got NaN"),
+    ],
+)
+def test_noise_of_another_kind_is_refused(noise, error, message):
+    y = torch.ones(6, dtype=torch.float64)
+    with pytest.raises(error, match=message):
+        scores(y, Moments(y, y), noise=noise)
+
+
 def test_scores_refuse_what_has_no_score():
     y = torch.ones(4, dtype=torch.float64)
     with pytest.raises(ShapeError, match="as the mean"):

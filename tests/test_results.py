@@ -253,6 +253,18 @@ def test_diagnostics_hold_alpha_and_moments(sampled):
     assert diagnostics.posterior_variance == pytest.approx(float(posterior), rel=1e-9)
 
 
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("calibrate", [tc.calibrate, tc.calibrate_additive])
+def test_few_draws_are_said_to_be_too_few_to_judge(calibrate, count):
+    with warnings.catch_warnings(record=True) as given:
+        warnings.simplefilter("always")
+        fit = calibrate(SIMULATOR, recording(), fixed={"s": 1.0}, **{**SHORT, "num_samples": count})
+    said = " ".join(str(one.message) for one in given if one.category is tc.errors.ConvergenceWarning)
+    assert f"{count} draw{'s' if count > 1 else ''} a chain cannot be judged" in said
+    assert "nan" not in said
+    assert fit.diagnostics.converged is False
+
+
 def test_without_draws_diagnostics_say_so(point):
     assert point.diagnostics.converged is None
     assert math.isnan(point.diagnostics.r_hat)
@@ -319,6 +331,39 @@ def test_a_round_trip_with_the_simulator_predicts_elsewhere(name, request, tmp_p
     assert str(loaded) == str(result)
     loaded.save(tmp_path / "again.nc")
     same(type(result).load(tmp_path / "again.nc").map, result.map)
+
+
+@pytest.mark.parametrize("samples", [0, 12])
+def test_a_result_in_which_nothing_is_uncertain_comes_back_with_its_simulator(samples, tmp_path):
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    other = tc.Simulator(lambda x, p: p["a"] - p["b"] * x, line.parameters)
+    data = tc.Recording(x=T, y=1 + 2 * T + 0.5 * T**2)
+    settings = {**SHORT, "num_samples": samples}
+    plain = tc.embeddings.PolynomialChaos(order=0)
+    fit = quietly(tc.calibrate, line, data, embedding=plain, likelihood="abcm", **settings)
+    fit.save(tmp_path / "plain.nc")
+    loaded = Calibration.load(tmp_path / "plain.nc", simulator=line)
+    same(dataclasses.replace(loaded.predict([0.3, 2.0]), x=None), dataclasses.replace(fit.predict([0.3, 2.0]), x=None))
+    assert float(loaded.predict().map.sd.max()) == 0.0
+    with pytest.raises(DomainError, match="predicts something else"):
+        Calibration.load(tmp_path / "plain.nc", simulator=other)
+
+
+def test_an_additive_result_without_its_simulator_still_has_its_parameters(additive, tmp_path):
+    additive.save(tmp_path / "result.nc")
+    loaded = AdditiveCalibration.load(tmp_path / "result.nc")
+    same(additive.parameters, loaded.parameters)
+    assert str(loaded) == str(additive)
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_a_missing_folder_is_named(name, request, tmp_path):
+    result = request.getfixturevalue(name)
+    with pytest.raises(DomainError, match=r"folder that exists.*no folder '.*nowhere'. Make it"):
+        result.save(tmp_path / "nowhere" / "result.nc")
+    with pytest.raises(DomainError, match="name of a file"):
+        result.save(tmp_path)
+    assert os.listdir(tmp_path) == []
 
 
 @pytest.mark.parametrize("likelihood", ["abc", "gausmarg", tc.likelihoods.Marginal(num_samples=16, bandwidth=0.5)])

@@ -1,6 +1,7 @@
 """Parameters, scalings and static simulators."""
 
 import math
+import warnings
 
 import pytest
 import torch
@@ -115,6 +116,21 @@ def test_scaling_and_back_is_the_identity():
     assert torch.autograd.gradcheck(scaling.physical, scaled.requires_grad_())
 
 
+def test_bounds_of_a_logarithmic_parameter_limit_its_median():
+    # The data ask for more than high=: the median stays at it, and the mean goes beyond.
+    x = torch.linspace(0.2, 2, 8, dtype=torch.float64)
+    k = tc.Parameter("k", low=0.1, high=1.0, transform="log")
+    simulator = tc.Simulator(lambda x, p: p["k"] * x, [k])
+    data = tc.Recording(x=x, y=3 * x)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", tc.errors.IdentifiabilityWarning)
+        fit = tc.calibrate(simulator, data, likelihood=tc.likelihoods.ABC(epsilon=0.1), num_samples=0)
+    drawn = fit.sample_parameters(4001, kind="map")[:, 0]
+    assert float(drawn.median()) < 1.1
+    assert float(fit.map.mean[0]) > 1.2
+    assert "median" in (tc.Parameter.__doc__ or "")
+
+
 def test_scaling_refuses_unequal_lengths():
     with pytest.raises(ShapeError, match="one shape"):
         Scaling(torch.zeros(2), torch.ones(3), torch.zeros(2, dtype=torch.bool))
@@ -211,6 +227,8 @@ def test_check_passes_where_one_point_of_many_is_finite():
         ((3, AB), "callable"),
         ((line, []), "at least one parameter"),
         ((line, ["a", "b"]), "Parameter objects"),
+        ((line, tc.Parameter("a")), r"a list of .*in brackets"),
+        ((line, 3), r"a list of .*Got 3"),
         ((line, [*AB, tc.Parameter("a")]), r"\['a'\] more than once"),
     ],
 )

@@ -1,9 +1,11 @@
 """Polynomial surrogates: exactness, convergence, oracles, caches, failures, files."""
 
+import functools
 import itertools
 import math
 import multiprocessing
 import os
+import warnings
 from concurrent.futures import ProcessPoolExecutor
 
 import numpy as np
@@ -11,8 +13,10 @@ import pytest
 import torch
 from numpy.polynomial import legendre
 
+from torchcal import Recording, calibrate
 from torchcal.embeddings import Gaussian
 from torchcal.errors import DomainError, ExtrapolationWarning, ShapeError, SimulatorError, SurrogateWarning
+from torchcal.likelihoods import ABC
 from torchcal.propagation import NISP
 from torchcal.simulators import (
     Evaluations,
@@ -247,6 +251,26 @@ def test_conditions_outside_the_box_warn_with_the_numbers():
     surrogate.at({"s": torch.tensor([0.0, 2.0 + 1e-12]).double(), "t": far["t"]})
 
 
+@pytest.mark.parametrize("samples", [0, 8])
+def test_predictions_outside_the_box_warn_once(samples):
+    a, b = Parameter("a", low=0.0, high=3.0), Parameter("b", low=-1.0, high=1.0)
+    surrogate = build_surrogate(
+        lambda x, p: p["a"] + p["b"] * x, conditions=(0.0, 1.0), parameters=[a, b], order=2, progress=False
+    )
+    x = torch.linspace(0, 1, 9, dtype=torch.float64)
+    data = Recording(x=x, y=1 + 0.5 * x + 0.2 * x**2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        fit = calibrate(surrogate, data, likelihood=ABC(epsilon=0.05), num_samples=samples, num_chains=2, num_warmup=4)
+    for ask in (fit.predict, lambda x: fit.sample_outputs(3, x, kind="map"), fit.predict):
+        with warnings.catch_warnings(record=True) as given:
+            warnings.simplefilter("always")
+            ask([0.5, 2.0])
+        far = [str(one.message) for one in given if one.category is ExtrapolationWarning]
+        assert len(far) == 1
+        assert "1 of 2 conditions" in far[0]
+
+
 def test_leaves_box():
     surrogate = build(cubic)
     values = torch.tensor([[[1.0, 0.0], [3.0, 4.0], [0.99, 0.0]], [[2.0, 4.1], [math.nan, 0.0], [2.0, 2.0]]])
@@ -307,7 +331,7 @@ def test_a_rerun_goes_on_from_what_was_kept(error, kind, tmp_path):
     if path:
         third = Counted(smooth)
         build(third, cache=path)
-        assert third.calls == 0
+        assert third.calls == 1
         assert os.listdir(tmp_path) == ["cache.npz"]
 
 
@@ -322,6 +346,45 @@ def interrupted(x, p):
     if p["a"] > 2.8:
         raise KeyboardInterrupt
     return smooth(x, p)
+
+
+def twice(x, p):
+    return 2 * smooth(x, p)
+
+
+@pytest.mark.parametrize("where", ["here", "pool"])
+@pytest.mark.parametrize("other", [{}, {"order": 4}, {"order": 4, "seed": 1}])
+def test_a_complete_cache_of_another_function_is_refused(other, where, pool, tmp_path):
+    path = tmp_path / "cache.npz"
+    build(smooth, cache=path)
+    kept = len(Evaluations.load(path))
+    # With another order and seed no point is asked for that is in the file.
+    with pytest.raises(SimulatorError, match=r"cache of this function's values.*Remove the cache"):
+        build(twice, cache=path, executor=pool if where == "pool" else None, **other)
+    assert len(Evaluations.load(path)) == kept
+    assert torch.equal(build(smooth, cache=path).coefficients, build(smooth).coefficients)
+
+
+def only_in_workers(pid, x, p):
+    if os.getpid() == pid:
+        raise ValueError("not here")
+    return smooth(x, p)
+
+
+def test_a_cached_point_is_repeated_where_the_others_run(pool, tmp_path):
+    function, path = functools.partial(only_in_workers, os.getpid()), tmp_path / "cache.npz"
+    first = build(function, cache=path, executor=pool)
+    assert torch.equal(build(function, cache=path, executor=pool).coefficients, first.coefficients)
+    with pytest.raises(SimulatorError, match="not here"):
+        build(function, cache=path)
+
+
+def test_a_cached_point_at_which_the_function_now_fails_is_named(tmp_path):
+    path = tmp_path / "cache.npz"
+    build(smooth, cache=path)
+    with pytest.raises(SimulatorError, match=r"no root.*p = \{'a': 1") as caught:
+        build(Counted(smooth, stop=1, error=ValueError("no root")), cache=path)
+    assert isinstance(caught.value.__cause__, ValueError)
 
 
 def test_the_cache_of_another_function_is_refused(tmp_path):
@@ -411,6 +474,14 @@ def test_save_and_load(tmp_path):
         for name in ("conditions", "outputs", "order", "nodes", "degree"):
             assert getattr(loaded, name) == getattr(surrogate, name)
     assert len(os.listdir(tmp_path)) == 3
+
+
+def test_a_missing_folder_is_named(tmp_path):
+    with pytest.raises(DomainError, match=r"folder that exists.*no folder '.*nowhere'"):
+        build(cubic).save(tmp_path / "nowhere" / "s.npz")
+    with pytest.raises(DomainError, match="name of a file"):
+        build(cubic).save(tmp_path)
+    assert os.listdir(tmp_path) == []
 
 
 def test_files_that_are_something_else(tmp_path):

@@ -22,6 +22,7 @@ __all__ = [
     "additive_prediction",
     "embedded_prediction",
     "kernel_density",
+    "output_moments",
     "parameter_density",
     "scores",
 ]
@@ -92,7 +93,7 @@ def embedded_prediction(propagate: NISP, alpha_map: Tensor, draws: Tensor | None
         at_map = _moments(propagate, alpha_map.to(like))
         if draws is None:
             return Prediction(propagate.x, at_map.mean, at_map.sd, at_map.sd, None, at_map, None, None)
-        mean, variance = _mean_and_variance(propagate, draws.to(like))
+        mean, variance = output_moments(propagate, draws.to(like))
         posterior_mean = mean.mean(0)
         model_error = variance.mean(0)
         parameter = mean.var(0, unbiased=False)
@@ -144,8 +145,8 @@ def additive_prediction(
     )
 
 
-def _mean_and_variance(propagate: NISP, alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """Moments of the outputs; without model error the variance is zero."""
+def output_moments(propagate: NISP, alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and variance of the outputs, ``(*batch, n)``; where nothing is uncertain the variance is zero."""
     if propagate.pattern.num_germs:
         return propagate.moments(alpha)
     mean = propagate.mean(alpha)
@@ -153,7 +154,7 @@ def _mean_and_variance(propagate: NISP, alpha: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _moments(propagate: NISP, alpha: Tensor) -> Moments:
-    mean, variance = _mean_and_variance(propagate, alpha)
+    mean, variance = output_moments(propagate, alpha)
     return Moments(_result(mean), _result(variance.sqrt()))
 
 
@@ -259,28 +260,37 @@ class Scores:
     level: float
 
 
-def scores(y: Tensor, moments: Moments, *, noise: Tensor | None = None, level: float = 0.95) -> Scores:
+def scores(y: Any, moments: Moments | Prediction, *, noise: Any = None, level: float = 0.95) -> Scores:
     """RMSE, log score and coverage of predicted moments against data ``(n,)``.
 
     Args:
-        y: The data.
+        y: The data; NaN where one is missing, which counts nowhere.
         moments: Predicted mean and sd.
-        noise: Sd of the measurement noise, added in square.
+        noise: Sd of the measurement noise, one number or ``(n,)`` of any kind of array, added in square.
         level: Nominal coverage, between 0 and 1.
 
     Raises:
-        ShapeError: If data and moments differ in shape.
-        DomainError: If the level is not between 0 and 1, or neither moments nor noise have a spread.
+        ShapeError: If data, moments and noise differ in shape.
+        DomainError: If the level is not between 0 and 1, no datum is there, or a sd is not a number or zero.
+
+    >>> found = scores([1.0, float("nan"), 3.0], Moments(torch.zeros(3), torch.ones(3)), noise=1.0)
+    >>> print(f"{found.rmse:.4f} {found.coverage}")     # √((1 + 9) / 2), and 3 is past 1.96 √2
+    2.2361 0.5
     """
     y = torch.as_tensor(y, dtype=torch.float64)
     if y.shape != moments.mean.shape:
         raise ShapeError(f"Expected y of shape {tuple(moments.mean.shape)}, as the mean. Got {tuple(y.shape)}.")
     if not 0 < level < 1:
         raise DomainError(f"Expected level between 0 and 1. Got {level!r}.")
-    error = y - moments.mean
-    sd = moments.sd if noise is None else (moments.sd.square() + noise.square()).sqrt()
+    known = ~torch.isnan(y)
+    if not bool(known.any()):
+        raise DomainError("Expected at least one datum that is not missing. Got NaN alone.")
+    error = (y - moments.mean)[known]
+    sd = moments.sd if noise is None else (moments.sd.square() + _noise_sd(noise, moments.sd).square()).sqrt()
+    sd = sd[known]
     if not bool((sd > 0).all()):
-        raise DomainError("Expected sd > 0 for a log score. Got 0. Give noise=, or compare the means by themselves.")
+        got = "0" if bool((sd == 0).any()) else "NaN"
+        raise DomainError(f"Expected sd > 0 for a log score. Got {got}. Give noise=, or compare the means alone.")
     quantile = math.sqrt(2) * float(torch.erfinv(torch.tensor(level, dtype=torch.float64)))
     z = error / sd
     log_score = (-0.5 * z.square() - sd.log()).mean() - 0.5 * math.log(2 * math.pi)
@@ -290,3 +300,18 @@ def scores(y: Tensor, moments: Moments, *, noise: Tensor | None = None, level: f
         coverage=float((z.abs() <= quantile).to(torch.float64).mean()),
         level=level,
     )
+
+
+def _noise_sd(noise: Any, like: Tensor) -> Tensor:
+    """The sd of the noise as a float64 tensor that spreads over the data."""
+    try:
+        value = torch.as_tensor(noise, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise DomainError(f"Expected noise as one number or {tuple(like.shape)} of them. Got {noise!r}.") from error
+    if value.ndim and value.shape != like.shape:
+        raise ShapeError(
+            f"Expected noise of shape {tuple(like.shape)}, as the data, or one number. Got {tuple(value.shape)}."
+        )
+    if bool((value < 0).any()):
+        raise DomainError(f"Expected noise >= 0, a standard deviation. Got {float(value.min())}.")
+    return value

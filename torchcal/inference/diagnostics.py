@@ -10,7 +10,10 @@ import torch
 from pyro.ops.stats import split_gelman_rubin
 from torch import Tensor
 
-__all__ = ["Figures", "figures"]
+__all__ = ["FEWEST", "Figures", "figures"]
+
+FEWEST = 4
+"""Draws a chain from which figures can be had: halves of two."""
 
 
 class Figures(NamedTuple):
@@ -43,7 +46,7 @@ def figures(draws: Tensor) -> Figures:
     chains, count = draws.shape[:2]
     rest = draws.shape[2:]
     values = draws.to(torch.float64).flatten(2).permute(2, 0, 1).contiguous()  # (Q, C, n)
-    if count < 4:
+    if count < FEWEST:
         nothing = torch.full(rest, torch.nan, dtype=torch.float64)
         return Figures(nothing, nothing, nothing)
     ordered, order = values.flatten(1).sort(dim=1)

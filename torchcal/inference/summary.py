@@ -59,6 +59,13 @@ def diagnose(
         everything = {**alpha, **parameters}
         wanted = min(ESS_THRESHOLD, samples.shape[0] * samples.shape[1] / 4)
         limit = r_hat_threshold(samples.shape[1])
+        count = samples.shape[1]
+        if count < measure.FEWEST:
+            problems.append(
+                f"{count} draw{'' if count == 1 else 's'} a chain cannot be judged: R-hat and effective sample size "
+                f"need {measure.FEWEST} or more"
+            )
+            everything = {}
         loud = {name: q for name, q in everything.items() if not q.r_hat <= limit}
         if loud:
             worst = max(loud, key=lambda name: loud[name].r_hat if loud[name].r_hat == loud[name].r_hat else 9e9)
@@ -67,8 +74,8 @@ def diagnose(
                 f"{len(everything)} quantities are past it"
             )
         few = {name: min(q.ess_bulk, q.ess_tail) for name, q in everything.items()}
-        worst = min(few, key=lambda name: few[name])
-        if not few[worst] >= wanted:
+        worst = min(few, key=lambda name: few[name], default="")
+        if few and not few[worst] >= wanted:
             problems.append(f"effective sample size of {worst} is {few[worst]:.0f} (threshold {wanted:.0f})")
         idle = [mode.weight for mode in draws.modes if not mode.started and mode.weight >= WORTH_CHAINS]
         if idle:

@@ -51,7 +51,7 @@ class AdditiveCalibration(Result):
     @property
     def parameters(self) -> Tensor:
         """Draws of λ in physical units, ``(S, d)``."""
-        return self._propagation().scaling.physical(self._needed_draws()[:, :-1])
+        return storage.scaling_of(self.settings).physical(self._needed_draws()[:, :-1])
 
     @property
     def sigma(self) -> Tensor:
@@ -128,7 +128,7 @@ class AdditiveCalibration(Result):
         lines = ["Calibration with an additive Gaussian discrepancy"]
         lines.append(f"  data: {self.recording.n} conditions, outputs {', '.join(self.recording.outputs)}")
         rows = []
-        draws = None if self.draws is None or self.propagate is None else self.parameters
+        draws = None if self.draws is None else self.parameters
         for i, name in enumerate(self.map.parameters):
             unit = self.settings["units"].get(name) or ""
             sd = "" if draws is None else f"{float(draws[:, i].std()):.3g}"

@@ -42,7 +42,11 @@ class Result:
         return storage.to_arviz(self.to_datatree())
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the result to a netCDF file, whole or not at all. The simulator's code is not stored."""
+        """Write the result to a netCDF file, whole or not at all. The simulator's code is not stored.
+
+        Raises:
+            DomainError: If the folder does not exist.
+        """
         storage.write(self.to_datatree(), path)
 
     def __repr__(self) -> str:

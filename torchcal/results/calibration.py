@@ -24,6 +24,7 @@ from torchcal.results.diagnostics import Diagnostics, table
 from torchcal.results.estimate import MapEstimate
 from torchcal.results.in_time import check_nodes_in_time, propagation_in_time, refine_in_time
 from torchcal.simulators import Simulator, Trajectories
+from torchcal.simulators.surrogate import warned_once
 
 __all__ = ["Calibration"]
 
@@ -78,8 +79,9 @@ class Calibration(Result):
                 "Expected a simulator to predict with. Got a calibration that was loaded without one. Use "
                 "Calibration.load(path, simulator=...)."
             )
-        propagate = self.propagation_at(x, function=function)
-        return embedded_prediction(propagate, self.map.alpha, thin(self.draws, max_draws))
+        with warned_once():
+            propagate = self.propagation_at(x, function=function)
+            return embedded_prediction(propagate, self.map.alpha, thin(self.draws, max_draws))
 
     def propagation_at(
         self, x: Any = None, *, function: Callable[[Any, dict[str, Tensor]], Any] | None = None
@@ -105,8 +107,9 @@ class Calibration(Result):
                 refine_in_time(other, alpha)
                 check_nodes_in_time(other, alpha)
             else:
-                other.refine(alpha)
-                other.check(alpha)
+                with warned_once():
+                    other.refine(alpha)
+                    other.check(alpha)
         return other
 
     def sample_outputs(self, num: int, x: Any = None, *, kind: str = "posterior", seed: int = 0) -> Tensor:
@@ -118,10 +121,11 @@ class Calibration(Result):
             kind: ``"posterior"`` (Eq. 31) or ``"map"`` (Eq. 30).
             seed: Of the draws.
         """
-        propagate = self.propagation_at(x)
-        alpha, xi = self._joint_draws(propagate, num, kind, seed)
-        with torch.no_grad():
-            return propagate.outputs_at(alpha, xi, paired=True).to(device="cpu", dtype=torch.float64)
+        with warned_once():
+            propagate = self.propagation_at(x)
+            alpha, xi = self._joint_draws(propagate, num, kind, seed)
+            with torch.no_grad():
+                return propagate.outputs_at(alpha, xi, paired=True).to(device="cpu", dtype=torch.float64)
 
     def sample_parameters(self, num: int, *, kind: str = "posterior", seed: int = 0) -> Tensor:
         """Draws of λ in physical units, ``(num, d)``, from the posterior or MAP predictive density (Eq. 44)."""

@@ -14,17 +14,18 @@ from torch import Tensor
 from torchcal import embeddings, likelihoods, polychaos
 from torchcal.data import Recording, Run
 from torchcal.errors import DomainError, EmbeddingError, MissingDependencyError, RecordingError, TorchcalError
-from torchcal.prediction import AdditivePrediction, Moments, Prediction
+from torchcal.prediction import AdditivePrediction, Moments, Prediction, output_moments
 from torchcal.propagation import NISP, PropagationCheck, RuleChoice
 from torchcal.results.diagnostics import Diagnostics, Mode, Quality
 from torchcal.results.estimate import MapEstimate
 from torchcal.simulators import ExternalSimulator, ODESimulator, Scaling, Simulator, Trajectories
+from torchcal.simulators.design import check_target
 
 if TYPE_CHECKING:
     from torchcal.results.additive import AdditiveCalibration
     from torchcal.results.calibration import Calibration
 
-__all__ = ["additive_tree", "calibration_tree", "read_additive", "read_calibration", "to_arviz", "write"]
+__all__ = ["additive_tree", "calibration_tree", "read_additive", "read_calibration", "scaling_of", "to_arviz", "write"]
 
 FORMAT = 1
 
@@ -95,7 +96,12 @@ def to_arviz(tree: Any) -> Any:
 
 
 def write(tree: Any, path: str | os.PathLike[str]) -> None:
-    """Write a tree to a netCDF file: to a temporary name beside it first, then moved into place."""
+    """Write a tree to a netCDF file: to a temporary name beside it first, then moved into place.
+
+    Raises:
+        DomainError: If the folder does not exist.
+    """
+    check_target(path)
     path = os.fspath(path)
     folder = os.path.dirname(os.path.abspath(path))
     handle, temporary = tempfile.mkstemp(suffix=".nc", dir=folder)
@@ -157,7 +163,7 @@ def check_simulator(result: "Calibration") -> None:
     if result.propagate is None or result.stored is None:
         return
     with torch.no_grad():
-        mean, variance = result.propagate.moments(result.map.alpha)
+        mean, variance = output_moments(result.propagate, result.map.alpha)
     pair = (mean, variance.clamp_min(0).sqrt())
     stored = (result.stored.map.mean, result.stored.map.sd)
     allowed = SAME * (result.recording.spread + stored[0].abs())
@@ -383,11 +389,6 @@ def _propagation(
     if simulator is None:
         return None
     settings = meta["settings"]
-    scaling = Scaling(
-        torch.tensor(settings["center"], dtype=torch.float64),
-        torch.tensor(settings["scale"], dtype=torch.float64),
-        torch.tensor(settings["log"]),
-    )
     if recording.runs is None and isinstance(simulator, ODESimulator | Trajectories):
         raise RecordingError("Expected a static simulator for a static recording. Got one in time (give the other).")
     simulator = simulator.bind(recording)
@@ -399,7 +400,7 @@ def _propagation(
         recording.x,
         fixed=settings["fixed"],
         outputs=recording.outputs,
-        scaling=scaling,
+        scaling=scaling_of(settings),
         order=settings["order"],
         sd_floor=settings["sd_floor"],
         rule=_rule(settings["rule"]) if "rule" in settings else settings["gauss_nodes"],
@@ -410,6 +411,15 @@ def _propagation(
             f"{list(propagate.pattern.names)}."
         )
     return propagate
+
+
+def scaling_of(settings: Mapping[str, Any]) -> Scaling:
+    """The coordinates that a result's settings name."""
+    return Scaling(
+        torch.tensor(settings["center"], dtype=torch.float64),
+        torch.tensor(settings["scale"], dtype=torch.float64),
+        torch.tensor(settings["log"]),
+    )
 
 
 def _rule(spec: Mapping[str, Any]) -> RuleChoice:

@@ -18,7 +18,7 @@ from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators.executor import TaskError, run_tasks
 from torchcal.simulators.points import PointCall, Value, failed_evaluation
 
-__all__ = ["Evaluations", "evaluate_points", "read_npz", "write_npz"]
+__all__ = ["Evaluations", "check_target", "evaluate_points", "read_npz", "write_npz"]
 
 Array = NDArray[np.float64]
 
@@ -85,7 +85,7 @@ def evaluate_points(
         variables: Names of the columns.
         executor: See `run_tasks`.
         cache: A file, which is read if it exists and written every ten seconds and at the end; or evaluations to
-            begin with.
+            begin with. One that is in it is repeated, also where none is missing.
         progress: Whether to show a bar.
 
     Returns:
@@ -100,7 +100,7 @@ def evaluate_points(
     store = _Store(variables, _open_cache(cache, variables), None if isinstance(cache, Evaluations) else cache)
     keys = [row.tobytes() for row in np.ascontiguousarray(points)]
     missing = list(dict.fromkeys(key for key in keys if key not in store.values))
-    known = next((key for key in keys if key in store.values), None)
+    known = next((key for key in keys if key in store.values), next(iter(store.values), None))
     tasks = [np.frombuffer(key).tolist() for key in missing]
     bar = tqdm(total=len(set(keys)), initial=len(set(keys)) - len(missing), desc="evaluations", disable=not progress)
 
@@ -109,8 +109,8 @@ def evaluate_points(
         bar.update()
 
     try:
-        if known is not None and missing:
-            _check_same(call, known, store)
+        if known is not None:
+            _check_same(call, known, store, executor)
         run_tasks(call, tasks, executor=executor, on_result=take)
     except TaskError as failure:
         error = failed_evaluation(failure, call.describe(tasks[failure.index]))
@@ -171,8 +171,7 @@ def _open_cache(cache: str | os.PathLike[str] | Evaluations | None, variables: t
     if cache is None:
         return None
     if not isinstance(cache, Evaluations):
-        if not Path(cache).parent.is_dir():
-            raise DomainError(f"Expected a cache in a folder that exists. Got {os.fspath(cache)!r}.")
+        check_target(cache)
         if not Path(cache).exists():
             return None
         cache = Evaluations.load(cache)
@@ -184,14 +183,16 @@ def _open_cache(cache: str | os.PathLike[str] | Evaluations | None, variables: t
     return cache
 
 
-def _check_same(call: PointCall, key: bytes, store: _Store) -> None:
-    """Repeat one cached evaluation: the function may have changed since."""
+def _check_same(call: PointCall, key: bytes, store: _Store, executor: Executor | None) -> None:
+    """Repeat one cached evaluation, where the others would run: the function may have changed since."""
     row = np.frombuffer(key).tolist()
     point = call.describe(row)
+    found: dict[int, Value] = {}
     try:
-        names, value = call(row)
-    except (Exception, SystemExit) as error:
-        raise failed_evaluation(TaskError(0, error), point) from error
+        run_tasks(call, [row], executor=executor, on_result=found.__setitem__)
+    except TaskError as failure:
+        raise failed_evaluation(failure, point) from failure.error
+    names, value = found[0]
     known = store.values[key]
     if names != store.outputs or not np.all(np.abs(value - known) <= _SAME * np.abs(known) + 1e-300):
         raise SimulatorError(
@@ -207,8 +208,29 @@ def _attach_partial(error: BaseException, store: _Store) -> None:
     error.add_note(f"{len(partial)} evaluations are kept {where}; pass it as cache= to go on from there.")
 
 
+def check_target(path: str | os.PathLike[str]) -> None:
+    """Check that a file can be put there, before anything is computed for it.
+
+    Raises:
+        DomainError: If its folder does not exist, or it is a folder itself.
+    """
+    target = Path(path)
+    if not target.parent.is_dir():
+        raise DomainError(
+            f"Expected a file in a folder that exists. Got {os.fspath(path)!r}: there is no folder "
+            f"{str(target.parent)!r}. Make it first, or give another one."
+        )
+    if target.is_dir():
+        raise DomainError(f"Expected the name of a file. Got the folder {os.fspath(path)!r}. Add a name to it.")
+
+
 def write_npz(path: str | os.PathLike[str], kind: str, header: Mapping[str, Any], **arrays: Array) -> None:
-    """Write arrays and a header of plain values, whole or not at all."""
+    """Write arrays and a header of plain values, whole or not at all.
+
+    Raises:
+        DomainError: If the folder does not exist.
+    """
+    check_target(path)
     target = Path(path)
     handle, name = tempfile.mkstemp(prefix=target.name, suffix=".part", dir=target.parent)
     try:

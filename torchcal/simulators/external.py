@@ -13,7 +13,7 @@ from torch import Tensor
 from torchcal.errors import DomainError, ShapeError, SimulatorError
 from torchcal.simulators.executor import TaskError, check_executor, run_tasks
 from torchcal.simulators.parameter import Parameter
-from torchcal.simulators.points import ArrayCall, Forgiving, PointCall, Value, failed_evaluation
+from torchcal.simulators.points import ArrayCall, Forgiving, PointCall, Value, failed_evaluation, raised_at
 from torchcal.simulators.static import Conditions, Simulator
 
 __all__ = ["ExternalSimulator"]
@@ -37,7 +37,7 @@ class ExternalSimulator(Simulator):
         function: ``function(x, p)`` with ``p`` a dict of floats. ``x`` is a float, or a dict of them where the
             conditions are named; it returns a number, or a dict of them for several outputs. With ``vectorized``
             ``x`` holds numpy arrays ``(n,)``, and it returns arrays ``(n,)``. It must give the same numbers for
-            the same arguments. Where it has no answer it may return nan.
+            the same arguments. Where it has no answer it may return nan; arithmetic errors count as none.
         parameters: In the order in which results list them.
         executor: Any ``concurrent.futures.Executor``; None calls the function here. For a process pool the
             function must be defined at the top level of a module. All parameter values of a call go in one map,
@@ -130,6 +130,15 @@ class ExternalSimulator(Simulator):
             return _unflatten(_Differenced.apply(rows, job), batch)
 
         return evaluate
+
+    def _raised(self, x: Conditions, values: Tensor, column: int) -> Exception | None:
+        names = tuple(x) if isinstance(x, Mapping) else None
+        columns = list(x.values()) if isinstance(x, Mapping) else [x]
+        points = torch.stack([torch.as_tensor(c).detach().to("cpu", torch.float64) for c in columns], dim=-1)
+        if self.vectorized:
+            return raised_at(ArrayCall(self.external, names, self.names, points.numpy()), values.tolist())
+        call = PointCall(self.external, names, self.names)
+        return raised_at(call, [*points[column % len(points)].tolist(), *values.tolist()])
 
     def _call(self, x: Conditions, p: dict[str, Tensor]) -> Tensor:
         """``function(x, p)`` on tensors: ``p[name]`` is ``(*batch, 1)``, or ``(*batch, n)`` where it varies."""

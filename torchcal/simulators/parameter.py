@@ -19,7 +19,8 @@ class Parameter:
     Args:
         name: How the simulator's function finds it, ``p[name]``.
         unit: Its physical unit, for reports only.
-        low: Smallest physical value. It limits E[λ], not the quadrature nodes.
+        low: Smallest physical value. It limits E[λ], not the quadrature nodes; with ``transform="log"`` it limits
+            exp(E[ln λ]), the median of a lognormal λ, and E[λ] may lie above `high`.
         high: Largest physical value, likewise.
         initial: A first guess.
         neutral: The value at which the parameter has no effect. A parameter with a neutral value is held

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torchcal.errors import SimulatorError
 from torchcal.simulators.executor import TaskError, worker_died
 
-__all__ = ["ArrayCall", "Forgiving", "PointCall", "Value", "describe_point", "failed_evaluation"]
+__all__ = ["ArrayCall", "Forgiving", "PointCall", "Value", "describe_point", "failed_evaluation", "raised_at"]
 
 Array = NDArray[np.float64]
 Value = tuple[tuple[str, ...] | None, Array]
@@ -81,7 +81,8 @@ class ArrayCall:
 class Forgiving:
     """A call that gives None where the arithmetic has no answer: searches try points far from anything physical.
 
-    Plain floats raise there (`math.exp(800)`, `1 / 0.0`, `math.log(-1)`), where arrays would give inf or NaN.
+    Plain floats raise there (`math.exp(800)`, `1 / 0.0`, `math.log(-1)`), where arrays would give inf or NaN. Where no
+    point at all has an answer, `Simulator.check` says what was raised (`raised_at`).
     """
 
     call: ArrayCall | PointCall
@@ -96,6 +97,15 @@ class Forgiving:
             if type(error) is ValueError and "math domain error" in str(error):
                 return None
             raise
+
+
+def raised_at(call: ArrayCall | PointCall, row: Sequence[float]) -> Exception | None:
+    """What a call raises at a row, of the kinds that `Forgiving` takes for no answer; else None."""
+    try:
+        call(row)
+    except (Exception, SystemExit) as error:
+        return error if isinstance(error, ArithmeticError | ValueError) else None
+    return None
 
 
 def split_point(

@@ -2,7 +2,7 @@
 
 import re
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,6 +40,11 @@ class Linearisation:
 
 def check_parameters(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
     """Return the parameters as a tuple, or raise if one is not a `Parameter` or is named twice."""
+    if isinstance(parameters, Parameter) or not isinstance(parameters, Iterable):
+        raise DomainError(
+            f"Expected a list of torchcal.Parameter objects. Got {parameters!r:.100}. Put it in brackets: "
+            "parameters=[Parameter(...)]."
+        )
     parameters = tuple(parameters)
     if not parameters:
         raise DomainError("Expected at least one parameter. Got none. Pass parameters=[Parameter(...), ...].")
@@ -211,11 +216,13 @@ class Simulator:
         if not bool(finite.any()):
             row, column = (int(i) for i in (~torch.isfinite(together)).nonzero()[0])
             point = {name: float(v) for name, v in zip(self.names, values[row], strict=True)}
+            cause = self._raised(x, values[row], column)
+            why = "" if cause is None else f" The function raised {type(cause).__name__} there: {cause}."
             raise SimulatorError(
                 f"Expected finite outputs. Got {float(together[row, column])} at output number {column} "
                 f"for parameters {point}, and none of {len(values)} parameter values gave finite outputs "
-                "everywhere. Check the simulator there, or narrow the parameters' bounds or give initial=."
-            )
+                f"everywhere.{why} Check the simulator there, or narrow the parameters' bounds or give initial=."
+            ) from cause
         good = finite.nonzero()[:2, 0].repeat(2)[:2]
         with torch.no_grad():
             alone = evaluate(values[good[0]])
@@ -228,6 +235,10 @@ class Simulator:
                 "(*batch, 1), x has shape (n,), the result (*batch, n); and leave random numbers out of it."
             )
         return together.shape[-1]
+
+    def _raised(self, x: Conditions, values: Tensor, column: int) -> Exception | None:
+        """What a simulator raised where NaN stands for it, at parameters ``(d,)`` and an output; None where nothing."""
+        return None
 
 
 def _length(x: Conditions) -> int:

@@ -7,7 +7,9 @@ import dataclasses
 import math
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 
 import numpy as np
 import torch
@@ -20,12 +22,25 @@ from torchcal.simulators.held_out import NUMBERS, HeldOutError
 from torchcal.simulators.parameter import Parameter, Scaling
 from torchcal.simulators.static import Conditions, Simulator
 
-__all__ = ["Box", "PolynomialSurrogate", "check_box"]
+__all__ = ["Box", "PolynomialSurrogate", "check_box", "warned_once"]
+
+_SAID: ContextVar[set[str] | None] = ContextVar("_SAID", default=None)
+"""Warnings already given, where each is to be given once."""
 
 _EDGE = 1e-9
 """How far past its box, in half-widths, a point still counts as on the edge: rounding gives 1e-16."""
 
 Box = Mapping[str, tuple[float, float]] | tuple[float, float]
+
+
+@contextmanager
+def warned_once() -> Iterator[None]:
+    """Within, conditions outside a box are warned of once, however often the surrogate is asked there."""
+    token = _SAID.set(set() if _SAID.get() is None else _SAID.get())
+    try:
+        yield
+    finally:
+        _SAID.reset(token)
 
 
 class PolynomialSurrogate(Simulator):
@@ -196,13 +211,17 @@ class PolynomialSurrogate(Simulator):
                 low, high = self.condition_bounds[i].tolist()
                 value = 0.5 * (low + high) + 0.5 * (high - low) * eta[:, i]
                 outside = int((eta[:, i].abs() > 1 + _EDGE).sum())
-                warnings.warn(
+                message = (
                     f"{outside} of {len(eta)} conditions are outside the surrogate's box: {name} from "
                     f"{float(value.min()):.6g} to {float(value.max()):.6g}, built for {low:.6g} to {high:.6g}. "
-                    f"A polynomial of order {self.order} is not to be trusted there; build it for a wider box.",
-                    ExtrapolationWarning,
-                    stacklevel=3,
+                    f"A polynomial of order {self.order} is not to be trusted there; build it for a wider box."
                 )
+                said = _SAID.get()
+                if said is not None:
+                    if message in said:
+                        continue
+                    said.add(message)
+                warnings.warn(message, ExtrapolationWarning, stacklevel=3)
 
     def _rows(self, outputs: Sequence[str] | None) -> list[int]:
         if self.outputs is None:
