@@ -76,7 +76,7 @@ def test_a_wrong_degree_is_told_and_does_no_harm():
     y = 2 * x / (1 + x) * (1 - 0.02 * x)
     right = mode(simulator, y, x)
     simulator.degree = 1
-    with pytest.warns(PropagationWarning, match="polynomials of degree 1 .* drop degree="):
+    with pytest.warns(PropagationWarning, match="polynomials of degree 1 .*: drop degree="):
         found = mode(simulator, y, x)
     torch.testing.assert_close(found.map.sd, right.map.sd, rtol=1e-3, atol=1e-6)
 
@@ -104,6 +104,39 @@ def test_a_bound_that_decides_is_told():
         tc.calibrate_additive(
             line(low=0.0, high=0.5), tc.Recording(x=X, y=1 + X + 0.2 * np.sin(X)), num_samples=0, seed=0
         )
+
+
+@pytest.mark.parametrize("simulator", [line(low=0.0, high=1e6), line(low=0.98, high=5.0)])
+def test_a_bound_that_is_only_near_is_not(simulator):
+    y = 1 + X + 0.05 * np.sin(4 * X)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", IdentifiabilityWarning)
+        mode(simulator, y)
+
+
+def test_a_small_output_is_no_spike():
+    simulator = tc.Simulator(lambda x, p: p["a"] * (x**3 + 1e-3), [tc.Parameter("a")])
+    x, rng = np.linspace(0, 1, 15), np.random.default_rng(2)
+    y = 2 * (x**3 + 1e-3) * (1 + 0.2 * rng.standard_normal(15))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        mode(simulator, y, x, likelihood=tc.likelihoods.GaussianMarginal())
+    assert not [w for w in told if "is a spike" in str(w.message)]
+
+
+def test_a_jump_in_time_takes_the_most_nodes_that_there_are():
+    t = np.linspace(0, 4, 30)
+    simulator = tc.ODESimulator(
+        lambda t, s, p, u: {"x": -s["x"] * torch.where(p["k"] > 1.0, 1.5, 0.5) + 0.1 * p["k"]},
+        {"x": None},
+        [tc.Parameter("k", initial=1.1)],
+        max_step=0.2,
+    )
+    run = tc.Run(time=t, outputs={"x": np.exp(-t) + 0.05 * np.sin(3 * t)}, initial={"x": 1.0})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = tc.calibrate(simulator, tc.Recording(runs=[run]), num_samples=0, num_starts=4, seed=0)
+    assert found.propagate.num_nodes <= 369
 
 
 def test_a_spike_of_a_likelihood_without_noise_is_told():

@@ -137,6 +137,8 @@ def _corrected(
                 finish=0,
             )
             if found is None or found.ends_chi2 is None or len(found.ends_chi2) != len(known):
+                for trial in trials:  # as far as tangents tell
+                    seen[trial] = min(seen[trial], sizes[trial[0]])
                 break
             for trial, chi2 in zip(known, found.ends_chi2.tolist(), strict=True):
                 short = effects[trial[0]].distance / max(math.sqrt(chi2), 1e-300)

@@ -124,7 +124,7 @@ def calibrate_additive(
     quality = diagnose(estimate, draws, samples, None, names, None)
     warn_of_chains(quality)
     warn_of_box(simulator, propagate, estimate.alpha[:-1])
-    warn_of_bounds(propagate, estimate.alpha[:-1])
+    warn_of_bounds(problem, estimate.alpha)
     mean = propagate.scaling.physical(estimate.alpha[:-1])
     result = AdditiveCalibration(
         map=MapEstimate(

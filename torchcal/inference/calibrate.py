@@ -179,7 +179,7 @@ def calibrate(
     if propagate.pattern.num_germs:
         warn_of_tolerance(quality, problem.likelihood)
     warn_of_box(simulator, propagate, estimate.alpha)
-    warn_of_bounds(propagate, estimate.alpha)
+    warn_of_bounds(problem, estimate.alpha)
     warn_of_spike(problem, estimate.alpha)
     warn_of_chains(quality)
     mean, covariance = propagate.parameter_moments(estimate.alpha)

@@ -32,9 +32,9 @@ __all__ = [
     "warn_of_tolerance",
 ]
 
-#: Distance from a bound, as a share of the room between bounds (or of the scale), up to which a mean lies at it.
+#: Distance from a bound, in scaled coordinates, up to which a mean may lie at it.
 AT_BOUND = 1e-4
-#: Smallest sd of the outputs over their median below which a likelihood without noise has found a spike.
+#: Share of what one parameter's spread gives at a datum below which all of them together have cancelled.
 SPIKE = 1e-2
 
 
@@ -163,15 +163,22 @@ def warn_of_tolerance(quality: Diagnostics, likelihood: likelihoods.Likelihood) 
         )
 
 
-def warn_of_bounds(propagate: NISP, alpha: Tensor) -> None:
-    """Warn where a parameter's mean (the median, on a logarithmic scale) lies at a bound."""
+def warn_of_bounds(problem: Problem, alpha: Tensor) -> None:
+    """Warn where a parameter's mean (the median, on a logarithmic scale) lies at a bound that it wants to cross."""
+    propagate = problem.propagate
     low, high = (end.to(alpha) for end in propagate.scaling.bounds(propagate.free))
-    mean = alpha[: propagate.num_alpha][propagate.pattern.leading.to(alpha.device)]
-    width = torch.where(torch.isfinite(high - low), high - low, torch.ones_like(mean))
+    places = propagate.pattern.leading.to(alpha.device).nonzero()[:, 0]
     told = []
-    for i, q in enumerate(propagate.free):
-        for end, value, side in ((low, q.low, "lower"), (high, q.high, "upper")):
-            if float((mean[i] - end[i]).abs()) <= AT_BOUND * float(width[i]):
+    for place, q, *ends in zip(places.tolist(), propagate.free, low.tolist(), high.tolist(), strict=True):
+        for end, value, side, sign in ((ends[0], q.low, "lower", -1.0), (ends[1], q.high, "upper", 1.0)):
+            away = abs(float(alpha[place]) - end)
+            if value is None or away > AT_BOUND:
+                continue
+            beyond = alpha.clone()
+            beyond[place] += sign * max(2 * away, 1e-6)
+            with torch.no_grad():
+                here, there = (float(problem.log_likelihood(point)) for point in (alpha, beyond))
+            if not there <= here:  # nor where it has no answer
                 told.append(f"{q.name} at its {side} bound {value:g}")
     if told:
         warnings.warn(
@@ -183,17 +190,25 @@ def warn_of_bounds(propagate: NISP, alpha: Tensor) -> None:
 
 
 def warn_of_spike(problem: Problem, alpha: Tensor) -> None:
-    """Warn where a likelihood without noise or tolerance has found one of its spurious maxima (Fig. 6)."""
+    """Warn where a likelihood without noise or tolerance has found one of its spurious maxima (Fig. 6).
+
+    There the spreads of several parameters cancel each other at one datum.
+    """
+    propagate, pattern = problem.propagate, problem.propagate.pattern
     if problem.likelihood.name not in ("marginal", "gaussian_marginal") or problem.noise is not None:
         return
+    leading, rows = pattern.leading.to(alpha.device), pattern.rows.to(alpha.device)
     with torch.no_grad():
-        sd = problem.propagate(alpha[: problem.propagate.num_alpha])[1]
-    sd = sd if problem.observed is None else sd[problem.observed]
-    if float(sd.min()) < SPIKE * float(sd.median()):
+        sd = propagate(alpha)[1]
+        own = [propagate(torch.where(leading | (rows == i), alpha, torch.zeros_like(alpha)))[1]
+               for i in range(len(pattern.names))]  # fmt: skip
+    share = sd / torch.stack(own).amax(0).clamp_min(1e-300)
+    share = share if problem.observed is None else share[problem.observed]
+    if float(share.min()) < SPIKE:
         warnings.warn(
-            f"The best density is a spike: the output's sd is {float(sd.min()):.2g} at one datum and "
-            f"{float(sd.median()):.2g} at the median one, and the {problem.likelihood.name} likelihood grows without "
-            "limit as it vanishes there. Give the recording's noise=, or use ABC().",
+            f"The best density is a spike: the spreads of several parameters cancel each other at one datum, to "
+            f"{float(share.min()):.1g} of what one gives alone, and the {problem.likelihood.name} likelihood grows "
+            "without limit as the output's sd vanishes there. Give the recording's noise=, or use ABC().",
             ConvergenceWarning,
             stacklevel=3,
         )

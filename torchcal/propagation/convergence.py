@@ -22,7 +22,7 @@ class PropagationCheck:
 
     Attributes:
         nodes: Number of nodes of the rule in use.
-        finer_nodes: Number of nodes of the rule that it was held against.
+        finer_nodes: Number of nodes of the rule that it was held against: a finer one, unless there is none.
         mean_change: Largest change of a mean, relative to the larger of ``|mean|`` and sd over the outputs.
         sd_change: Largest change of an sd, on the same scale.
         truncated: Largest share of a variance that lies in terms above ``order``; 0 for the full variance.
@@ -38,7 +38,8 @@ class PropagationCheck:
 def compare(propagate: "NISP", alpha: Tensor) -> PropagationCheck:
     """Moments at α against those of a finer rule, and the expansion against the full variance."""
     pattern = propagate.pattern
-    finer = propagate.copy(rule=propagate.rule_choice.finer(pattern.num_germs, pattern.basis))
+    rule = propagate.rule_choice
+    finer = propagate.copy(rule=rule.finer(pattern.num_germs, pattern.basis) or rule.coarser())
     with torch.no_grad():
         mean, variance = propagate.moments(alpha)
         other_mean, other_variance = finer.moments(alpha)

@@ -345,7 +345,7 @@ class NISP(nn.Module):
         germs = self.pattern.num_germs
         while germs and self._choice.kind == "tensor" and choice.exact_count(self) is None:
             finer = self._choice.finer(germs, self.pattern.basis)
-            if finer.size**germs > self.max_nodes or finer.size < self._choice.size:
+            if finer is None or finer.size**germs > self.max_nodes:
                 break
             result = self.check(alpha, warn=False)
             changes = (result.mean_change, result.sd_change)

@@ -38,8 +38,8 @@ class RuleChoice:
             return polychaos.qmc_rule(basis, germs, self.size, seed=self.seed)
         return polychaos.tensor_rule(basis, germs, self.size)
 
-    def finer(self, germs: int, basis: polychaos.Basis) -> "RuleChoice":
-        """The rule to hold this one against: a finer one, or a coarser one where Gauss rules have no more nodes."""
+    def finer(self, germs: int, basis: polychaos.Basis) -> "RuleChoice | None":
+        """The next finer rule to hold this one against; None where Gauss rules have no more nodes."""
         most = math.inf if basis.most_points is None else basis.most_points
         if self.given is not None:
             count = len(self.given.nodes)
@@ -48,8 +48,12 @@ class RuleChoice:
             return replace(self, size=self.size + 1)
         if self.kind == "qmc":
             return replace(self, size=2 * self.size, seed=self.seed + 1)
-        size = min(max(self.size + 2, math.ceil(1.3 * self.size)), most)
-        return replace(self, size=int(size if size > self.size else self.size / 1.3))
+        size = int(min(max(self.size + 2, math.ceil(1.3 * self.size)), most))
+        return replace(self, size=size) if size > self.size else None
+
+    def coarser(self) -> "RuleChoice":
+        """A rule of fewer nodes, to hold a tensor rule against that is the finest."""
+        return replace(self, size=max(1, int(self.size / 1.3)))
 
     def expansion_order(self, germs: int) -> int:
         """The highest total degree of an expansion that the rule projects on without much aliasing."""

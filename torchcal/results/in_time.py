@@ -33,7 +33,9 @@ def refine_in_time(propagate: NISP, alpha: Tensor) -> bool:
         result = propagate.check(alpha, warn=False)
         change = max(result.mean_change, result.sd_change, key=lambda number: (math.isnan(number), number))
         finer = propagate.rule_choice.finer(germs, propagate.pattern.basis)
-        if change <= NODE_TOLERANCE or not math.isfinite(change) or finer.size**germs > propagate.max_nodes:
+        if finer is None or finer.size**germs > propagate.max_nodes:
+            break
+        if change <= NODE_TOLERANCE or not math.isfinite(change):
             break
         propagate.set_rule(finer)
         changed = True

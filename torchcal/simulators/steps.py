@@ -22,11 +22,12 @@ if TYPE_CHECKING:
 
 __all__ = ["POINTS", "Steps"]
 
-#: Gaps in a trajectory, relative to the state's size, below which Newton's method stops.
-GAP = 1e-9
-#: Gaps whose square is below `GAP`, and corrections that are small enough for this to hold: after one more of them
-#: nothing is left to check. A larger one may cross a kink, such as a clamp at zero.
-QUADRATIC, SMALL = 1e-5, 1e-4
+#: Corrections, relative to the state where they are made, after which nothing is left to check: the next would be
+#: their square. A larger one may cross a kink, such as a clamp at zero.
+SMALL = 1e-5
+#: Share of a state's largest value below which it counts as that large, by rounding; and the same where a trajectory
+#: is found from its beginning, in which what has decayed may grow again.
+SMALLEST, SMALLEST_ANEW = 1e-8, 1e-12
 #: Newton passes before the trajectory is solved step by step instead.
 MAX_PASSES = 8
 #: Points whose derivatives are computed at once: about what a processor's cache holds.
@@ -34,7 +35,7 @@ POINTS = 2**15
 #: Steps of the first span that is tried where there is no guess.
 SPAN = 64
 #: Trajectories times the derivatives that a pass needs of each, above which a step costs less than its share of passes.
-CROWD = 200
+CROWD = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +122,7 @@ class Steps:
         return float(((ends - states[:, :, 1:]).abs() / size).max())
 
     def solve(self, values: Tensor, warm: Tensor | None = None, *, march: bool = True) -> Tensor:
-        """States at the ends of all steps, ``(H, R, K + 1, states)``; infinite where the solution blows up.
+        """States at the ends of all steps, ``(H, R, K + 1, states)``; infinite from where one of a run's blows up.
 
         ``warm`` is a guess. Where Newton's method does not settle from there, the trajectory is solved from its
         beginning; without ``march`` it is infinite instead.
@@ -141,8 +142,7 @@ class Steps:
         start = self.layout.start(values)
         hyper, runs, size = start.shape
         if hyper * runs * (1 + size) > CROWD:
-            found = self._one_by_one(values, start)
-            return torch.where(torch.isfinite(found), found, torch.full_like(found, math.inf))
+            return _ended(self._one_by_one(values, start))
         dead = ~torch.isfinite(start).all(-1, keepdim=True)
         parts, begin, largest = [start.unsqueeze(2)], start, start.abs().amax(dim=1)[:, None, None]
         longest = most = max(SPAN, POINTS // max(1, hyper * runs))
@@ -162,11 +162,12 @@ class Steps:
                 part = replace(self, grid=self.grid.part(first, first + on_foot))
                 states = part._one_by_one(values, begin)
             first += part.grid.num_steps
-            lost = dead.unsqueeze(2) | ~torch.isfinite(states)
-            parts.append(states.masked_fill(lost, math.inf)[:, :, 1:])
-            dead = dead | lost[:, :, -1].any(-1, keepdim=True)
+            states = _ended(states.masked_fill(dead.unsqueeze(2), math.inf))
+            parts.append(states[:, :, 1:])
+            dead = torch.isinf(states[:, :, -1, :1])
             begin = torch.where(dead, start, states[:, :, -1])  # what has blown up goes on, unseen
-            largest = torch.maximum(largest, states.masked_fill(lost, 0.0).abs().amax(dim=(1, 2), keepdim=True))
+            seen = states.masked_fill(torch.isinf(states), 0.0)
+            largest = torch.maximum(largest, seen.abs().amax(dim=(1, 2), keepdim=True))
         return torch.cat(parts, dim=2)
 
     def _one_by_one(self, values: Tensor, begin: Tensor) -> Tensor:
@@ -181,7 +182,7 @@ class Steps:
     def _newton(self, values: Tensor, guess: Tensor, largest: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Newton's method on whole trajectories from their first states on, and which rows ``(H,)`` settled.
 
-        Gaps are relative to the largest values of each state, those before the trajectory, ``(H, 1, 1, S)``, included.
+        ``largest`` holds the largest values of each state before the trajectory, ``(H, 1, 1, S)``, where it goes on.
         """
         states = guess.clone()
         settled = torch.zeros(len(values), dtype=torch.bool)
@@ -205,8 +206,15 @@ class Steps:
             moved = torch.cat([now[:, :, :1], now[:, :, 1:] + change], dim=2)
             good &= torch.isfinite(moved).flatten(1).all(-1)
             states[rows] = torch.where(good[:, None, None, None], moved, now)
-            step = (change.abs() / size).flatten(1).amax(-1)
-            last_one = (worst < GAP) | ((worst < QUADRATIC) & (step < SMALL))
+            near = torch.maximum(moved[:, :, :-1].abs(), moved[:, :, 1:].abs())
+            floor = size * (SMALLEST if largest is None else SMALLEST_ANEW)
+            last_one = (change.abs() / torch.maximum(near, floor)).flatten(1).amax(-1) < SMALL
             settled[rows] = good & last_one
             active[rows] = good & ~last_one
         return states, settled
+
+
+def _ended(states: Tensor) -> Tensor:
+    """Trajectories ``(H, R, K + 1, S)``, in which a run is infinite from its first state on that is not finite."""
+    alive = torch.isfinite(states).all(-1).cumprod(-1).bool()
+    return states.masked_fill(~alive.unsqueeze(-1), math.inf)
