@@ -247,8 +247,11 @@ def test_data_that_stick_out_at_one_level_of_a_grid_are_no_outliers(rows, togeth
     assert outliers._clustered(problem, torch.arange(25), high) is together
 
 
-@pytest.mark.parametrize(("p", "verdict"), [(0.005, "named"), (0.03, "named"), (0.2, "consistent")])
-def test_a_base_that_is_improbable_counts_as_a_misfit(monkeypatch, p, verdict):
+@pytest.mark.parametrize(
+    ("p", "bend", "verdict"),
+    [(0.005, 1.0, "named"), (0.03, 0.2, "named"), (0.2, 0.2, "consistent"), (0.2, 1.0, "named")],
+)
+def test_a_base_that_is_improbable_counts_as_a_misfit(monkeypatch, p, bend, verdict):
     # A statistic for all kinds of misfit sees each kind less well than its own refit does.
     screen_all = Search.screen_all
 
@@ -257,7 +260,7 @@ def test_a_base_that_is_improbable_counts_as_a_misfit(monkeypatch, p, verdict):
         search.p_detect = p
 
     monkeypatch.setattr(Search, "screen_all", screened)
-    x, y = bent(bend=1.0)
+    x, y = bent(bend=bend)
     assert diagnose(straight(), tc.Recording(x=x, y=y, noise=0.1), [SQUARE]).verdict == verdict
     x, y = bent(bend=0.0)
     assert diagnose(straight(), tc.Recording(x=x, y=y, noise=0.1), [SQUARE]).verdict == "consistent"

@@ -308,6 +308,7 @@ TARGETS = {
 }
 
 
+@pytest.mark.filterwarnings("ignore:The best density has")
 @pytest.mark.parametrize(
     ("name", "sampler"),
     [(name, "nuts") for name in TARGETS] + [("the mode on the upper wall", "hmc"), ("the kink, ratio 4", "hmc")],

@@ -17,6 +17,10 @@ found 1.6e-7; the Moon ruled it out). It leaves 0.40 km over 4 years where relat
 noise; to first order the two are the same, so that the screening may list one as an alias of the other. An oblate Sun
 leaves 2.9 km in the fitted half and 10 km later, and would need a J2 of 3.3e-4, 1700 times the real one.
 
+Over 40 years 0.76 km a coordinate are left with relativity and 0.79 km with Hall's law, both mostly the solver's and
+the interpolation's error; an oblate Sun leaves 51 km. Among these three the diagnosis is `ambiguous` between the first
+two.
+
 States are the deviations from a fixed ellipse, in km (Encke's method): the ellipse itself is known exactly, and what is
 left is a ten-thousandth of the orbit, so that steps of a quarter of a day do. The axes are those of the Sun's equator.
 Planets are where the ephemeris has them, as inputs.
