@@ -398,6 +398,7 @@ def test_nothing_is_named_where_nothing_is_missing():
     assert "linear drag cannot be told from the parameters of the base" in d.identifiability
 
 
+@pytest.mark.slow
 def test_a_planted_effect_above_its_limit_is_found():
     limit = next(r for r in quiet(*pushed(0.0)).detection_limit if r.term == "bias force").smallest
     d = quiet(*pushed(2.0 * limit, seed=12))
@@ -610,7 +611,9 @@ def test_what_the_base_holds_already_is_never_named():
         assert next(r for r in d.ranking if r.terms == (name,)).note == "already in the base model"
 
 
-@pytest.mark.parametrize(("truth", "bounds"), [(-0.2, {"low": 0.0}), (0.2, {"high": 0.0})])
+@pytest.mark.parametrize(
+    ("truth", "bounds"), [(-0.2, {"low": 0.0}), pytest.param(0.2, {"high": 0.0}, marks=pytest.mark.slow)]
+)
 def test_an_estimate_that_wants_to_cross_its_bound_is_not_named(truth, bounds):
     # Only hardening, or only softening, is allowed, and it is what the spring does not do.
     def term(**bounds):

@@ -62,7 +62,7 @@ def heated():
     return base, tc.Recording(runs=runs), [term for term in library if term.name in ("heater lag", "lag of T")]
 
 
-@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("order", [1, pytest.param(-1, marks=pytest.mark.slow)])
 def test_what_does_the_same_is_tied_in_whatever_order_it_is_given(heated, order):
     # The noise is estimated anew during the search, by a factor of three: all that was likely is fitted again.
     base, recording, terms = heated
@@ -322,7 +322,7 @@ def test_a_base_that_is_stiff_where_it_starts_is_solved_with_shorter_steps():
     assert diagnose(base, recording, []).verdict == "consistent"
 
 
-@pytest.mark.parametrize("noise", [{"noise": 0.01}, {}])
+@pytest.mark.parametrize("noise", [pytest.param({"noise": 0.01}, marks=pytest.mark.slow), {}])
 def test_what_one_run_has_and_others_lack_is_said_to_differ_between_runs(noise):
     base, recording = decays(**noise)
     d = diagnose(base, recording, tc.terms.kinetics("A"))

@@ -52,12 +52,11 @@ def library(*names):
 @pytest.mark.parametrize(
     ("extra", "driver", "term", "span"),
     [
-        pytest.param(
-            lambda t, x, v: -1.5 * v**3 if 4 < t < 9 else 0.0, "t", "cubic drag", (4.0, 9.0), marks=pytest.mark.slow
-        ),
+        (lambda t, x, v: -1.5 * v**3 if 4 < t < 9 else 0.0, "t", "cubic drag", (4.0, 9.0)),
         (lambda t, x, v: -6.0 * x**3 if 0.3 < x < 0.8 else 0.0, "x", "cubic stiffness", (0.3, 0.8)),
     ],
 )
+@pytest.mark.slow
 def test_a_strong_effect_with_sharp_ends_is_named_where_it_acts(extra, driver, term, span):
     # At the base's fit the best window is far from this one, and the base's misfit looks like correlated noise.
     terms = library("quadratic drag", "cubic drag", "quadratic stiffness", "cubic stiffness", "bias force")

@@ -43,7 +43,7 @@ def estimates(prepared: dict[str, Study]) -> dict[str, list[Calibration]]:
     }
 
 
-def _posterior(one: Study, epsilon: float, num_samples: int = 120) -> Calibration:
+def _posterior(one: Study, epsilon: float, num_samples: int = 80) -> Calibration:
     with warnings.catch_warnings():
         # Few draws; the tolerances below allow for it.
         warnings.simplefilter("ignore", ConvergenceWarning)

@@ -308,7 +308,7 @@ def test_certified_values_of_the_copper_data():
     assert np.sum((y - model) ** 2) == pytest.approx(1.5324382854, rel=1e-9)
 
 
-@pytest.mark.parametrize("spectrum", ["einstein", "debye"])
+@pytest.mark.parametrize("spectrum", ["einstein", pytest.param("debye", marks=pytest.mark.slow)])
 def test_anharmonicity_of_copper_is_named(spectrum: str):
     diagnosis = tc.diagnose(copper.simulator(spectrum), copper.recording(), copper.candidates(spectrum), progress=False)
     assert diagnosis.verdict in ("named", "ambiguous")

@@ -1,7 +1,7 @@
 """Every built-in term is planted once in a base model of its field, hidden by calibration and noise, and looked for.
 
 It must come back named, or among the tied, or as an alias of one that is, or be called part of the base model where
-that is the truth. A third of them runs always, the rest with the slow tests.
+that is the truth. A fifth of them runs always, the rest with the slow tests.
 """
 
 from collections.abc import Callable
@@ -82,7 +82,7 @@ def mechanics() -> Field:
             "lag of x": {"a": 1.0, "t90": 0.5},
             "delay of x": {"a": 1.0, "D": 0.3},
         },
-        ("bias force", "linear spring", "end stop", "offset of x"),
+        ("bias force", "linear spring", "offset of x"),
         ("linear drag", "linear spring"),
     )
 
@@ -187,7 +187,7 @@ def hydraulics() -> Field:
             "discharge exponent": {"m": 0.15},
             "clogging": {"r": 0.0006},
         },
-        ("leak", "overflow", "bypass", "clogging"),
+        ("leak", "overflow"),
     )
 
 
@@ -247,7 +247,7 @@ def kinetics() -> Field:
             "lag of B": {"a": 1.0, "t90": 3.0},
             "delay of B": {"a": 1.0, "D": 1.0},
         },
-        ("reverse reaction", "consecutive reaction", "reaction order", "activation energy", "offset of B", "lag of A"),
+        ("reverse reaction", "reaction order", "activation energy", "offset of B", "lag of A"),
     )
 
 
@@ -372,7 +372,7 @@ def test_every_term_of_every_field_is_planted():
         assert set(field.quick) <= set(field.effects)
         assert len(field.quick) >= len(field.effects) // 6
     quick = sum(len(field.quick) for field in FIELDS.values())
-    assert quick >= 0.25 * len(CASES)
+    assert quick >= 0.19 * len(CASES)
 
 
 @pytest.mark.parametrize(("name", "effect"), CASES)

@@ -66,7 +66,7 @@ def test_the_default_tolerance_respects_known_noise():
         generator = torch.Generator().manual_seed(seed)
         y = 1 + 2 * x + noise * torch.randn(21, generator=generator, dtype=torch.float64)
         simulator = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
-        result = tc.calibrate(simulator, tc.Recording(x=x, y=y, noise=noise), num_samples=150, num_chains=8, seed=seed)
+        result = tc.calibrate(simulator, tc.Recording(x=x, y=y, noise=noise), num_samples=60, num_chains=8, seed=seed)
         slope = result.propagate.parameter_moments(result.draws)[0][:, 1]
         assert float(slope.std()) > 0.5 * sd
         z.append((float(slope.mean()) - 2) / float(slope.std()))
@@ -92,7 +92,7 @@ def test_a_users_own_bounded_model_is_sampled_with_the_defaults_of_nuts():
     state = pyro.util.get_rng_state()
     for seed in (0, 3):
         pyro.set_rng_seed(seed)
-        chain = MCMC(NUTS(model), num_samples=100, warmup_steps=150, disable_progbar=True)
+        chain = MCMC(NUTS(model), num_samples=60, warmup_steps=80, disable_progbar=True)
         chain.run()
         draws = propagate.parameter_moments(chain.get_samples()["alpha"])[0]
         assert float(draws[:, 1].std()) > 0

@@ -47,10 +47,15 @@ class Bounds(Transform):
         self.codomain = _Within(self)
         self.low, self.high = low, high
         self.loc, self.scale_tril = loc, scale_tril
-        self.has_low, self.has_high = torch.isfinite(low), torch.isfinite(high)
-        self.free = not bool((self.has_low | self.has_high).any())
+        has_low, has_high = torch.isfinite(low), torch.isfinite(high)
         zero = torch.zeros_like(low)
-        self._low, self._high = torch.where(self.has_low, low, zero), torch.where(self.has_high, high, zero)
+        self._low, self._high = torch.where(has_low, low, zero), torch.where(has_high, high, zero)
+        self._both, self._only_low, self._only_high = has_low & has_high, has_low & ~has_high, has_high & ~has_low
+        self._any = tuple(bool(case.any()) for case in (self._both, self._only_low, self._only_high))
+        self.free = not any(self._any)
+        # The log of the slope is c + a u - b softplus(u), with b the number of bounds.
+        self._log_width = torch.where(self._both, self._high - self._low, zero + 1).log()
+        self._along, self._softened = has_low.to(low), has_low.to(low) + has_high.to(low)
 
     def unwhiten(self, z: Tensor) -> Tensor:
         """u of z."""
@@ -60,21 +65,26 @@ class Bounds(Transform):
 
     def bound(self, u: Tensor) -> Tensor:
         """α of u."""
-        if self.free:
-            return u
-        low, high = self._low.to(u), self._high.to(u)
-        both, only_low, only_high = self._cases(u)
+        both, only_low, only_high = self._any
         softplus = torch.nn.functional.softplus
-        value = torch.where(both, low + (high - low) * u.sigmoid(), u)
-        value = torch.where(only_low, low + softplus(u), value)
-        return torch.where(only_high, high - softplus(-u), value)
+        value = u
+        if both:
+            low, high = self._low.to(u), self._high.to(u)
+            value = torch.where(self._both.to(u.device), low + (high - low) * u.sigmoid(), value)
+        if only_low:
+            value = torch.where(self._only_low.to(u.device), self._low.to(u) + softplus(u), value)
+        if only_high:
+            value = torch.where(self._only_high.to(u.device), self._high.to(u) - softplus(-u), value)
+        return value
 
     def unbound(self, alpha: Tensor) -> Tensor:
         """u of α; a value on a bound is taken a little inside."""
         if self.free:
             return alpha
         low, high = self._low.to(alpha), self._high.to(alpha)
-        both, only_low, only_high = self._cases(alpha)
+        both, only_low, only_high = (
+            case.to(alpha.device) for case in (self._both, self._only_low, self._only_high)
+        )
         inside = max(1e-9, torch.finfo(alpha.dtype).eps)
         share = ((alpha - low) / torch.where(both, high - low, torch.ones_like(low))).clamp(inside, 1 - inside)
         value = torch.where(both, share.logit(), alpha)
@@ -85,16 +95,8 @@ class Bounds(Transform):
         """Σ log ``|dα/du|``, ``(*batch,)``."""
         if self.free:
             return torch.zeros_like(u[..., 0])
-        both, only_low, only_high = self._cases(u)
-        logsigmoid = torch.nn.functional.logsigmoid
-        width = torch.where(both, self._high.to(u) - self._low.to(u), torch.ones_like(u))
-        value = torch.where(both, width.log() + logsigmoid(u) + logsigmoid(-u), torch.zeros_like(u))
-        value = torch.where(only_low, logsigmoid(u), value)
-        return torch.where(only_high, logsigmoid(-u), value).sum(-1)
-
-    def _cases(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        has_low, has_high = self.has_low.to(like.device), self.has_high.to(like.device)
-        return has_low & has_high, has_low & ~has_high, has_high & ~has_low
+        softened = torch.nn.functional.softplus(u, threshold=40.0) * self._softened.to(u)
+        return (self._log_width.to(u) + self._along.to(u) * u - softened).sum(-1)
 
     def _call(self, x: Tensor) -> Tensor:
         return self.bound(self.unwhiten(x))

@@ -30,8 +30,11 @@ lower end. Divergences raise it."""
 DIVERGING = 5e-4
 """Share of divergent transitions at the end of the warm-up from which on smaller steps are tried."""
 
-_WARM_UP_CHAINS = 64
-"""Chains that adapt together: pooled draws make the covariance reliable after a few transitions each."""
+_WARM_UP_CHAINS, _FEW_WARM_UP_CHAINS = 64, 16
+"""Chains that adapt together: pooled draws make the covariance reliable after a few transitions each. The fewer where
+an evaluation of more handles `_WARM_UP_ELEMENTS` numbers, past which its time grows with the chains."""
+
+_WARM_UP_ELEMENTS = 2**17
 
 MOST_ELEMENTS = 2**22
 """Numbers that one evaluation of all chains may handle where the number of chains is ours to choose."""
@@ -197,7 +200,8 @@ def run_batched(
     loc = modes[0].loc
     generator = torch.Generator(device=loc.device).manual_seed(seed)
     moves: _Kernel = _HMC(generator) if kernel == "hmc" else _NUTS(max_tree_depth, loc.device, generator)
-    crowd = max(num_chains, min(_WARM_UP_CHAINS, max(4, MOST_ELEMENTS // max(1, cost))))
+    most, cheap = max(4, MOST_ELEMENTS // max(1, cost)), max(_FEW_WARM_UP_CHAINS, _WARM_UP_ELEMENTS // max(1, cost))
+    crowd = max(num_chains, min(_WARM_UP_CHAINS, most, cheap))
     bar = tqdm(total=num_warmup + num_samples, desc=kernel.upper(), disable=not progress, leave=False)
     drawn = _Collector(num_chains, len(loc), loc)
     try:

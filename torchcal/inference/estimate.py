@@ -16,7 +16,8 @@ from torchcal.inference.randomness import preserve_random_state
 from torchcal.inference.tangent import few_nodes, pieces, search, search_with_few_nodes
 from torchcal.models import Problem
 from torchcal.propagation import NISP
-from torchcal.results.in_time import refine_in_time
+from torchcal.propagation.convergence import SETTLED
+from torchcal.results.in_time import NODE_TOLERANCE
 from torchcal.simulators import Trajectories
 
 __all__ = ["Estimate", "check_starts", "laplace", "maximise", "modes_of"]
@@ -145,7 +146,7 @@ def maximise(
     if problem.propagate.pattern.num_germs:
         for _ in range(4):  # a maximum found with too few nodes may move with more of them
             best = coefficients(found.points[:1])
-            if not (refine_in_time(problem.propagate, best) if in_time else problem.propagate.refine(best)):
+            if not problem.propagate.refine(best, tolerance=NODE_TOLERANCE if in_time else SETTLED):
                 break
             points = found.points[: 1 if in_time else max(4, total // 4)]
             points = torch.cat([points[:1], points[1:][(points.diff(dim=0) != 0).any(-1)]])  # those that joined, once

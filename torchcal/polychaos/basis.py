@@ -235,7 +235,7 @@ def _check_indices(indices: Tensor) -> int:
     return int(indices.max())
 
 
-_MANY = 200_000
+_MANY = 20_000
 """Values from which on the arithmetic costs more than the calls."""
 
 

@@ -13,7 +13,10 @@ from torchcal.errors import PropagationWarning
 if TYPE_CHECKING:
     from torchcal.propagation.nisp import NISP
 
-__all__ = ["PropagationCheck", "compare", "warn"]
+__all__ = ["SETTLED", "PropagationCheck", "compare", "warn"]
+
+SETTLED = 1e-7
+"""Change of the moments, relative to the output's scale, with which enough nodes are found."""
 
 
 @dataclass(frozen=True)

@@ -335,8 +335,12 @@ class NISP(nn.Module):
             convergence.warn(result, self.order, tolerance, order_tolerance)
         return result
 
-    def refine(self, alpha: Tensor, *, tolerance: float = 1e-7) -> bool:
+    def refine(self, alpha: Tensor, *, tolerance: float = convergence.SETTLED) -> bool:
         """Take more nodes until the moments at α settle, or the outermost of more are values that f does not bear.
+
+        Args:
+            alpha: Where they are to settle, ``(*batch, P)``.
+            tolerance: Change, relative to the output's scale, that counts as settled.
 
         Returns:
             Whether the rule has changed.

@@ -22,7 +22,7 @@ from torchcal.results import storage
 from torchcal.results.base import Result, conditions, indent, thin
 from torchcal.results.diagnostics import Diagnostics, table
 from torchcal.results.estimate import MapEstimate
-from torchcal.results.in_time import check_nodes_in_time, propagation_in_time, refine_in_time
+from torchcal.results.in_time import NODE_TOLERANCE, check_nodes_in_time, propagation_in_time
 from torchcal.simulators import Simulator, Trajectories
 from torchcal.simulators.surrogate import warned_once
 
@@ -104,7 +104,7 @@ class Calibration(Result):
         if other.pattern.num_germs:  # nodes that were enough at the data may not be elsewhere
             alpha = self.map.alpha.to(other.nodes)
             if in_time:
-                refine_in_time(other, alpha)
+                other.refine(alpha, tolerance=NODE_TOLERANCE)
                 check_nodes_in_time(other, alpha)
             else:
                 with warned_once():

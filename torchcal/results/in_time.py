@@ -14,32 +14,11 @@ from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results.base import conditions
 from torchcal.simulators import Conditions, Simulator, Trajectories
 
-__all__ = ["check_nodes_in_time", "propagation_in_time", "refine_in_time"]
+__all__ = ["NODE_TOLERANCE", "check_nodes_in_time", "propagation_in_time"]
 
 NODE_TOLERANCE = 1e-5
 """Change of the moments of trajectories, relative to the output's scale, with which enough nodes are found. Long
 oscillations take many nodes for less, and the default tolerance ε is a hundred times as large."""
-
-
-def refine_in_time(propagate: NISP, alpha: Tensor) -> bool:
-    """Take more nodes until the moments at α settle, or trajectories at more of them blow up.
-
-    Returns:
-        Whether the rule has changed.
-    """
-    changed = False
-    germs = propagate.pattern.num_germs
-    while germs and propagate.rule_choice.kind == "tensor":
-        result = propagate.check(alpha, warn=False)
-        change = max(result.mean_change, result.sd_change, key=lambda number: (math.isnan(number), number))
-        finer = propagate.rule_choice.finer(germs, propagate.pattern.basis)
-        if finer is None or finer.size**germs > propagate.max_nodes:
-            break
-        if change <= NODE_TOLERANCE or not math.isfinite(change):
-            break
-        propagate.set_rule(finer)
-        changed = True
-    return changed
 
 
 def check_nodes_in_time(propagate: NISP, alpha: Tensor) -> PropagationCheck:
