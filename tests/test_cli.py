@@ -1,6 +1,7 @@
 """The command `torchcal`."""
 
 import importlib.metadata
+import json
 import subprocess
 import sys
 
@@ -44,10 +45,11 @@ def test_calibrate_writes_a_result_that_show_prints(problem, tmp_path, capsys):
 
 
 def test_diagnose_names_what_is_missing_and_writes_a_report(problem, tmp_path, capsys):
-    page = tmp_path / "report.html"
-    assert cli.main(["diagnose", str(problem), "--report", str(page), "--quiet"]) == 0
+    page, out = tmp_path / "report.html", tmp_path / "diagnosis.json"
+    assert cli.main(["diagnose", str(problem), "--report", str(page), "--out", str(out), "--quiet"]) == 0
     assert capsys.readouterr().out.startswith("Verdict: named: bend")
     assert "bend" in page.read_text()
+    assert json.loads(out.read_text(encoding="utf-8"))["terms"] == ["bend"]
 
 
 def test_show_reads_an_additive_calibration_too(tmp_path, capsys):
@@ -71,7 +73,7 @@ def test_mistakes_are_told_in_a_line_before_any_work(problem, tmp_path, capsys, 
         (["calibrate", str(half)], "Got no recording"),
         (["calibrate", str(odd)], "as a dict"),
         (["calibrate", str(taken)], "rename it"),
-        (["calibrate", str(problem), "--out", str(tmp_path)], "in a folder that exists"),
+        (["calibrate", str(problem), "--out", str(tmp_path)], "the name of a file"),
         (["calibrate", str(problem), "--out", str(tmp_path / "no" / "a.nc")], "in a folder that exists"),
         (["show", str(problem)], "netCDF"),
     ]:

@@ -17,6 +17,7 @@ import torchcal
 
 ROOMS = (
     "errors",
+    "files",
     "data",
     "polychaos",
     "simulators",

@@ -18,6 +18,7 @@ from typing import Any
 
 from torchcal.discovery import diagnose
 from torchcal.errors import DomainError, TorchcalError
+from torchcal.files import check_target
 from torchcal.inference import calibrate
 from torchcal.results import AdditiveCalibration, Calibration
 
@@ -82,6 +83,7 @@ def _parser() -> argparse.ArgumentParser:
     diagnosing = commands.add_parser("diagnose", help="find the physics that was left out")
     diagnosing.set_defaults(run=_diagnose)
     diagnosing.add_argument("--report", type=Path, metavar="REPORT.html", help="where the report is written")
+    diagnosing.add_argument("--out", type=Path, metavar="RESULT.json", help="where the result is written")
     for command in (calibrating, diagnosing):
         command.add_argument("problem", type=Path, help="a Python file that defines simulator and recording")
         command.add_argument("--seed", type=int, help="of every random number")
@@ -101,7 +103,8 @@ def _version() -> str:
 
 def _calibrate(given: argparse.Namespace) -> None:
     problem = _problem(given.problem)
-    _check_target(given.out)
+    if given.out is not None:
+        check_target(given.out)
     options = _options(problem, "calibrate_options", calibrate, given, target_ess=given.target_ess)
     result = calibrate(problem.simulator, problem.recording, **options)
     if given.out is not None:
@@ -111,11 +114,15 @@ def _calibrate(given: argparse.Namespace) -> None:
 
 def _diagnose(given: argparse.Namespace) -> None:
     problem = _problem(given.problem)
-    _check_target(given.report)
+    for path in (given.report, given.out):
+        if path is not None:
+            check_target(path)
     options = _options(problem, "diagnose_options", diagnose, given)
     result = diagnose(problem.simulator, problem.recording, getattr(problem, "candidates", ()), **options)
     if given.report is not None:
         result.report(given.report)
+    if given.out is not None:
+        result.save(given.out)
     print(result)
 
 
@@ -165,12 +172,6 @@ def _problem(path: Path) -> ModuleType:
     if missing:
         raise DomainError(f"Expected {path} to define simulator and recording. Got no {' and no '.join(missing)}.")
     return module
-
-
-def _check_target(path: Path | None) -> None:
-    """Raise for a file that could not be written, before any long work."""
-    if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
-        raise DomainError(f"Expected a file in a folder that exists. Got {path}.")
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from torchcal.data import Recording
-from torchcal.discovery import words
+from torchcal.discovery import as_json, words
 from torchcal.discovery.embedded import Embedded
 from torchcal.discovery.records import (
     Experiment,
@@ -112,6 +112,20 @@ class Diagnosis:
         from torchcal import plots
 
         return plots.discovery_overview(self, fig=fig)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write everything but the simulators, which are code, into one JSON file, whole or not at all.
+
+        The keys are the names of the attributes, tables are lists of records, and what is infinite or no number is
+        null. ``text`` is what ``print`` shows.
+
+        Args:
+            path: The file; an older one is replaced. Its folder must exist.
+
+        Raises:
+            DomainError: If the folder does not exist, or the path is a folder.
+        """
+        as_json.write(self, path)
 
     def report(self, path: str | os.PathLike[str]) -> None:
         """Write everything into one self-contained HTML page."""

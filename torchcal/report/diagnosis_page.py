@@ -1,17 +1,15 @@
 """A diagnosis as one self-contained HTML page, to be read, printed and sent."""
 
-import contextlib
 import math
 import os
 import re
-import tempfile
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from torchcal.errors import DomainError
+from torchcal.files import check_target, replacing
 from torchcal.plots.discovery import FigurePart, figure_parts
 from torchcal.report.markup import (
     STYLE,
@@ -43,7 +41,7 @@ MEANING = {
 def write(diagnosis: Any, path: str | os.PathLike[str]) -> Path:
     """Write a diagnosis as an HTML page that needs no other file, no network and no script.
 
-    The page is written whole or not at all: to a temporary file beside it first, which is then moved into place.
+    The page is written whole or not at all.
 
     Args:
         diagnosis: The result of ``torchcal.diagnose``, or anything with its attributes.
@@ -56,23 +54,10 @@ def write(diagnosis: Any, path: str | os.PathLike[str]) -> Path:
         DomainError: If the folder does not exist, the path is a folder, or ``diagnosis`` is none.
         OSError: If the file cannot be written.
     """
-    if not isinstance(path, str | os.PathLike):
-        raise DomainError(f"Expected path: the name of a file. Got {type(path).__name__}.")
-    target = Path(os.fspath(path))
-    if target.is_dir():
-        raise DomainError(f"Expected path: the name of a file. Got the folder {target} (add 'report.html').")
-    if not target.absolute().parent.is_dir():
-        raise DomainError(f"Expected a path in a folder that exists. Got {target} (make {target.parent} first).")
+    target = check_target(path)
     text = page(diagnosis)
-    handle, temporary = tempfile.mkstemp(suffix=".html", dir=target.absolute().parent)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8", errors="xmlcharrefreplace", newline="\n") as file:
-            file.write(text)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, target)
-    finally:
-        with contextlib.suppress(FileNotFoundError):
-            os.remove(temporary)
+    with replacing(target) as temporary:
+        temporary.write_text(text, encoding="utf-8", errors="xmlcharrefreplace", newline="\n")
     return target
 
 

@@ -2,7 +2,6 @@
 
 import json
 import os
-import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict, fields
 from typing import TYPE_CHECKING, Any
@@ -14,12 +13,12 @@ from torch import Tensor
 from torchcal import embeddings, likelihoods, polychaos
 from torchcal.data import Recording, Run
 from torchcal.errors import DomainError, EmbeddingError, MissingDependencyError, RecordingError, TorchcalError
+from torchcal.files import replacing
 from torchcal.prediction import AdditivePrediction, Moments, Prediction, output_moments
 from torchcal.propagation import NISP, PropagationCheck, RuleChoice
 from torchcal.results.diagnostics import Diagnostics, Mode, Quality
 from torchcal.results.estimate import MapEstimate
 from torchcal.simulators import ExternalSimulator, ODESimulator, Scaling, Simulator, Trajectories
-from torchcal.simulators.design import check_target
 
 if TYPE_CHECKING:
     from torchcal.results.additive import AdditiveCalibration
@@ -96,23 +95,13 @@ def to_arviz(tree: Any) -> Any:
 
 
 def write(tree: Any, path: str | os.PathLike[str]) -> None:
-    """Write a tree to a netCDF file: to a temporary name beside it first, then moved into place.
+    """Write a tree to a netCDF file, whole or not at all.
 
     Raises:
         DomainError: If the folder does not exist.
     """
-    check_target(path)
-    path = os.fspath(path)
-    folder = os.path.dirname(os.path.abspath(path))
-    handle, temporary = tempfile.mkstemp(suffix=".nc", dir=folder)
-    os.close(handle)
-    try:
+    with replacing(path) as temporary:
         tree.to_netcdf(temporary, engine="h5netcdf")
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    finally:
-        if os.path.exists(temporary):
-            os.remove(temporary)
 
 
 def read_calibration(

@@ -2,7 +2,6 @@
 
 import json
 import os
-import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
@@ -15,10 +14,11 @@ from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
 from torchcal.errors import DomainError, SimulatorError
+from torchcal.files import check_target, replacing
 from torchcal.simulators.executor import TaskError, run_tasks
 from torchcal.simulators.points import PointCall, Value, failed_evaluation
 
-__all__ = ["Evaluations", "check_target", "evaluate_points", "read_npz", "write_npz"]
+__all__ = ["Evaluations", "evaluate_points", "read_npz", "write_npz"]
 
 Array = NDArray[np.float64]
 
@@ -208,41 +208,15 @@ def _attach_partial(error: BaseException, store: _Store) -> None:
     error.add_note(f"{len(partial)} evaluations are kept {where}; pass it as cache= to go on from there.")
 
 
-def check_target(path: str | os.PathLike[str]) -> None:
-    """Check that a file can be put there, before anything is computed for it.
-
-    Raises:
-        DomainError: If its folder does not exist, or it is a folder itself.
-    """
-    target = Path(path)
-    if not target.parent.is_dir():
-        raise DomainError(
-            f"Expected a file in a folder that exists. Got {os.fspath(path)!r}: there is no folder "
-            f"{str(target.parent)!r}. Make it first, or give another one."
-        )
-    if target.is_dir():
-        raise DomainError(f"Expected the name of a file. Got the folder {os.fspath(path)!r}. Add a name to it.")
-
-
 def write_npz(path: str | os.PathLike[str], kind: str, header: Mapping[str, Any], **arrays: Array) -> None:
     """Write arrays and a header of plain values, whole or not at all.
 
     Raises:
         DomainError: If the folder does not exist.
     """
-    check_target(path)
-    target = Path(path)
-    handle, name = tempfile.mkstemp(prefix=target.name, suffix=".part", dir=target.parent)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            text = json.dumps({"kind": kind, "version": 1, **header})
-            np.savez(file, header=np.array(text), **arrays)  # type: ignore[arg-type]
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(name, target)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    text = json.dumps({"kind": kind, "version": 1, **header})
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        np.savez(file, header=np.array(text), **arrays)  # type: ignore[arg-type]
 
 
 def read_npz(path: str | os.PathLike[str], kind: str, names: Sequence[str]) -> tuple[dict[str, Any], dict[str, Array]]:
