@@ -22,7 +22,10 @@ def percent(share: float) -> str:
     """A share as text."""
     if not math.isfinite(share):
         return "an unknown share"
-    return f"{100 * share:.0f} %" if share >= 0.095 or share < 0.001 else f"{100 * share:.1f} %"
+    if 0.9995 <= share < 1:
+        return "over 99.9 %"
+    whole = 0.095 <= share < 0.995 or share < 0.001 or share >= 1
+    return f"{100 * share:.0f} %" if whole else f"{100 * share:.1f} %"
 
 
 def _probability(p: float) -> str:
