@@ -156,3 +156,13 @@ def test_a_spike_of_a_likelihood_without_noise_is_told():
             num_samples=0,
             seed=0,
         )
+
+
+@pytest.mark.parametrize("additive", [False, True])
+def test_parameters_that_are_known_as_a_product_alone_are_told(additive):
+    x = torch.linspace(0, 5, 11, dtype=torch.float64)
+    product = tc.Simulator(lambda x, p: p["a"] * p["c"] + p["b"] * x, [tc.Parameter(name) for name in "abc"])
+    recording = tc.Recording(x=x, y=1 + 0.5 * x + 0.1 * x**2)
+    calibrate = tc.calibrate_additive if additive else tc.calibrate
+    with pytest.warns(IdentifiabilityWarning, match="The data determine a, c only together"):
+        calibrate(product, recording, num_samples=0)

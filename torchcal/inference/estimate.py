@@ -175,6 +175,13 @@ def maximise(
             IdentifiabilityWarning,
             stacklevel=3,
         )
+    elif together := _known_together(problem, found, null):
+        warnings.warn(
+            f"The data determine {', '.join(together)} only together: other values of them give the same maximum, as "
+            "where a model has nothing but their product. Hold one of them with fixed=, or give a proper prior.",
+            IdentifiabilityWarning,
+            stacklevel=3,
+        )
     with torch.no_grad():
         likelihood = float(problem.log_likelihood(best))
     return Estimate(
@@ -222,6 +229,20 @@ def _unseen_means(problem: Problem, alpha: Tensor, curvature: Tensor) -> tuple[s
     return tuple(dict.fromkeys(names))
 
 
+def _known_together(problem: Problem, found: Minima, null: Tensor) -> tuple[str, ...]:
+    """Parameters whose means differ between maxima of the same objective that a flat direction of means joins.
+
+    Such a ridge may be bent, so that no straight step along it is free.
+    """
+    rows = problem.propagate.pattern.leading.nonzero()[:, 0].to(null.device)
+    if not bool((null[:, rows].abs() > 0.1).any()):
+        return ()
+    means = _tied(problem, found)[:, rows]
+    apart = means.amax(0) - means.amin(0) > SAME_MEANS
+    names = [name for name, far in zip(problem.propagate.pattern.names, apart.tolist(), strict=True) if far]
+    return tuple(names) if len(names) > 1 else ()
+
+
 def _unheld(problem: Problem, unseen: tuple[str, ...]) -> tuple[str, ...]:
     if problem.prior.proper:
         return ()
@@ -249,14 +270,19 @@ def _agreeing(found: Minima) -> int:
     return int((found.values - found.values[0] <= AGREEMENT * scale).sum())
 
 
+def _tied(problem: Problem, found: Minima) -> Tensor:
+    """α of the starts that ended at the best objective, ``(S, P)``."""
+    tied = found.points[found.values - found.values[0] <= 1e-9 * (1 + found.values[0].abs())]
+    return problem.prior.transform.bound(tied)
+
+
 def _first_of_the_tied(problem: Problem, found: Minima) -> tuple[Tensor, int]:
     """One of the densities that tie for the best objective, the same from any seed, and how many there are.
 
     The tie is broken by the larger mean of the first parameter in which they differ.
     """
     propagate = problem.propagate
-    tied = found.points[found.values - found.values[0] <= 1e-9 * (1 + found.values[0].abs())]
-    alpha = problem.prior.transform.bound(tied)
+    alpha = _tied(problem, found)
     means = alpha[:, : propagate.num_alpha][:, propagate.pattern.leading]
     best, different = 0, [0]
     for i in range(1, len(means)):
