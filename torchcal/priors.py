@@ -226,7 +226,7 @@ def _layout(propagate: NISP) -> tuple[Tensor, Tensor, Tensor, Tensor]:
 
 
 class Flat(CoefficientPrior):
-    """Constant density on all α, within the physical bounds of E[λ] (Eq. 12). Improper where there are none."""
+    """Constant density on all α, within the physical bounds of E[λ] (Eq. 12). Improper, as spreads are not bounded."""
 
     def __init__(self, propagate: NISP) -> None:
         super().__init__(*_layout(propagate))

@@ -1,6 +1,7 @@
 """Discovery: detect a mismatch, locate it, name it, model it, prove it."""
 
 from torchcal.discovery.diagnose import diagnose
+from torchcal.discovery.embedded import Embedded
 from torchcal.discovery.records import (
     Estimate,
     Experiment,
@@ -19,6 +20,7 @@ from torchcal.discovery.result import Diagnosis
 
 __all__ = [
     "Diagnosis",
+    "Embedded",
     "Estimate",
     "Experiment",
     "Fit",

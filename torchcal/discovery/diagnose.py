@@ -73,12 +73,14 @@ def diagnose(
             rest leaves the base too open to predict it; False for nothing, a share, or a bool array, True where held
             out.
         fixed: Values of parameters that are not calibrated.
-        confidence: 1 minus the probability of calling noise a mismatch.
-        max_terms: Terms that may be missing together.
+        confidence: 1 minus the probability of calling noise a mismatch: above 0.5, and at most 0.998, as a thousand
+            simulated residuals tell no more.
+        max_terms: Terms that may be missing together: 1, 2 or 3; more is taken for 3.
         num_starts: Starting values of the base's calibration.
         seed: Of every random number.
         executor: Any ``concurrent.futures.Executor``, on whose workers hypotheses are refitted; None refits them
-            here. It pays where one refit takes seconds. Terms of lambdas need cloudpickle to get there.
+            here. It pays where one refit takes seconds. Every term but one that only frees a parameter needs
+            cloudpickle to get there, here and on the workers (``pip install cloudpickle``, or ``torchcal[dask]``).
         progress: Whether to show a bar.
 
     Returns:
@@ -89,6 +91,9 @@ def diagnose(
         RecordingError: If simulator and recording do not belong together.
         SimulatorError: If the simulator or a term raises, or gives other outputs when it is called again.
         ConvergenceError: If the base cannot be calibrated at all.
+
+    Warns:
+        ConvergenceWarning: If few starting values of the base agree, or it explains no more than a constant.
     """
     begun = time.perf_counter()
     terms = _check(simulator, recording, candidates, confidence)

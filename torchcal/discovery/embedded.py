@@ -7,7 +7,7 @@ polynomial chaos of the output). Its likelihood is the marginal Gaussian one,
 
 with the noise sd s_i. A full embedding, with all coefficients inferred, is `torchcal.calibrate`.
 
-Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 19-22.
+Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 17, 28-29.
 """
 
 from dataclasses import dataclass

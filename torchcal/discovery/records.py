@@ -188,7 +188,7 @@ class Location:
     Attributes:
         kind: ``"equation"``, ``"output"`` or ``"parameter"``.
         target: Name of that equation (its state), output or parameter.
-        driver: What the mismatch varies with: a condition, ``"t"``, a state or an input.
+        driver: What the mismatch varies with: a condition, ``"t"``, a state, an input, or ``"run"``, counted from 0.
         spans: Ranges of the driver in which it sits, ``((low, high), …)``.
         share: Share of the misfit beyond noise that a change there, varying with the driver, can remove.
         evidence: Log evidence of a smooth unknown change there against none.
@@ -319,7 +319,8 @@ class Experiment:
         description: In words.
         separation: Predicted distance of the two nearest tied models there, in noise sd (root of the expected
             χ² difference).
-        conditions: The conditions, initial states and inputs of the experiment, ready for a new recording.
+        conditions: Ready for a new recording: in time ``{"time": (T,), "initial": {state: value}, "inputs":
+            {input: (T,)}}``, otherwise ``{"x": {condition: (n,)}}``. Found for the first four tied models.
     """
 
     description: str

@@ -64,7 +64,9 @@ class Diagnosis:
         p_detect: Probability of so much misfit by noise alone.
         confidence: Asked for.
         library: Names of all candidates.
-        settings: Numbers that the diagnosis was run with.
+        settings: What else is behind the verdict: ``withdrawn`` and ``doubt`` (why there is no name, in words, or
+            empty), ``nearly`` (whether the name rests on the share of the misfit removed), ``set_aside`` (terms that
+            may explain the outliers), ``region`` of a named local term; and ``seed`` and ``solver``.
         seconds: How long it took.
         drivers: Conditions, or time, states and inputs of the calibrated base, at every condition of the recording.
     """

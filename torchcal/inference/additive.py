@@ -53,7 +53,8 @@ def calibrate_additive(
         fixed: Parameters to hold.
         num_samples: Posterior draws a chain; 0 for the MAP alone; by default 1000. With ``target_ess`` the most of
             them, by default 20,000.
-        num_chains: Chains; by default 4, and with ``target_ess`` up to 256.
+        num_chains: Chains; by default 4, and with ``target_ess`` one for every 120 effective draws wanted, 32 to 400,
+            or fewer where an evaluation is dear.
         num_warmup: Draws thrown away a chain.
         target_ess: Draw until the effective sample size of every α, bulk and tail, is at least this and every R-hat
             below 1.01.

@@ -79,7 +79,8 @@ def calibrate(
         fixed: Parameters to hold, ``{name: physical value}``.
         num_samples: Posterior draws a chain; 0 for the MAP alone; by default 1000. With ``target_ess`` the most of
             them, by default 20,000.
-        num_chains: Chains; by default 4, and with ``target_ess`` up to 256.
+        num_chains: Chains; by default 4, and with ``target_ess`` one for every 120 effective draws wanted, 32 to 400,
+            or fewer where an evaluation is dear.
         num_warmup: Draws thrown away a chain, beside those that find the trajectory length of ``"hmc"`` and the smaller
             steps that divergences call for; by default 100 (60 with ``target_ess``), and half of ``num_samples`` but at
             least 300 for ``sampler="pyro"``.

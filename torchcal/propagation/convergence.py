@@ -77,7 +77,7 @@ def warn(result: PropagationCheck, order: int | None, tolerance: float, order_to
             told = (
                 f"With {result.nodes} quadrature nodes the output's mean is off by {result.mean_change:.2g} and "
                 f"its sd by {result.sd_change:.2g} of the output's scale, against {result.finer_nodes} nodes "
-                f"(tolerance {tolerance:.0e}). Pass a larger rule= or max_nodes=."
+                f"(tolerance {tolerance:.0e}). Pass a larger rule= (or, to NISP, max_nodes=)."
             )
         warnings.warn(told, PropagationWarning, stacklevel=3)
     if result.truncated > order_tolerance:

@@ -2,7 +2,7 @@
 
 from torchcal.results.additive import AdditiveCalibration, sigma_unit
 from torchcal.results.calibration import Calibration
-from torchcal.results.diagnostics import Diagnostics, Quality
+from torchcal.results.diagnostics import Diagnostics, Mode, Quality
 from torchcal.results.estimate import MapEstimate
 
-__all__ = ["AdditiveCalibration", "Calibration", "Diagnostics", "MapEstimate", "Quality", "sigma_unit"]
+__all__ = ["AdditiveCalibration", "Calibration", "Diagnostics", "MapEstimate", "Mode", "Quality", "sigma_unit"]

@@ -62,9 +62,9 @@ class Diagnostics:
         agreeing: Number of them that reached the best objective.
         ties: Number of different densities of λ that reach it; more than one where model and data have a symmetry.
         propagation: How far quadrature and expansion have converged at the MAP.
-        model_error_variance: E[σ²], mean over the data (Eq. 32).
-        posterior_variance: V[μ], mean over the data; NaN without draws.
-        map_variance: σ² at the MAP, mean over the data.
+        model_error_variance: E[σ²], mean over the data (Eq. 32); of several outputs in units of each one's spread.
+        posterior_variance: V[μ], in the same way; NaN without draws.
+        map_variance: σ² at the MAP, in the same way.
         converged: Whether every figure is within its threshold; None without draws.
         problems: What is not, in words.
         modes: Separate maxima that were found, the best first; empty without draws.

@@ -168,12 +168,12 @@ class Scaling:
     def from_parameters(
         cls, parameters: Sequence[Parameter], center: Tensor | None = None, scale: Tensor | None = None
     ) -> "Scaling":
-        """Scale by bounds where both are given, else by ``initial``, else by ``center`` and ``scale``.
+        """Scale by bounds where both are given, else by ``center`` and ``scale``, else by ``initial``.
 
         Args:
             parameters: The free parameters.
-            center: Fallback centres (from a least-squares fit), shape ``(d,)``, logarithms where the
-                parameter is logarithmic; default 0.
+            center: Centres (from a least-squares fit), shape ``(d,)``, logarithms where the parameter is logarithmic;
+                by default ``initial``, or 0.
             scale: Fallback scales, shape ``(d,)``; default 1.
         """
         centers, scales = [], []
