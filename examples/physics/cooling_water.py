@@ -13,7 +13,7 @@ convection 0.82, both with a *negative* coefficient in Newton's law, so that phy
 radiation leaves 1.15 and convection 1.06.
 
 The proof is the second half: fitted to 0-120 min, Newton's law misses 121-221 min by 4.9 °C, and evaporation by
-0.4 °C. The humidity of the room cannot be told: with Newton's loss in the model it only moves the room's temperature.
+0.5 °C. The humidity of the room cannot be told: with Newton's loss in the model it only moves the room's temperature.
 
 Recording: CoolingWater of mosaicData, 222 points, one a minute, read to 0.1 °C (see `data.cooling_water`).
 
