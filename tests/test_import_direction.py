@@ -17,6 +17,7 @@ import torchcal
 
 ROOMS = (
     "errors",
+    "checks",
     "files",
     "data",
     "polychaos",

@@ -185,7 +185,7 @@ def test_a_nonlinear_function_of_a_linear_calibration():
         ({"T0": TEMPERATURE, "phi": [1.0]}, "one length"),
         ({"T0": [1000.0, math.nan], "phi": [1.0, 1.0]}, "not finite"),
         ({"T0": TEMPERATURE[None], "phi": [1.0]}, r"shape \(1, 5\)"),
-        ({"T0": ["hot"], "phi": [1.0]}, "as numbers"),
+        ({"T0": ["hot"], "phi": [1.0]}, "as real numbers"),
     ],
 )
 def test_conditions_other_than_the_recordings_are_refused(rate, x, message):

@@ -246,9 +246,9 @@ def test_diagnostics_hold_alpha_and_moments(sampled):
     assert diagnostics.ess == min(min(q.ess_bulk, q.ess_tail) for q in qualities)
     assert diagnostics.converged == (not diagnostics.problems)
     prediction = sampled.predict()
-    unit = sampled.recording.spread  # two outputs, each in units of its own spread
-    model_error = (prediction.sd_model_error / unit).square().mean()
-    posterior = (prediction.sd_posterior / unit).square().mean()
+    unit, seen = sampled.recording.spread, sampled.recording.observed  # each output in units of its own spread
+    model_error = (prediction.sd_model_error / unit).square()[seen].mean()
+    posterior = (prediction.sd_posterior / unit).square()[seen].mean()
     assert diagnostics.model_error_variance == pytest.approx(float(model_error), rel=1e-9)
     assert diagnostics.posterior_variance == pytest.approx(float(posterior), rel=1e-9)
 

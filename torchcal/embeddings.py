@@ -19,7 +19,8 @@ import torch
 from torch import Tensor
 
 from torchcal import polychaos
-from torchcal.errors import DomainError, EmbeddingError
+from torchcal.checks import whole
+from torchcal.errors import EmbeddingError
 
 __all__ = ["Embedding", "Gaussian", "IndependentGaussian", "Pattern", "PolynomialChaos", "Uniform"]
 
@@ -253,6 +254,5 @@ class PolynomialChaos(Embedding):
     triangular: bool = True
 
     def __post_init__(self) -> None:
-        if isinstance(self.order, bool) or not isinstance(self.order, int) or self.order < 0:
-            raise DomainError(f"Expected the order as a non-negative integer. Got {self.order!r}.")
+        object.__setattr__(self, "order", whole("order", self.order, 0))
         polychaos.get_basis(self.germ)

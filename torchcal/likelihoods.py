@@ -16,6 +16,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from torchcal.checks import whole
 from torchcal.errors import DegenerateLikelihoodError, DomainError, ShapeError
 
 __all__ = [
@@ -395,7 +396,6 @@ def _default_epsilon(y: Tensor) -> float:
 
 
 def _check_samples(num_samples: int, bandwidth: float | None) -> None:
-    if isinstance(num_samples, bool) or not isinstance(num_samples, int) or num_samples < 2:
-        raise DomainError(f"Expected num_samples as an integer of at least 2. Got {num_samples!r}.")
+    whole("num_samples", num_samples, 2)
     if bandwidth is not None:
         _positive(bandwidth, "bandwidth")

@@ -295,8 +295,12 @@ class Normal(CoefficientPrior):
         shape = self._extended_shape(torch.Size(sample_shape))
         uniform = torch.rand(shape, dtype=torch.float64, device=self.low.device)
         ends = torch.stack([self.low, self.high])
-        below, above = torch.special.ndtr(((ends - self.loc) / self.scale).double())
-        z = torch.special.ndtri((below + uniform * (above - below)).clamp(1e-300, 1 - 1e-16)).to(self.low)
+        z = ((ends - self.loc) / self.scale).double()
+        flip = z[0] > 0  # tails are resolved below zero alone; ndtr itself is 0 from -9 on
+        low, high = torch.where(flip, -z.flip(0), z)
+        below, above = (0.5 * torch.special.erfc(-end / math.sqrt(2)) for end in (low, high))
+        z = torch.special.ndtri((below + uniform * (above - below)).clamp(1e-300, 1 - 1e-16))
+        z = torch.where(flip, -z, z).to(self.low)
         return torch.maximum(torch.minimum(self.loc + self.scale * z, self.high), self.low)
 
     def log_prob(self, value: Tensor) -> Tensor:

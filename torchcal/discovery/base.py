@@ -169,7 +169,7 @@ def _again(found: Fitted, keep: Tensor) -> Fitted:
 def _sharpen(found: Fitted) -> Fitted:
     """Shorten time steps, where they err, until the solver's error is small against the noise."""
     recording = found.problem.recording
-    for _ in range(7):
+    for number in range(8):
         simulator = found.problem.simulator
         if not isinstance(simulator, Trajectories) or simulator.ode.max_step is not None:
             return found
@@ -183,6 +183,8 @@ def _sharpen(found: Fitted) -> Fitted:
         error = (y - found.y).abs()
         if bool((error <= allowed).all()):
             return found
+        if number == 7:
+            break
         if isinstance(found.warm, Tensor):
             excess = 2.0 * float((error / allowed).max())
             finer = simulator.focused(found.values, found.warm, excess) if math.isfinite(excess) else finer

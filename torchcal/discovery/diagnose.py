@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from torchcal.checks import whole
 from torchcal.data import Recording
 from torchcal.discovery import explain, verify
 from torchcal.discovery.candidates import base_columns, check_repeats
@@ -30,8 +31,7 @@ from torchcal.discovery.search import Search
 from torchcal.discovery.several import refit_several
 from torchcal.discovery.verdict import PLAINLY_WHITE, Decision, decide
 from torchcal.errors import ConvergenceWarning, DomainError, RecordingError
-from torchcal.polychaos._checks import whole
-from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories
+from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories, free_parameters
 from torchcal.simulators.executor import check_executor
 from torchcal.terms import Term, extend
 
@@ -103,7 +103,7 @@ def diagnose(
     given = terms
     terms = [term for term in given if not _contains(simulator, term)]
     problem = Problem.of(simulator, recording)
-    _check_fixed(problem, fixed or {})
+    free_parameters(problem.parameters, fixed)  # raises for what cannot be held
     free, held = base_columns(problem, fixed or {})
     if not free:
         raise DomainError("Expected at least one parameter to calibrate. Got all of them fixed or dormant.")
@@ -174,19 +174,6 @@ def _check(simulator: Any, recording: Any, candidates: Any, confidence: float) -
             f"Got {confidence!r}."
         )
     return list(by_name.values())
-
-
-def _check_fixed(problem: Problem, fixed: Mapping[str, float]) -> None:
-    """Raise for names that do not exist and values outside their bounds."""
-    if not isinstance(fixed, Mapping):
-        raise DomainError(f"Expected fixed as a dict from parameter names to values. Got {fixed!r}.")
-    parameters = {q.name: q for q in problem.parameters}
-    for name, value in fixed.items():
-        if name not in parameters:
-            raise DomainError(f"Expected fixed values of parameters among {list(parameters)}. Got {name!r}.")
-        if not math.isfinite(float(value)) or not parameters[name].contains(float(value)):
-            q = parameters[name]
-            raise DomainError(f"Expected the fixed parameter {name!r} within [{q.low}, {q.high}]. Got {value!r}.")
 
 
 def _contains(simulator: Simulator, term: Term) -> bool:

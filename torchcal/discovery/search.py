@@ -302,8 +302,9 @@ class Search:
         off = set()
         for i, at in zip(found.free, found.at_bound.tolist(), strict=True):
             if at and names[i] in amplitude:
-                value, neutral = float(found.values[i]), float(candidate.neutral[candidate.own.index(i)])
-                if abs(value - neutral) <= 1e-9 * (1 + abs(value)):
+                value, q = float(found.values[i]), candidate.problem.parameters[i]
+                end = min((one for one in (q.low, q.high) if one is not None), key=lambda one: abs(one - value))
+                if end == float(candidate.neutral[candidate.own.index(i)]):
                     off.add(names[i])
         closed = model.window is not None and model.window.low >= model.window.high
         model.physical = not new and not closed

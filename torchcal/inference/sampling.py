@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcal import models
+from torchcal.checks import whole
 from torchcal.errors import ConvergenceWarning, DomainError, ImproperPosteriorError
 from torchcal.inference.batched import MOST_ELEMENTS, run_batched
 from torchcal.inference.coordinates import Laplace, dealt_out
@@ -17,7 +18,6 @@ from torchcal.inference.draws import WORTH_CHAINS, Draws
 from torchcal.inference.estimate import Estimate, modes_of
 from torchcal.inference.nuts import run_nuts
 from torchcal.models import Problem
-from torchcal.polychaos._checks import whole
 from torchcal.results.diagnostics import R_HAT_THRESHOLD, Mode
 
 __all__ = ["Plan", "draw"]

@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from torchcal import likelihoods
+from torchcal.checks import whole
 from torchcal.data import Recording
 from torchcal.embeddings import Embedding
 from torchcal.errors import DomainError, EmbeddingError, ImproperPosteriorError, RecordingError, SimulatorError
 from torchcal.inference.fitting import allowed_solver_error
 from torchcal.models import Problem
-from torchcal.polychaos._checks import whole
 from torchcal.priors import CoefficientPrior
 from torchcal.propagation import NISP
 from torchcal.simulators import Parameter, Scaling, Simulator, Trajectories, free_parameters

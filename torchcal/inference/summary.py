@@ -251,7 +251,7 @@ def settings_of(problem: Problem, fit: LeastSquares, embedding: str, seed: int, 
         "center": fit.scaling.center.tolist(),
         "scale": fit.scaling.scale.tolist(),
         "log": fit.scaling.log.tolist(),
-        "fixed": dict(propagate.fixed),
+        "fixed": {name: float(value) for name, value in propagate.fixed.items()},
         "units": {parameter.name: parameter.unit for parameter in propagate.free},
     }
 
@@ -259,7 +259,7 @@ def settings_of(problem: Problem, fit: LeastSquares, embedding: str, seed: int, 
 def mean_square(sd: Tensor, recording: Recording) -> float:
     """Mean of squares over the data; of several outputs, each in units of its own spread."""
     unit = recording.spread if len(recording.outputs) > 1 else torch.ones_like(recording.spread)
-    return float((sd / unit.to(sd)).square().mean())
+    return float((sd / unit.to(sd)).square()[recording.observed.to(sd.device)].mean())
 
 
 def to_result(value: Tensor) -> Tensor:

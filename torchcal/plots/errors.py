@@ -65,7 +65,9 @@ def sd_against_error(
     predicted, recorded = conditions_of(prediction.x, recording), conditions_of(recording.x, recording)
     same = list(predicted) and set(predicted) == set(recorded)
     if not same or not all(
-        len(predicted[name]) == recording.n and np.allclose(predicted[name], recorded[name], rtol=1e-6)
+        len(predicted[name]) == recording.n and np.allclose(
+            predicted[name], recorded[name], rtol=1e-6, atol=1e-9 * np.ptp(recorded[name])
+        )
         for name in recorded
     ):
         raise ShapeError(

@@ -10,8 +10,8 @@ from numpy.polynomial.hermite_e import hermegauss
 from numpy.polynomial.legendre import leggauss
 from torch import Tensor
 
+from torchcal.checks import whole
 from torchcal.errors import DomainError, ShapeError
-from torchcal.polychaos._checks import whole
 
 __all__ = ["HERMITE", "LEGENDRE", "Basis", "evaluate", "get_basis", "norms"]
 

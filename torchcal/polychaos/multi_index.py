@@ -6,7 +6,8 @@ import math
 import torch
 from torch import Tensor
 
-from torchcal.polychaos._checks import limit_rows, whole
+from torchcal.checks import whole
+from torchcal.polychaos._checks import limit_rows
 
 __all__ = ["multi_indices"]
 

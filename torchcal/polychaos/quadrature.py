@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
+from torchcal.checks import whole
 from torchcal.errors import DomainError, ShapeError
-from torchcal.polychaos._checks import limit_rows, whole
+from torchcal.polychaos._checks import limit_rows
 from torchcal.polychaos.basis import Basis
 
 __all__ = ["Rule", "qmc_rule", "smolyak_rule", "tensor_rule"]

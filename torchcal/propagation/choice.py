@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchcal import polychaos
+from torchcal.checks import whole
 from torchcal.errors import DomainError, ShapeError
 from torchcal.propagation.rules import RuleChoice, gauss_counts, sparse_or_random
 
@@ -35,9 +36,7 @@ def choose(propagate: "NISP", rule: polychaos.Rule | RuleChoice | int | None) ->
     if germs == 0:
         return RuleChoice("tensor", 1)
     if rule is not None:
-        if isinstance(rule, bool) or not isinstance(rule, int) or rule < 1:
-            raise DomainError(f"Expected rule as a Rule, a positive integer or None. Got {rule!r}.")
-        return RuleChoice("tensor", rule)
+        return RuleChoice("tensor", whole("rule", rule, 1, advice="or a Rule, or None"))
     exact = exact_count(propagate)
     if exact is not None and exact**germs <= propagate.max_nodes:
         return RuleChoice("tensor", exact)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from torchcal import polychaos
+from torchcal.checks import whole
 from torchcal.embeddings import Embedding, Pattern
 from torchcal.errors import DomainError, EmbeddingError, ShapeError
 from torchcal.propagation import choice, convergence, parameters, polynomials
@@ -96,8 +97,7 @@ class NISP(nn.Module):
             raise DomainError(f"Expected a torchcal.Simulator. Got {type(simulator).__name__}. Wrap the function.")
         if not isinstance(embedding, Embedding):
             raise DomainError(f"Expected one of torchcal.embeddings, such as Gaussian(). Got {embedding!r}.")
-        if order is not None and (isinstance(order, bool) or not isinstance(order, int) or order < 1):
-            raise DomainError(f"Expected order as a positive integer or None. Got {order!r}.")
+        order = None if order is None else whole("order", order, 1, advice="or None")
         if sd_floor is not None and not (math.isfinite(sd_floor) and sd_floor > 0):
             raise DomainError(f"Expected sd_floor > 0. Got {sd_floor!r}.")
         self.simulator = simulator
@@ -200,8 +200,7 @@ class NISP(nn.Module):
 
     def largest(self, values: Tensor) -> Tensor:
         """The largest of each output's values, in the place of every value of that output, ``(*batch, n)``."""
-        count = 1 if self.outputs is None else len(self.outputs)
-        split = values.reshape(*values.shape[:-1], count, values.shape[-1] // count)
+        split = values.unflatten(-1, (-1, len(self._x0)))  # one output after another
         return split.amax(-1, keepdim=True).expand(split.shape).reshape(values.shape)
 
     def moments(self, alpha: Tensor) -> tuple[Tensor, Tensor]:
@@ -292,7 +291,7 @@ class NISP(nn.Module):
         """
         if simulator is None:
             return self.copy(x=x)
-        return self.copy(x=x, simulator=simulator, outputs=None, rule=self._wanted_rule)
+        return self.copy(x=x, simulator=simulator, outputs=None, sd_floor=None, rule=self._wanted_rule)
 
     def copy(self, **changes: Any) -> "NISP":
         """The same propagation with some of its constructor's arguments changed."""

@@ -8,8 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchcal.checks import whole
 from torchcal.data import Recording
-from torchcal.errors import DomainError
+from torchcal.data.arrays import to_tensor
+from torchcal.errors import DomainError, RecordingError, ShapeError
 from torchcal.results import storage
 from torchcal.results.estimate import MapEstimate
 from torchcal.simulators import Conditions
@@ -58,8 +60,7 @@ class Result:
 
 def thin(draws: Tensor | None, most: int) -> Tensor | None:
     """At most ``most`` draws, evenly spaced."""
-    if isinstance(most, bool) or not isinstance(most, int) or most < 1:
-        raise DomainError(f"Expected max_draws as a positive integer. Got {most!r}.")
+    most = whole("max_draws", most, 1)
     if draws is None or len(draws) <= most:
         return draws
     return draws[torch.linspace(0, len(draws) - 1, most).round().long()]
@@ -71,14 +72,15 @@ def conditions(x: Any, recording: Recording | None) -> Conditions:
         wanted = tuple(x) if isinstance(x, Mapping) else None
     else:
         wanted = tuple(recording.x) if isinstance(recording.x, Mapping) else None
+    units = {} if recording is None else recording.units
     if wanted is None:
         if isinstance(x, Mapping):
             raise DomainError(f"Expected conditions as one array, as in the recording. Got a dict {list(x)}.")
-        return _vector(x, "x")
+        return _vector(x, "x", units)
     if not isinstance(x, Mapping) or set(x) != set(wanted):
         got = list(x) if isinstance(x, Mapping) else type(x).__name__
         raise DomainError(f"Expected conditions as a dict with {list(wanted)}. Got {got}.")
-    values = {name: _vector(x[name], name) for name in wanted}
+    values = {name: _vector(x[name], name, units) for name in wanted}
     if len({len(value) for value in values.values()}) > 1:
         raise DomainError(
             f"Expected conditions of one length. Got { {name: len(v) for name, v in values.items()} }."
@@ -86,11 +88,11 @@ def conditions(x: Any, recording: Recording | None) -> Conditions:
     return values
 
 
-def _vector(value: Any, name: str) -> Tensor:
+def _vector(value: Any, name: str, units: Mapping[str, str]) -> Tensor:
     try:
-        array = torch.as_tensor(value, dtype=torch.float64).detach()
-    except (TypeError, ValueError, RuntimeError) as error:
-        raise DomainError(f"Expected condition {name!r} as numbers of shape (n,). Got {value!r}.") from error
+        array = to_tensor(value, name, units.get(name))[0]
+    except (RecordingError, ShapeError) as error:
+        raise DomainError(str(error)) from error
     if array.ndim == 0:
         array = array[None]
     if array.ndim != 1 or not len(array) or not bool(torch.isfinite(array).all()):

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchcal.checks import whole
 from torchcal.data import Recording
 from torchcal.embeddings import Embedding
 from torchcal.errors import DomainError
@@ -163,8 +164,7 @@ class Calibration(Result):
         return kind
 
     def _joint_draws(self, propagate: NISP, num: int, kind: str, seed: int) -> tuple[Tensor, Tensor]:
-        if isinstance(num, bool) or not isinstance(num, int) or num < 0:
-            raise DomainError(f"Expected num as a non-negative integer. Got {num!r}.")
+        num = whole("num", num, 0)
         like = propagate.nodes
         xi = propagate.draw_germ(num, seed=seed)
         draws = self.draws

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from torchcal.data import Recording, Run
+from torchcal.data.arrays import to_tensor
+from torchcal.data.run import OUTSIDE, change, convert
 from torchcal.errors import DomainError, PropagationWarning
 from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results.base import conditions
@@ -111,17 +113,10 @@ def _blank(runs: Sequence[Run], recording: Recording) -> Recording:
                 f"Expected inputs {sorted(needed)} in every run, as in the recording. Got {sorted(run.inputs)} in run "
                 f"{i}."
             )
-    empty = [
-        Run(
-            time=run.time,
-            outputs={name: torch.zeros_like(run.time) for name in recording.outputs},
-            inputs=run.inputs,
-            initial=run.initial,
-            hold=run.hold,
-        )
-        for run in runs
-    ]
-    return Recording(runs=empty)
+    units = {**recording.units, **(recording.runs[0].units if recording.runs else {})}
+    alike = [convert(run, units, run.time.device, f"run {i}") for i, run in enumerate(runs)]
+    blank = [{name: torch.zeros_like(run.time) for name in recording.outputs} for run in alike]
+    return Recording(runs=[change(run, outputs=y) for run, y in zip(alike, blank, strict=True)])
 
 
 def _columns(bound: Trajectories, other: Trajectories) -> list[int]:
@@ -148,7 +143,7 @@ def _times(x: Any, recording: Recording) -> dict[str, Tensor]:
     if len(runs) == 1 and not (isinstance(x, Mapping) and "run" in x):
         time = x["time"] if isinstance(x, Mapping) and set(x) == {"time"} else x
         if not isinstance(time, Mapping):
-            time = torch.as_tensor(time, dtype=torch.float64)
+            time = to_tensor(time, "time", recording.units.get("time"))[0]
             x = {"time": time, "run": torch.zeros_like(time)}
     where = conditions(x, recording)
     if not isinstance(where, Mapping):
@@ -171,6 +166,8 @@ def _with_times(recording: Recording, where: Mapping[str, Tensor]) -> tuple[Reco
                 f"Expected times from {float(run.time[0]):.6g} on in run {r}, where it begins. Got "
                 f"{float(wanted.min()):.6g}."
             )
+        nearest = run.time[(run.time - wanted[:, None]).abs().argmin(1)]  # not a rounding beside a sample
+        wanted = torch.where((nearest - wanted).abs() <= OUTSIDE * run.time.abs().max(), nearest, wanted)
         time = torch.unique(torch.cat([run.time, wanted]))
         inputs = run.inputs_at(time) if run.inputs else {}
         picks[chosen] = offset + torch.searchsorted(time, wanted)

@@ -153,10 +153,14 @@ def check_simulator(result: "Calibration") -> None:
         return
     with torch.no_grad():
         mean, variance = output_moments(result.propagate, result.map.alpha)
-    pair = (mean, variance.clamp_min(0).sqrt())
-    stored = (result.stored.map.mean, result.stored.map.sd)
-    allowed = SAME * (result.recording.spread + stored[0].abs())
-    if any(bool(((a - b).abs() > allowed).any()) for a, b in zip(pair, stored, strict=True)):
+    stored = result.stored.map
+    _hold_against(result.recording, stored.mean, (mean, stored.mean), (variance.clamp_min(0).sqrt(), stored.sd))
+
+
+def _hold_against(recording: Recording, size: Tensor, *pairs: tuple[Tensor, Tensor]) -> None:
+    """Raise where what is predicted is not what was stored."""
+    allowed = SAME * (recording.spread + size.abs())
+    if not all(bool(((predicted - stored).abs() <= allowed).all()) for predicted, stored in pairs):
         raise DomainError(
             "Expected the simulator that was calibrated. Got one that predicts something else with the same parameters."
         )
@@ -171,7 +175,7 @@ def read_additive(
     propagate = _propagation(simulator, embeddings.PolynomialChaos(order=0), recording, meta)
     p = groups["prediction"]
     kinds = {k: Moments(p[f"{k}_mean"], p[f"{k}_sd"]) for k in ("push_forward", "posterior", "map")}
-    return cls(
+    result = cls(
         map=_map(groups, meta),
         samples=_samples(groups),
         diagnostics=_diagnostics(groups, meta),
@@ -180,6 +184,12 @@ def read_additive(
         settings=meta["settings"],
         stored=AdditivePrediction(x=recording.x, **kinds),
     )
+    if propagate is not None and not isinstance(simulator, ExternalSimulator | ODESimulator):
+        with torch.no_grad():
+            mean = propagate.mean(result.map.alpha[:-1])
+        stored = kinds["map"].mean
+        _hold_against(recording, stored, (mean, stored))
+    return result
 
 
 # --- writing ---------------------------------------------------------------------------------------------
@@ -290,7 +300,7 @@ def _plain_fields(item: Any) -> dict[str, Any]:
     values = {}
     for entry in fields(item):
         value = getattr(item, entry.name)
-        if isinstance(value, Tensor):
+        if isinstance(value, Tensor | np.generic | np.ndarray):
             value = value.tolist()
         values[entry.name] = list(value) if isinstance(value, tuple) else value
     return values

@@ -15,7 +15,9 @@ import torch
 from torch import Tensor
 
 from torchcal import polychaos
+from torchcal.checks import whole
 from torchcal.errors import DomainError, SimulatorError, SurrogateWarning
+from torchcal.polychaos._checks import limit_rows
 from torchcal.simulators.design import Evaluations, evaluate_points
 from torchcal.simulators.executor import check_executor
 from torchcal.simulators.external import ExternalSimulator
@@ -96,10 +98,10 @@ def build_surrogate(
     parameters = _choose_parameters(simulator, parameters)
     names, bounds = check_box(conditions, parameters)
     dim = len(bounds) + len(parameters)
-    order = _whole("order", order, 1)
+    order = whole("order", order, 1)
     counts = _check_nodes(nodes, order, dim)
-    _whole("holdout", holdout, 10)
-    _whole("seed", seed, 0)
+    whole("holdout", holdout, 10)
+    whole("seed", seed, 0)
     if not (isinstance(threshold, int | float) and threshold > 0):
         raise DomainError(f"Expected threshold > 0. Got {threshold!r}.")
     external = not isinstance(simulator, Simulator) or isinstance(simulator, ExternalSimulator)
@@ -117,6 +119,7 @@ def build_surrogate(
     random = 2 * torch.from_numpy(np.random.default_rng(seed).random((holdout, dim))) - 1
     x_random = 0.5 * (low + high) + 0.5 * (high - low) * random[:, : len(bounds)]
     p_random = scaling.physical(random[:, len(bounds) :])
+    labels = [*(names or ("x",)), *(parameter.name for parameter in parameters)]
     if external:
         call = _point_call(simulator, names, parameters)
         if isinstance(simulator, ExternalSimulator) and executor is None:
@@ -124,14 +127,17 @@ def build_surrogate(
         check_executor(executor, call.function)
         design = torch.cat([x_nodes.repeat_interleave(len(p_nodes), 0), p_nodes.repeat(len(x_nodes), 1)], dim=-1)
         every = torch.cat([design, torch.cat([x_random, p_random], dim=-1)])
-        variables = [*(names or ("x",)), *(parameter.name for parameter in parameters)]
-        done = evaluate_points(call, every.numpy(), variables, executor=executor, cache=cache, progress=progress)
+        done = evaluate_points(call, every.numpy(), labels, executor=executor, cache=cache, progress=progress)
         found, values = done.outputs, torch.from_numpy(done.values).T
         on_grid, held_out = values[:, : len(design)], values[:, len(design) :]
     else:
         model = _TorchModel(simulator, names, parameters, outputs)  # type: ignore[arg-type]
         on_grid, held_out = model.grid(x_nodes, p_nodes), model.pairs(x_random, p_random)
         found = model.outputs
+    if found is None and outputs is not None:
+        raise SimulatorError(
+            f"Expected outputs {list(outputs)}. Got one without a name. Return a dict of them, or leave outputs= out."
+        )
     if found is not None:
         kept = found if outputs is None else tuple(outputs)
         missing = [name for name in kept if name not in found]
@@ -151,7 +157,6 @@ def build_surrogate(
     psi = polychaos.evaluate(polychaos.LEGENDRE, surrogate.indices, random)
     error = (coefficients @ psi.T - held_out).abs()
     points = torch.cat([x_random, p_random], dim=-1)
-    labels = [*(names or ("x",)), *(parameter.name for parameter in parameters)]
     measured = HeldOutError(
         num=holdout,
         outputs=found or ("y",),
@@ -278,25 +283,13 @@ def _choose_parameters(simulator: Any, parameters: Sequence[Parameter] | None) -
     return tuple(chosen)
 
 
-def _whole(name: str, value: Any, least: int) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < least:
-        raise DomainError(f"Expected {name} as a whole number >= {least}. Got {value!r}.")
-    return value
-
-
 def _check_nodes(nodes: int | Sequence[int] | None, order: int, dim: int) -> list[int]:
     if nodes is None:
         return [order + 1] * dim
-    counts = [nodes] * dim if isinstance(nodes, int) else list(nodes)
+    counts = list(nodes) if isinstance(nodes, Sequence) else [nodes] * dim
     if len(counts) != dim:
         raise DomainError(f"Expected nodes as one number or {dim}, one per condition and parameter. Got {nodes}.")
-    for count in counts:
-        if isinstance(count, bool) or not isinstance(count, int) or count <= order:
-            raise DomainError(
-                f"Expected nodes above the order, {order}: fewer cannot tell its polynomials apart. Got {nodes}. "
-                f"Use {order + 1}, the default, or more."
-            )
-    limit = math.prod(counts)
-    if limit > 10_000_000:
-        raise DomainError(f"Expected at most 1e7 evaluations. Got {limit}. Use fewer nodes or dimensions.")
+    advice = f"fewer cannot tell polynomials of order {order} apart"
+    counts = [whole("nodes", count, order + 1, advice=advice) for count in counts]
+    limit_rows("the design", math.prod(counts), advice="use fewer nodes or dimensions")
     return counts

@@ -140,18 +140,18 @@ class ExternalSimulator(Simulator):
         call = PointCall(self.external, names, self.names)
         return raised_at(call, [*points[column % len(points)].tolist(), *values.tolist()])
 
-    def _call(self, x: Conditions, p: dict[str, Tensor]) -> Tensor:
+    def _call(self, x: Conditions, p: dict[str, Tensor]) -> Tensor | dict[str, Tensor]:
         """``function(x, p)`` on tensors: ``p[name]`` is ``(*batch, 1)``, or ``(*batch, n)`` where it varies."""
         values = torch.stack(torch.broadcast_tensors(*(p[name] for name in self.names)), dim=-1)
-        if values.shape[-2] == 1:
-            return self.at(x)(values[..., 0, :])
-        if self.vectorized:
+        if self.vectorized and values.shape[-2] > 1:
             raise SimulatorError(
                 "Expected parameters that are the same at all conditions. Got values that vary with them (a "
                 "term's shifts=), which a vectorized function cannot take. Use vectorized=False."
             )
         rows = values.reshape(-1, *values.shape[-2:])
-        return _unflatten(_Differenced.apply(rows, _Job(self, x, None)), values.shape[:-2])
+        job = _Job(self, x, None)
+        result = _unflatten(_Differenced.apply(rows, job), values.shape[:-2])
+        return result if job.found is None else dict(zip(job.found, result.split(len(job.x), dim=-1), strict=True))
 
 
 def _unflatten(result: Tensor, batch: torch.Size) -> Tensor:
@@ -173,6 +173,7 @@ class _Job:
         self.x = np.stack(arrays, axis=-1)  # (n, c)
         self.outputs = None if outputs is None else tuple(outputs)
         self.width = len(self.x) * len(self.outputs or (None,))
+        self.found: tuple[str, ...] | None = None
 
     def steps(self, values: Tensor) -> Tensor:
         """h, the shape of the values."""
@@ -184,7 +185,8 @@ class _Job:
             elif parameter.low is not None and parameter.high is not None:
                 size = torch.full_like(size, 0.5 * (parameter.high - parameter.low))
             else:
-                size = size.clamp_min(abs(parameter.initial or 0.0) or 1.0)
+                size = size.clamp_min(abs(parameter.initial or 0.0))
+                size = torch.where(size > 0, size, torch.ones_like(size))
             sizes.append(size)
         return self.simulator.step * torch.stack(sizes, dim=-1)
 
@@ -222,17 +224,17 @@ class _Job:
             )
         except TaskError as failure:
             raise failed_evaluation(failure, call.describe(tasks[failure.index])) from failure.error
-        done = [value for value in values if value is not None]
+        done = [(task, *value) for task, value in zip(tasks, values, strict=True) if value is not None]
         if not done:
             return None
-        names = done[0][0]
-        for index, (other, _) in enumerate(done):
+        names = self.found = done[0][1]
+        for task, other, _ in done:
             if other != names:
                 raise SimulatorError(
                     f"Expected the same outputs from every evaluation. Got {names} and {other}, the latter in row "
-                    f"{tasks[index]}."
+                    f"{task}."
                 )
-        nothing = (names, np.full_like(done[0][1], np.nan))
+        nothing = (names, np.full_like(done[0][2], np.nan))
         stacked = np.stack([value for _, value in (one or nothing for one in values)], axis=1)
         if names is None or self.outputs is None:
             return stacked

@@ -1,6 +1,7 @@
 """One evaluation of a user's function on plain numbers: calling it, reading its result, naming its point."""
 
 import numbers
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +15,12 @@ from torchcal.simulators.executor import TaskError, worker_died
 __all__ = ["ArrayCall", "Forgiving", "PointCall", "Value", "describe_point", "failed_evaluation", "raised_at"]
 
 Array = NDArray[np.float64]
+
+_DOMAIN = re.compile(
+    r"math domain error|expected (a (positive|nonnegative|finite|noninteger)|a number |argument value)"
+)
+"""What the functions of ``math`` say outside their domain: up to Python 3.13, and since."""
+
 Value = tuple[tuple[str, ...] | None, Array]
 """Output names (None for a function of one unnamed output) and their values, outputs first."""
 
@@ -94,7 +101,7 @@ class Forgiving:
         except ArithmeticError:
             return None
         except ValueError as error:
-            if type(error) is ValueError and "math domain error" in str(error):
+            if type(error) is ValueError and _DOMAIN.match(str(error)):
                 return None
             raise
 

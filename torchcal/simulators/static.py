@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from torchcal.checks import whole
 from torchcal.data import Recording
 from torchcal.errors import DomainError, ShapeError, SimulatorError
 from torchcal.simulators.dual import Still, still
@@ -90,11 +91,9 @@ class Simulator:
     ) -> None:
         if not callable(function):
             raise DomainError(f"Expected a callable f(x, p). Got {type(function).__name__}.")
-        if degree is not None and (isinstance(degree, bool) or not isinstance(degree, int) or degree < 0):
-            raise DomainError(f"Expected degree as a non-negative integer or None. Got {degree!r}.")
         self.function = function
         self.parameters = check_parameters(parameters)
-        self.degree = degree
+        self.degree = None if degree is None else whole("degree", degree, 0, advice="or None")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -118,6 +117,11 @@ class Simulator:
         n = _length(x)
 
         def evaluate(values: Tensor) -> Tensor:
+            if values.ndim == 0 or values.shape[-1] != len(self.names):
+                raise ShapeError(
+                    f"Expected parameter values of shape (*batch, {len(self.names)}): {', '.join(self.names)}. "
+                    f"Got {tuple(values.shape)}."
+                )
             p = {name: values[..., i : i + 1] for i, name in enumerate(self.names)}
             try:
                 result = self.function(x, p)

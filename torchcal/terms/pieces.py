@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchcal.errors import DomainError
 from torchcal.simulators import Parameter
-from torchcal.terms.term import Term
+from torchcal.terms.term import Term, outer
 
 __all__ = [
     "Named",
@@ -144,7 +144,7 @@ def quantity(value: Any, what: str) -> Callable[[Named, Named, Named], Any]:
         what: What it is, for messages.
     """
     if callable(value):
-        return lambda s, p, u: value(p)
+        return lambda s, p, u: value(outer(p))
     if isinstance(value, str) and value:
 
         def find(s: Named, p: Named, u: Named) -> Any:

@@ -4,13 +4,12 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from torchcal.errors import DomainError
 from torchcal.simulators import Parameter
 from torchcal.terms.pieces import amplitude, check_name, check_names, excess, shape
-from torchcal.terms.term import Term
+from torchcal.terms.term import Term, outer
 
 __all__ = ["sensor"]
 
@@ -141,16 +140,20 @@ def _signal(output: str) -> Signal:
     return signal
 
 
-def _dynamic(output: str, unit: str, time: str, signal: Signal) -> list[Term]:
+def _dynamic(output: str, unit: str, time: str, given: Signal) -> list[Term]:
     """Instruments with a memory of their own."""
+
+    def signal(t: Any, s: Any, p: Any, u: Any) -> Any:
+        return given(t, s, outer(p), u)
 
     def first(s: Any, p: Any) -> Any:
         try:
-            return signal(torch.zeros((), dtype=next(iter(s.values())).dtype), s, p, {})
-        except KeyError as error:
+            return signal(None, s, p, {})  # a run need not begin at t = 0
+        except (KeyError, TypeError, AttributeError) as error:
             raise DomainError(
                 f"Expected the output {output!r} from states and parameters alone, to begin its lag with. It needs "
-                f"{error}. Use dynamic=False to leave lag and delay out."
+                f"t or an input, or fails ({type(error).__name__}: {error}). Use dynamic=False to leave lag and delay "
+                "out."
             ) from error
 
     lag, delay = f"lag of {output}", f"delay of {output}"

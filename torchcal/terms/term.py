@@ -11,9 +11,22 @@ from torch import Tensor
 from torchcal.errors import DomainError, SimulatorError, TorchcalError
 from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories
 
-__all__ = ["Term", "extend"]
+__all__ = ["Term", "extend", "outer"]
 
 Function = Callable[..., Any]
+
+
+class _Own(dict[str, Any]):
+    """``p`` of a term's functions: its own parameters before the simulator's of the same names."""
+
+    def __init__(self, outer: Mapping[str, Any], own: Mapping[str, Any]) -> None:
+        super().__init__({**outer, **own})
+        self.outer = outer
+
+
+def outer(p: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The simulator's ``p``, for what a user wrote for that, out of a term's."""
+    return p.outer if isinstance(p, _Own) else p
 
 
 @dataclass(frozen=True, init=False, repr=False, eq=False)
@@ -144,7 +157,7 @@ class Term:
 
     def own(self, p: Mapping[str, Any]) -> dict[str, Any]:
         """``p`` as the term's functions see it."""
-        return {**p, **{parameter.name: p[self.full(parameter.name)] for parameter in self.parameters}}
+        return _Own(p, {parameter.name: p[self.full(parameter.name)] for parameter in self.parameters})
 
     def call(self, function: Function, *given: Any) -> Any:
         """One of its functions on what it is given; an error in it is told as this term's."""

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from torchcal.checks import whole
 from torchcal.data import Recording
 from torchcal.errors import DomainError
 from torchcal.plots.discovery.pieces import ACCEPTED, BASE, DASHES, Look, as_numbers, join_terms, places_of, rms
@@ -74,8 +75,7 @@ def panels_of(
     columns, n = conditions_of(recording.x, recording), recording.n
     if output is not None and output not in recording.outputs:
         raise DomainError(f"Expected output among {list(recording.outputs)}. Got {output!r} (check the spelling).")
-    if isinstance(most, bool) or not isinstance(most, int) or most < 1:
-        raise DomainError(f"Expected most: a number of panels, at least 1. Got {most!r}.")
+    most = whole("most", most, 1, advice="the number of panels")
     in_time = set(columns) == {"time", "run"}
     if along == "t" and in_time:
         along = "time"
