@@ -370,16 +370,6 @@ def test_a_recording_in_time_is_copyable():
         assert repr(twin.runs[1]) == repr(recording.runs[1])
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_runs_follow_the_accelerator():
-    runs = [run(hold="cubic"), run(outputs={"x": torch.tensor(X, device="cuda")}, hold="cubic")]
-    recording = Recording(runs=runs)
-    inputs = [r.inputs_at([0.5])["f"] for r in recording.runs]
-    tensors = (*recording.x.values(), recording.y, recording.observed, recording.spread, *inputs)
-    assert {t.device.type for t in tensors} == {"cuda"}
-    assert recording.masked([True, True, True, False, True, True]).y.device.type == "cuda"
-
-
 # --- masks ------------------------------------------------------------------------------------------
 
 

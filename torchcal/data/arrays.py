@@ -12,7 +12,6 @@ from torchcal.errors import RecordingError, ShapeError
 __all__ = [
     "check_finite",
     "check_lengths",
-    "common_device",
     "declared_units",
     "is_quantity",
     "named",
@@ -120,7 +119,7 @@ def _plain(value: Any, label: str) -> Tensor:
     if isinstance(value, Tensor):
         if value.dtype == torch.bool or value.is_complex() or value.layout != torch.strided:
             _refuse(label, f"a {value.layout} tensor of {value.dtype}")
-        return value.detach().to(torch.float64, copy=True)
+        return value.detach().to("cpu", torch.float64, copy=True)
     if isinstance(value, list | tuple):
         for index, entry in enumerate(value):
             if is_quantity(entry):
@@ -187,16 +186,6 @@ def check_lengths(arrays: Mapping[str, Tensor]) -> None:
         )  # fmt: skip
     if (n := min(lengths.values())) < 2:
         raise RecordingError(f"Expected at least 2 data points. Got {n} (one data point cannot calibrate).")
-
-
-def common_device(arrays: Mapping[str, Tensor]) -> torch.device:
-    """The accelerator that some of the arrays live on, else the CPU."""
-    devices = {array.device for array in arrays.values() if array.device.type != "cpu"}
-    if len(devices) > 1:
-        raise RecordingError(
-            f"Expected arrays on one device. Got {sorted(map(str, devices))} (move them with .to)."
-        )
-    return devices.pop() if devices else torch.device("cpu")
 
 
 def sample_spread(values: Tensor) -> Tensor:

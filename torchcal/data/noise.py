@@ -12,9 +12,7 @@ from torchcal.errors import DomainError, RecordingError, ShapeError
 __all__ = ["noise_sd"]
 
 
-def noise_sd(
-    noise: Any, outputs: tuple[str, ...], n: int, units: Mapping[str, str], device: torch.device
-) -> Tensor | str | None:
+def noise_sd(noise: Any, outputs: tuple[str, ...], n: int, units: Mapping[str, str]) -> Tensor | str | None:
     """None, "none", or the sd of every output value ``(n_total,)``, from what the user gave."""
     if noise is None:
         return None
@@ -52,7 +50,7 @@ def noise_sd(
                 f"Expected {label} as finite sd > 0. Got {sd.reshape(-1)[index].item()}{where} "
                 '(noise="none" is how to say that there is none; leave noise out if it is unknown).'
             )
-        parts.append((sd[i * n : (i + 1) * n] if sd.shape == (total,) else sd.expand(n)).to(device))
+        parts.append(sd[i * n : (i + 1) * n] if sd.shape == (total,) else sd.expand(n))
     return torch.cat(parts)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchcal.data.arrays import check_finite, check_lengths, common_device, declared_units, named, to_tensor
+from torchcal.data.arrays import check_finite, check_lengths, declared_units, named, to_tensor
 from torchcal.data.run import Run, convert
 from torchcal.errors import RecordingError, ShapeError
 
@@ -52,8 +52,6 @@ def static_parts(x: Any, y: Any, units: Any, missing: bool) -> Parts:
             if unit is not None:
                 known[name] = unit
     check_lengths(arrays)
-    device = common_device(arrays)
-    arrays = {name: array.to(device) for name, array in arrays.items()}
     return Parts(
         x={name: arrays[name] for name in given_x} if isinstance(x, Mapping) else arrays["x"],
         y={name: arrays[name] for name in given_y},
@@ -82,8 +80,7 @@ def run_parts(runs: Any, units: Any, missing: bool) -> Parts:
         for name, values in run.outputs.items():
             check_finite(values, f"outputs[{name!r}] of run {i}", is_output=True, missing=missing)
     known = _common_units(runs, declared_units(units, ["time", *outputs, *inputs]))
-    device = common_device({f"run {i}": run.time for i, run in enumerate(runs)})
-    runs = tuple(convert(run, known, device, f"run {i}") for i, run in enumerate(runs))
+    runs = tuple(convert(run, known, f"run {i}") for i, run in enumerate(runs))
 
     def values_of(name: str, run: Run) -> Tensor:
         return run.outputs[name] if name in run.outputs else torch.full_like(run.time, torch.nan)

@@ -29,8 +29,8 @@ class Recording:
     and ``n`` is the number of their samples.
 
     Arrays may be torch tensors, numpy arrays, lists, pandas Series, xarray DataArrays or pint Quantities
-    of any real dtype. They are matched by position; an index or a coordinate is not looked at. Arrays on
-    the CPU follow those on an accelerator.
+    of any real dtype. They are matched by position; an index or a coordinate is not looked at. What
+    is on an accelerator is copied from there: ``device=`` of a calibration says where the work is done.
 
     Args:
         x: Conditions: one array ``(n,)``, or a dict from names to arrays ``(n,)``. Never NaN.
@@ -137,7 +137,7 @@ class Recording:
             "spread",
             torch.cat([sample_spread(parts.y[name][mask]).expand(n) for name, mask in observed.items()]),
         )
-        put(self, "noise", noise_sd(noise, outputs, n, parts.units, self.y.device))
+        put(self, "noise", noise_sd(noise, outputs, n, parts.units))
         put(self, "runs", parts.runs)
 
     @property
@@ -210,7 +210,7 @@ class Recording:
                 f"Expected mask of dtype bool and shape ({self.n},). Got {keep.dtype}, {tuple(keep.shape)} "
                 "(True for each condition to keep; indices do not work)."
             )
-        keep = keep.to(self.y.device)
+        keep = keep.cpu()
         return Recording(
             x={k: v[keep] for k, v in self.x.items()} if isinstance(self.x, dict) else self.x[keep],
             y={name: values[keep] for name, values in self.split(self.y).items()},
@@ -250,7 +250,7 @@ class Recording:
                 f"Expected keep of dtype bool and shape {wanted}. Got {mask.dtype}, {tuple(mask.shape)} "
                 "(True for each datum to keep; indices do not work)."
             )
-        mask = mask.to(self.y.device)
+        mask = mask.cpu()
         mask = mask if len(mask) == total else mask.repeat(len(self.outputs))
         observed = self.observed & mask
         if (left := int(observed.sum())) < 2:

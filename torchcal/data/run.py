@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchcal.data.arrays import check_finite, common_device, is_quantity, to_tensor, value_range
+from torchcal.data.arrays import check_finite, is_quantity, to_tensor, value_range
 from torchcal.data.frames import check_columns, column_names
 from torchcal.data.interpolation import HOLDS, evaluate_pieces, pieces
 from torchcal.errors import DomainError, RecordingError, ShapeError
@@ -103,8 +103,6 @@ class Run:
             if (quantity := _quantity(values)) is not None:
                 quantities[name] = type(quantity)(0.0, unit)  # converts later; pint's class itself does not pickle
         _check_increasing(arrays["time"])
-        device = common_device(arrays)
-        arrays = {name: array.to(device) for name, array in arrays.items()}
 
         put = object.__setattr__
         put(self, "time", arrays["time"])
@@ -205,19 +203,19 @@ def change(run: Run, **changes: Any) -> Run:
     return twin
 
 
-def convert(run: Run, units: Mapping[str, str], device: torch.device, where: str) -> Run:
-    """The run in these units and on this device; ``where`` names it in errors."""
+def convert(run: Run, units: Mapping[str, str], where: str) -> Run:
+    """The run in these units; ``where`` names it in errors."""
 
     def converted(name: str, array: Tensor, label: str) -> Tensor:
         source, target = run.units.get(name), units.get(name)
         if source is None or target is None or source == target:
-            return array.to(device, copy=True)
+            return array.clone()
         if name not in run._quantities:
             raise RecordingError(
                 f"Expected {label} of {where} in {target!r}. Got {source!r} (convert it, or spell them alike)."
             )
-        given = type(run._quantities[name])(array.cpu().numpy(), source)
-        return to_tensor(given, f"{label} of {where}", target)[0].to(device)
+        given = type(run._quantities[name])(array.numpy(), source)
+        return to_tensor(given, f"{label} of {where}", target)[0]
 
     names = ("time", *run.outputs, *run.inputs)
     return change(

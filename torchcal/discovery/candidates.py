@@ -303,7 +303,7 @@ def _driver_values(base: Problem, found: Fitted, terms: Sequence[Term]) -> dict[
         drivers.setdefault(name, found.y[base.output_of == number])
     return {
         term.full(own): drivers[driver].abs().flatten().sort().values
-        for term in terms for own, driver in (term.scales or {}).items()
+        for term in terms for own, driver in term.scales.items()
         if driver in drivers and driver != "t"
     }  # fmt: skip
 

@@ -210,7 +210,7 @@ def estimate(
         mask = mine(problem, output)
         table[output, : len(sizes)] = torch.tensor(sizes, dtype=torch.float64).sqrt()
         if given is None:
-            if replicated is not None and replicated[1][output] >= 3:
+            if replicated is not None:
                 sd[mask], freedom = replicated[0][output], min(freedom, float(replicated[1][output]))
             else:
                 sd[mask], freedom = scale * unit[mask], min(freedom, usable)

@@ -48,10 +48,6 @@ class Whitening:
         """Whitened ``(*batch, n)``."""
         return self(values.unsqueeze(-1)).squeeze(-1)
 
-    def scaled(self, factor: float) -> "Whitening":
-        """With another size of the noise."""
-        return dataclasses.replace(self, sd=self.sd * factor)
-
 
 @dataclass(frozen=True, eq=False)
 class Problem:

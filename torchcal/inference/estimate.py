@@ -58,7 +58,6 @@ class Estimate:
         agreeing: Number of starts that reached the best objective.
         ties: Number of different densities of λ that reach it: a symmetry of model and data makes more than one.
         null_directions: Unit vectors in α along which the log-posterior does not change, ``(k, P)``.
-        unseen: Names of parameters whose means the data do not determine.
         improper: Those of them that no bounds hold either, or whose spread is as free.
         others: Where the other starts ended, if not far below the best, ``(k, P)``.
     """
@@ -70,7 +69,6 @@ class Estimate:
     agreeing: int
     ties: int
     null_directions: Tensor
-    unseen: tuple[str, ...]
     improper: tuple[str, ...]
     others: Tensor
 
@@ -192,7 +190,6 @@ def maximise(
         agreeing=agreeing,
         ties=ties,
         null_directions=null,
-        unseen=unseen,
         improper=_unheld(problem, unseen),
         others=transform.bound(found.points[found.values - found.values[0] < MODE_GAP]),
     )

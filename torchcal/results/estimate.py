@@ -15,7 +15,7 @@ class MapEstimate:
         alpha: MAP α in scaled coordinates, ``(P,)``.
         mean: E[λ] at it, ``(d,)``, physical units, the free parameters in order.
         covariance: Cov[λ] at it, ``(d, d)``, physical units.
-        objective: Negative log-likelihood at it, without constants.
+        objective: Negative log-likelihood at it.
         alpha_names: The names of α.
         parameters: The names of the free parameters.
     """

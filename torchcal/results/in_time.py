@@ -114,7 +114,7 @@ def _blank(runs: Sequence[Run], recording: Recording) -> Recording:
                 f"{i}."
             )
     units = {**recording.units, **(recording.runs[0].units if recording.runs else {})}
-    alike = [convert(run, units, run.time.device, f"run {i}") for i, run in enumerate(runs)]
+    alike = [convert(run, units, f"run {i}") for i, run in enumerate(runs)]
     blank = [{name: torch.zeros_like(run.time) for name in recording.outputs} for run in alike]
     return Recording(runs=[change(run, outputs=y) for run, y in zip(alike, blank, strict=True)])
 
