@@ -191,3 +191,22 @@ def test_a_strong_local_change_of_an_output_is_found_around_its_own_fit():
     assert d.terms == ["viscosity"]
     end = next(e for e in d.ranking[0].estimates if e.name == "viscosity.window from")
     assert end.value == pytest.approx(0.52, abs=0.03)
+
+
+def test_a_step_of_a_static_recording_is_found_between_its_data():
+    torch.manual_seed(3)
+    x = 3 * torch.rand(120, dtype=torch.float64) - 1.5
+    inside = (x > -0.6) & (x < 0.7)
+    y = 13 * x - 40 * inside * x**3 + 0.45 * torch.randn(120, dtype=torch.float64)
+    base = tc.Simulator(lambda x, p: p["k"] * x + p["F0"], [tc.Parameter("k"), tc.Parameter("F0")])
+    candidates = [
+        tc.Term(name, outputs={"y": lambda x, p, y, n=n: y + p["a"] * x**n}, parameters=[tc.Parameter("a")])
+        for name, n in (("quadratic", 2), ("cubic", 3), ("fifth power", 5))
+    ]
+    d = diagnose(base, tc.Recording(x=x, y=y, noise=0.45), candidates)
+    assert (d.verdict, d.terms) == ("named", ["cubic"])
+    found = {e.name.split("window ")[-1]: e for e in d.final.estimates}
+    assert found["cubic.a"].value == pytest.approx(-40, abs=4 * found["cubic.a"].sd)
+    for end, value in (("from", -0.6), ("to", 0.7)):
+        assert found[end].value == pytest.approx(value, abs=math.sqrt(12) * found[end].sd)  # within its gap
+        assert found[end].sd < 0.05

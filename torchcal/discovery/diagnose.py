@@ -238,7 +238,7 @@ def _result(
     if shown is not None:
         search.examine(shown)
     base = explain.fit_record(search.base, search.structure, ())
-    final = base if best is None else explain.fit_record(best.found, best.structure, best.names)
+    final = base if best is None else explain.fit_record(best.found, best.structure, best.names, best.window)
     _warn(search, decision.verdict)
     before = _scores(search, search.base, mask)
     after = None if best is None else _scores(search, best.found, mask)

@@ -8,10 +8,11 @@ from torch import Tensor
 
 from torchcal.discovery.channels import Channel
 from torchcal.discovery.fitting import Fitted, fit, starts
-from torchcal.discovery.local import region_text
+from torchcal.discovery.local import is_window, region_text
 from torchcal.discovery.model import Model
 from torchcal.discovery.noise import estimate
 from torchcal.discovery.records import Estimate, Fit, Location, MissingRate, NeededShift, Table
+from torchcal.discovery.screen import Window
 from torchcal.discovery.search import Search
 from torchcal.discovery.structure import Place, Structure
 
@@ -44,8 +45,11 @@ STARTS, AGAIN, RIVAL, ELSEWHERE = 4, 60, 4.0, 4.0
 BENT = 3.0
 
 
-def estimates(found: Fitted, places: Sequence[int]) -> tuple[Estimate, ...]:
-    """Estimates of some parameters. Without noise the misfit takes its place."""
+def estimates(found: Fitted, places: Sequence[int], window: Window | None = None) -> tuple[Estimate, ...]:
+    """Estimates of some parameters. Without noise the misfit takes its place.
+
+    The end of a static window is known to the gap between two data that it lies in, where its edge is a step.
+    """
     sd = found.sd()
     if isinstance(found.problem.recording.noise, str):
         sd = sd * misfit_size(found)
@@ -55,10 +59,19 @@ def estimates(found: Fitted, places: Sequence[int]) -> tuple[Estimate, ...]:
         q = found.problem.parameters[i]
         value = float(found.values[i])
         spread = float(sd[i])
+        if window is not None and not found.problem.in_time and is_window(q.name):
+            spread = min(spread, _gap(found.problem.drivers_at_data(found.values[None], None)[window.driver], value))
         if spread > 1e5 * max(abs(value), 1e-300):
             spread = math.inf
         result.append(Estimate(q.name, value, spread, q.unit, i in bound))
     return tuple(result)
+
+
+def _gap(driver: Tensor, value: float) -> float:
+    """Sd of a place that may lie anywhere between two data of a driver, or between 0 and the first."""
+    below, above = driver[driver <= value], driver[driver > value]
+    low = float(below.max()) if len(below) else 0.0
+    return (float(above.min()) - low) / math.sqrt(12) if len(above) else math.inf
 
 
 def misfit_size(found: Fitted) -> float:
@@ -66,13 +79,20 @@ def misfit_size(found: Fitted) -> float:
     return math.sqrt(found.chi2 / max(found.problem.n - len(found.free), 1))
 
 
-def fit_record(found: Fitted, structure: Structure | None, terms: tuple[str, ...]) -> Fit:
+def fit_record(
+    found: Fitted, structure: Structure | None, terms: tuple[str, ...], window: Window | None = None
+) -> Fit:
     """A fit as a record."""
     recording = found.problem.recording
     whole = found.problem.simulator.linearise(recording.x, found.values[None], recording.outputs, [], found.warm)
     residual = torch.where(recording.observed, recording.y - whole.y[0], torch.full_like(recording.y, math.nan))
     return Fit(
-        terms, estimates(found, found.free), whole.y[0], residual, found.chi2, structure.p_value if structure else 1.0
+        terms,
+        estimates(found, found.free, window),
+        whole.y[0],
+        residual,
+        found.chi2,
+        structure.p_value if structure else 1.0,
     )
 
 
@@ -311,5 +331,5 @@ def formulas(model: Model) -> list[str]:
         if model.window is not None:
             w = model.window
             text = f"{text.split(' where ')[0]} where {region_text(w.driver, w.low, w.high)}"
-        rows.append(f"{text}, with " + "; ".join(str(e) for e in estimates(model.found, own)))
+        rows.append(f"{text}, with " + "; ".join(str(e) for e in estimates(model.found, own, model.window)))
     return rows

@@ -16,6 +16,8 @@ __all__ = ["EDGE", "ENDS", "WIDTHS", "Span", "beyond", "force", "is_window", "lo
 #: Width of a window's edges, as a share of the driver's range: wide enough for a fit to move them; and the limits
 #: between which it is fitted, from nearly a step.
 EDGE, WIDTHS = 0.02, (0.004, 0.1)
+#: The narrowest of a static recording, whose ends are sought between its data: no time step has to meet them.
+STEP = 1e-4
 
 #: Ratio of the ends of a positive driver's range from which on its windows are laid out in its logarithm.
 DECADES = 30.0
@@ -84,7 +86,7 @@ def localised(
             ends.append(Parameter(ENDS[name], low=span.low, high=span.high, initial=begin, transform=scale))
     size = span.size
     if edge:
-        least, most = (share * size for share in WIDTHS)
+        least, most = (STEP if static else WIDTHS[0]) * size, WIDTHS[1] * size
         ends.append(Parameter(WIDTH_OF_EDGE, low=least, high=most, initial=EDGE * size, transform="log"))
 
     def inside(d: Tensor, p: Mapping[str, Any]) -> Any:

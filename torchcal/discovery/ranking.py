@@ -70,7 +70,7 @@ def _refitted(search: Search, model: Model, share: float, others: list[int], hel
         terms=model.names,
         log_evidence=model.log_evidence,
         probability=share,
-        estimates=explain.estimates(model.found, model.candidate.own),
+        estimates=explain.estimates(model.found, model.candidate.own, model.window),
         physical=model.physical,
         misfit_removed=explain.removed(search, model),
         p_white=model.structure.p_value if model.structure else None,

@@ -8,7 +8,7 @@ import torch
 
 from torchcal.discovery.candidates import prepare
 from torchcal.discovery.channels import responses
-from torchcal.discovery.local import EDGE, ENDS, WIDTHS, Span, beyond, is_window, localised
+from torchcal.discovery.local import EDGE, ENDS, WIDTH_OF_EDGE, WIDTHS, Span, beyond, is_window, localised
 from torchcal.discovery.model import PRIOR, Model
 from torchcal.discovery.screen import Window, windows_of
 from torchcal.discovery.search import Search
@@ -39,6 +39,8 @@ SHIFT, FINE = 0.1, 0.03
 SHORT = 0.02
 #: Data below which no window is sought; nor is any without noise, where a window bends to whatever is left.
 LEAST = 30
+#: Gaps between data, around an edge that was found, where it is tried as a step; and fits from there.
+NEIGHBOURS, STEPPED = 12, 6
 
 
 def refit_local(search: Search) -> None:
@@ -131,9 +133,35 @@ def _refine_edges(search: Search, prior: float) -> None:
         scales = [span, dataclasses.replace(span, log=False)] if span.log else [span]
         found = [refit_window(search, w, prior, model, edge=True, span=scale) for scale in scales]
         other = max((one for one in found if one is not None), key=lambda one: one.weight, default=None)
+        if other is not None and not search.problem.in_time:  # time steps are not chosen to meet a step
+            other = max(filter(None, (other, _stepped(search, other))), key=lambda one: one.weight)
         if other is not None and other.weight > model.weight:
             search.models.remove(model)
             _keep(search, other)
+
+
+def _stepped(search: Search, model: Model) -> Model | None:
+    """A static local model with steps for edges, each between two of the data near the edge that was found.
+
+    The misfit of a step jumps from datum to datum, and slopes lead to none of its minima.
+    """
+    if model.window is None:
+        return None
+    problem, values = model.candidate.problem, model.found.values
+    driver = search._drivers()[model.window.driver].unique()
+    between = 0.5 * (driver[1:] + driver[:-1])
+    choices = []
+    for q, value in zip(problem.parameters, values.tolist(), strict=True):
+        if q.name.endswith(WIDTH_OF_EDGE):
+            choices.append(torch.tensor([q.low], dtype=torch.float64))
+        elif is_window(q.name):
+            choices.append(between[(between - value).abs().argsort()[:NEIGHBOURS]])
+        else:
+            choices.append(torch.tensor([value], dtype=torch.float64))
+    begin = torch.cartesian_prod(*choices)
+    misfit = search.noise.whitening(problem).vector(problem.y - problem.evaluate(begin, [])[0]).square().sum(-1)
+    begin = begin[misfit.nan_to_num(nan=torch.inf).argsort()[:STEPPED]]
+    return search._refit(model.numbers, model.candidate, begin, model.log_prior, window=model.window)
 
 
 def _keep(search: Search, model: Model | None) -> None:
