@@ -210,3 +210,20 @@ def test_a_step_of_a_static_recording_is_found_between_its_data():
     for end, value in (("from", -0.6), ("to", 0.7)):
         assert found[end].value == pytest.approx(value, abs=math.sqrt(12) * found[end].sd)  # within its gap
         assert found[end].sd < 0.05
+
+
+def test_the_sd_of_a_steps_place_says_how_far_it_may_be_off():
+    """One step in noise as large as a third of it: over seeds the errors are a few sd, not ten."""
+    z = []
+    for seed in range(4):
+        torch.manual_seed(seed)
+        x = torch.rand(300, dtype=torch.float64)
+        y = 1 + 2 * x + 2.0 * (x > 0.3) + torch.randn(300, dtype=torch.float64)
+        base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+        jump = tc.Term("jump", outputs={"y": lambda x, p, y: y + p["c"]}, parameters=[tc.Parameter("c")])
+        d = diagnose(base, tc.Recording(x=x, y=y, noise=1.0), [jump])
+        rows = [row for row in d.ranking if row.terms == ("jump",) and row.estimates and row.region]
+        ends = [e for e in rows[0].estimates if e.name.endswith(("window from", "window to"))]
+        nearest = min(ends, key=lambda e: abs(e.value - 0.3))
+        z.append((nearest.value - 0.3) / nearest.sd)
+    assert max(abs(one) for one in z) < 5

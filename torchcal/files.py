@@ -39,7 +39,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         DomainError: If the folder does not exist.
     """
     target = check_target(path)
-    handle, name = tempfile.mkstemp(prefix=target.name, suffix=".part", dir=target.parent)
+    handle, name = tempfile.mkstemp(prefix=target.name[:100], suffix=".part", dir=target.parent)
     os.close(handle)
     temporary = Path(name)
     os.umask(mask := os.umask(0o077))  # it cannot be read without being set

@@ -7,6 +7,7 @@ import os
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from torch import Tensor
 
 from torchcal.data import Recording
@@ -42,7 +43,7 @@ def plain(value: Any) -> Any:
     >>> plain({"sd": torch.tensor([0.5, torch.inf]), "spans": ((0.0, 1.0),)})
     {'sd': [0.5, None], 'spans': [[0.0, 1.0]]}
     """
-    if isinstance(value, Tensor):
+    if isinstance(value, Tensor | np.generic | np.ndarray):
         return plain(value.tolist())
     if isinstance(value, Recording):
         names = ("x", "y", "noise", "units", "outputs") if value.runs is None else ("runs", "noise", "units", "outputs")

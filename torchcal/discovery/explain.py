@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchcal.discovery.channels import Channel
 from torchcal.discovery.fitting import Fitted, fit, starts
-from torchcal.discovery.local import is_window, region_text
+from torchcal.discovery.local import WIDTH_OF_EDGE, is_window, region_text
 from torchcal.discovery.model import Model
 from torchcal.discovery.noise import estimate
 from torchcal.discovery.records import Estimate, Fit, Location, MissingRate, NeededShift, Table
@@ -30,6 +30,8 @@ __all__ = [
 #: Share of an output's evidence that counts beside an equation's.
 OUTPUT_SHARE = 0.9
 
+#: Gaps between data that an end of a window may lie in, where its edge is a step.
+GAPS = 200
 #: Share of the largest part of a direction that the data do not see from which on a parameter belongs to it.
 MIXED = 0.02
 
@@ -60,18 +62,31 @@ def estimates(found: Fitted, places: Sequence[int], window: Window | None = None
         value = float(found.values[i])
         spread = float(sd[i])
         if window is not None and not found.problem.in_time and is_window(q.name):
-            spread = min(spread, _gap(found.problem.drivers_at_data(found.values[None], None)[window.driver], value))
+            spread = _stepped_sd(found, i, window.driver, spread)
         if spread > 1e5 * max(abs(value), 1e-300):
             spread = math.inf
         result.append(Estimate(q.name, value, spread, q.unit, i in bound))
     return tuple(result)
 
 
-def _gap(driver: Tensor, value: float) -> float:
-    """Sd of a place that may lie anywhere between two data of a driver, or between 0 and the first."""
-    below, above = driver[driver <= value], driver[driver > value]
-    low = float(below.max()) if len(below) else 0.0
-    return (float(above.min()) - low) / math.sqrt(12) if len(above) else math.inf
+def _stepped_sd(found: Fitted, i: int, driver: str, spread: float) -> float:
+    """Sd of a window's end whose edge is a step, over the gaps that the misfit allows; else as the curvature says."""
+    names = [q.name for q in found.problem.parameters]
+    steps = [k for k, name in enumerate(names) if name.endswith(WIDTH_OF_EDGE)]
+    along = found.problem.drivers_at_data(found.values[None], None)[driver].unique()
+    if i in steps or not steps or float(found.values[steps[0]]) > float(along.diff().median()):
+        return spread
+    middle, gap = 0.5 * (along[1:] + along[:-1]), along.diff()
+    near = (middle - found.values[i]).abs().argsort()[:GAPS]
+    middle, gap = middle[near], gap[near]
+    rows = found.values.repeat(len(middle), 1)
+    rows[:, i] = middle
+    problem = found.problem
+    chi2 = found.whitening.vector(problem.y - problem.evaluate(rows, [])[0]).square().sum(-1).nan_to_num(nan=math.inf)
+    weight = gap * (0.5 * (chi2.min() - chi2)).exp()
+    weight = weight / weight.sum()
+    mean = float(weight @ middle)
+    return math.sqrt(float(weight @ ((middle - mean).square() + gap.square() / 12)))
 
 
 def misfit_size(found: Fitted) -> float:

@@ -232,10 +232,9 @@ def _known_together(problem: Problem, found: Minima, null: Tensor) -> tuple[str,
     Such a ridge may be bent, so that no straight step along it is free.
     """
     rows = problem.propagate.pattern.leading.nonzero()[:, 0].to(null.device)
-    if not bool((null[:, rows].abs() > 0.1).any()):
-        return ()
+    flat = (null[:, rows].abs() > SAME_MEANS).any(0)
     means = _tied(problem, found)[:, rows]
-    apart = means.amax(0) - means.amin(0) > SAME_MEANS
+    apart = flat & (means.amax(0) - means.amin(0) > SAME_MEANS)
     names = [name for name, far in zip(problem.propagate.pattern.names, apart.tolist(), strict=True) if far]
     return tuple(names) if len(names) > 1 else ()
 

@@ -14,7 +14,7 @@ class preserve_random_state:
 
     def __enter__(self) -> None:
         self._state = pyro.util.get_rng_state()  # which leaves out the accelerators, though the seed is theirs too
-        self._cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_available() else []
+        self._cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else []
         pyro.set_rng_seed(self.seed)
 
     def __exit__(self, *_: object) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchcal.data import Recording, Run
 from torchcal.data.arrays import to_tensor
-from torchcal.data.run import OUTSIDE, change, convert
+from torchcal.data.run import change, convert
 from torchcal.errors import DomainError, PropagationWarning
 from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results.base import conditions
@@ -114,7 +114,7 @@ def _blank(runs: Sequence[Run], recording: Recording) -> Recording:
                 f"{i}."
             )
     units = {**recording.units, **(recording.runs[0].units if recording.runs else {})}
-    alike = [convert(run, units, f"run {i}") for i, run in enumerate(runs)]
+    alike = [convert(change(run, outputs={}), units, f"run {i}") for i, run in enumerate(runs)]
     blank = [{name: torch.zeros_like(run.time) for name in recording.outputs} for run in alike]
     return Recording(runs=[change(run, outputs=y) for run, y in zip(alike, blank, strict=True)])
 
@@ -166,8 +166,11 @@ def _with_times(recording: Recording, where: Mapping[str, Tensor]) -> tuple[Reco
                 f"Expected times from {float(run.time[0]):.6g} on in run {r}, where it begins. Got "
                 f"{float(wanted.min()):.6g}."
             )
-        nearest = run.time[(run.time - wanted[:, None]).abs().argmin(1)]  # not a rounding beside a sample
-        wanted = torch.where((nearest - wanted).abs() <= OUTSIDE * run.time.abs().max(), nearest, wanted)
+        after = torch.searchsorted(run.time, wanted).clamp(1, len(run.time) - 1)
+        below, above = run.time[after - 1], run.time[after]
+        nearest = torch.where(wanted - below < above - wanted, below, above)  # not a rounding beside a sample
+        few = 8 * torch.finfo(torch.float64).eps * run.time.abs().max()
+        wanted = torch.where((nearest - wanted).abs() <= few, nearest, wanted)
         time = torch.unique(torch.cat([run.time, wanted]))
         inputs = run.inputs_at(time) if run.inputs else {}
         picks[chosen] = offset + torch.searchsorted(time, wanted)

@@ -185,7 +185,8 @@ class _Job:
             elif parameter.low is not None and parameter.high is not None:
                 size = torch.full_like(size, 0.5 * (parameter.high - parameter.low))
             else:
-                size = size.clamp_min(abs(parameter.initial or 0.0))
+                open_ = parameter.low is None and parameter.high is None  # it may cross 0, which is then no scale
+                size = size.clamp_min(abs(parameter.initial or 0.0) or (1.0 if open_ else 0.0))
                 size = torch.where(size > 0, size, torch.ones_like(size))
             sizes.append(size)
         return self.simulator.step * torch.stack(sizes, dim=-1)

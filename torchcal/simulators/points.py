@@ -17,7 +17,8 @@ __all__ = ["ArrayCall", "Forgiving", "PointCall", "Value", "describe_point", "fa
 Array = NDArray[np.float64]
 
 _DOMAIN = re.compile(
-    r"math domain error|expected (a (positive|nonnegative|finite|noninteger)|a number |argument value)"
+    r"math domain error|expected (a (positive|nonnegative|finite) input|a noninteger or positive integer|"
+    r"a number between -1 and 1|argument value (>|not less than) )"
 )
 """What the functions of ``math`` say outside their domain: up to Python 3.13, and since."""
 

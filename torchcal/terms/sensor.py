@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from torchcal.errors import DomainError
@@ -147,14 +148,20 @@ def _dynamic(output: str, unit: str, time: str, given: Signal) -> list[Term]:
         return given(t, s, outer(p), u)
 
     def first(s: Any, p: Any) -> Any:
+        like = next(iter(s.values()))
         try:
-            return signal(None, s, p, {})  # a run need not begin at t = 0
-        except (KeyError, TypeError, AttributeError) as error:
+            found, later = (torch.as_tensor(signal(torch.full_like(like, t), s, p, {})) for t in (0.0, 1.0))
+        except Exception as error:
             raise DomainError(
-                f"Expected the output {output!r} from states and parameters alone, to begin its lag with. It needs "
-                f"t or an input, or fails ({type(error).__name__}: {error}). Use dynamic=False to leave lag and delay "
-                "out."
+                f"Expected the output {output!r} from states and parameters alone, to begin its lag with. It fails "
+                f"without inputs ({type(error).__name__}: {error}). Use dynamic=False to leave lag and delay out."
             ) from error
+        if not torch.equal(found.nan_to_num(), later.nan_to_num()):  # a run need not begin at t = 0
+            raise DomainError(
+                f"Expected the output {output!r} from states and parameters alone, to begin its lag with. It depends "
+                "on t. Use dynamic=False to leave lag and delay out."
+            )
+        return found
 
     lag, delay = f"lag of {output}", f"delay of {output}"
     shown, slope = f"{lag}: shown", f"{delay}: slope"
