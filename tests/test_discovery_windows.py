@@ -69,6 +69,7 @@ def test_a_strong_effect_with_sharp_ends_is_named_where_it_acts(extra, driver, t
     assert d.noise.correlation["x"] < 0.15
 
 
+@pytest.mark.slow
 def test_a_kick_at_one_moment_is_no_window():
     data = recorded(lambda t, x, v: 0.0, kick=0.3)
     d = diagnose(oscillator(), data, library("quadratic drag", "cubic drag", "bias force", "cubic stiffness"))

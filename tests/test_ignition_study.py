@@ -217,6 +217,7 @@ def test_map_and_posterior_coincide_at_small_epsilon(key: str, posteriors: dict[
     assert _rms(prediction.sd_posterior) < 0.02 * _rms(prediction.sd_model_error)
 
 
+@pytest.mark.slow
 def test_densities_of_lambda_coincide_at_small_epsilon(posteriors: dict[str, Calibration], wide: Calibration) -> None:
     # Total variation distance of posterior and MAP predictive density (Fig. 12). Measured: 0.001, and 0.24 at ε = 0.01.
     assert _distance(posteriors["1a"]) < 0.01
@@ -230,6 +231,7 @@ def _distance(result: Calibration) -> float:
     return 0.5 * float((ratio - 1).abs().mean())
 
 
+@pytest.mark.slow
 def test_posterior_predictive_of_lambda_is_narrower_along_the_ridge(wide: Calibration) -> None:
     """What the paper saw at ε = 0.01, N = 11, and did not expect."""
     mean, covariance = wide.propagation_at().parameter_moments(wide.draws)

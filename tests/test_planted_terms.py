@@ -151,7 +151,7 @@ def thermal() -> Field:
             "lag of T": {"a": 1.0, "t90": 1.5},
             "delay of T": {"a": 1.0, "D": 1.0},
         },
-        ("heater gain error", "second heat capacity", "lag of T", "drift of T"),
+        ("heater gain error", "second heat capacity", "lag of T"),
         ("Newton cooling", "heater gain error"),
     )
 
@@ -276,7 +276,7 @@ def electrical() -> Field:
             "non-linear capacitance": {"a": 0.25},
             "self-heating": {"a": 0.4, "tau": 2.0},
         },
-        ("shunt", "leakage current", "dielectric absorption", "series resistance"),
+        ("shunt", "leakage current", "series resistance"),
         ("shunt",),
     )
 

@@ -30,7 +30,7 @@ from torchcal.discovery.rounds import settle, with_all
 from torchcal.discovery.search import Search
 from torchcal.discovery.several import refit_several
 from torchcal.discovery.verdict import PLAINLY_WHITE, Decision, decide
-from torchcal.errors import ConvergenceWarning, DomainError, RecordingError
+from torchcal.errors import ConvergenceWarning, DomainError, EmbeddingError, RecordingError
 from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories, free_parameters
 from torchcal.simulators.executor import check_executor
 from torchcal.terms import Term, extend
@@ -103,10 +103,11 @@ def diagnose(
     given = terms
     terms = [term for term in given if not _contains(simulator, term)]
     problem = Problem.of(simulator, recording)
-    free_parameters(problem.parameters, fixed)  # raises for what cannot be held
+    try:
+        free_parameters(problem.parameters, fixed)
+    except EmbeddingError as error:  # which says of the same that it cannot be embedded
+        raise DomainError(str(error)) from error
     free, held = base_columns(problem, fixed or {})
-    if not free:
-        raise DomainError("Expected at least one parameter to calibrate. Got all of them fixed or dormant.")
     if problem.n <= len(free):
         raise RecordingError(
             f"Expected more data than parameters to calibrate. Got {problem.n} data and {len(free)} free parameters."
