@@ -722,6 +722,7 @@ def test_one_term_need_not_be_in_a_list():
 # --- recordings as they come --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_correlated_noise():
     # A correlation of 0.6 takes much of the power: the effect is large.
     body, motion, library = pushed(0.25, phi=0.6)

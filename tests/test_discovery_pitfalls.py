@@ -122,6 +122,7 @@ def test_a_name_leaves_no_more_than_the_noise_that_is_given():
     assert d.verdict in ("unexplained", "ambiguous")
 
 
+@pytest.mark.slow
 def test_structure_that_slow_noise_explains_is_said_to_be_there():
     base, _ = decays()
     t, noise = np.linspace(0, 20, 120), np.random.default_rng(0).standard_normal(120)
