@@ -10,22 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.concealed.workers import run_all
+from torchcal.discovery.as_json import plain
 
 NUMBER = r"[-+0-9.einfa]+"
 REGION = re.compile(rf"^\s*(?:(?P<low>{NUMBER}) < )?(?P<driver>.+?)(?: (?P<sign>[<>]) (?P<end>{NUMBER}))?\s*$")
-
-
-def plain(value: Any) -> Any:
-    """Tensors, records and infinities as JSON holds them."""
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value if value is None or isinstance(value, str | int | float | bool) else str(value)
 
 
 def parse_region(text: str) -> tuple[str, float, float] | None:

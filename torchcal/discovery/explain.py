@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchcal.discovery.channels import Channel
 from torchcal.discovery.fitting import Fitted, fit, starts
-from torchcal.discovery.local import WIDTH_OF_EDGE, is_window, region_text
+from torchcal.discovery.local import ENDS, WIDTH_OF_EDGE, region_text
 from torchcal.discovery.model import Model
 from torchcal.discovery.noise import estimate
 from torchcal.discovery.records import Estimate, Fit, Location, MissingRate, NeededShift, Table
@@ -50,7 +50,7 @@ BENT = 3.0
 def estimates(found: Fitted, places: Sequence[int], window: Window | None = None) -> tuple[Estimate, ...]:
     """Estimates of some parameters. Without noise the misfit takes its place.
 
-    The end of a static window is known to the gap between two data that it lies in, where its edge is a step.
+    Where the edge of a static window is a step, its end is known by the gaps between data that it may lie in.
     """
     sd = found.sd()
     if isinstance(found.problem.recording.noise, str):
@@ -61,7 +61,7 @@ def estimates(found: Fitted, places: Sequence[int], window: Window | None = None
         q = found.problem.parameters[i]
         value = float(found.values[i])
         spread = float(sd[i])
-        if window is not None and not found.problem.in_time and is_window(q.name):
+        if window is not None and not found.problem.in_time and q.name.endswith(tuple(ENDS.values())):
             spread = _stepped_sd(found, i, window.driver, spread)
         if spread > 1e5 * max(abs(value), 1e-300):
             spread = math.inf
@@ -71,10 +71,10 @@ def estimates(found: Fitted, places: Sequence[int], window: Window | None = None
 
 def _stepped_sd(found: Fitted, i: int, driver: str, spread: float) -> float:
     """Sd of a window's end whose edge is a step, over the gaps that the misfit allows; else as the curvature says."""
-    names = [q.name for q in found.problem.parameters]
-    steps = [k for k, name in enumerate(names) if name.endswith(WIDTH_OF_EDGE)]
+    pairs = zip(found.problem.parameters, found.values.tolist(), strict=True)
+    width = next((value for q, value in pairs if q.name.endswith(WIDTH_OF_EDGE)), math.inf)
     along = found.problem.drivers_at_data(found.values[None], None)[driver].unique()
-    if i in steps or not steps or float(found.values[steps[0]]) > float(along.diff().median()):
+    if width > float(along.diff().median()):
         return spread
     middle, gap = 0.5 * (along[1:] + along[:-1]), along.diff()
     near = (middle - found.values[i]).abs().argsort()[:GAPS]

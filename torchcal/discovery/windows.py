@@ -134,22 +134,20 @@ def _refine_edges(search: Search, prior: float) -> None:
         found = [refit_window(search, w, prior, model, edge=True, span=scale) for scale in scales]
         other = max((one for one in found if one is not None), key=lambda one: one.weight, default=None)
         if other is not None and not search.problem.in_time:  # time steps are not chosen to meet a step
-            other = max(filter(None, (other, _stepped(search, other))), key=lambda one: one.weight)
+            other = max(filter(None, (other, _stepped(search, other, w.driver))), key=lambda one: one.weight)
         if other is not None and other.weight > model.weight:
             search.models.remove(model)
             _keep(search, other)
 
 
-def _stepped(search: Search, model: Model) -> Model | None:
+def _stepped(search: Search, model: Model, driver: str) -> Model | None:
     """A static local model with steps for edges, each between two of the data near the edge that was found.
 
     The misfit of a step jumps from datum to datum, and slopes lead to none of its minima.
     """
-    if model.window is None:
-        return None
     problem, values = model.candidate.problem, model.found.values
-    driver = search._drivers()[model.window.driver].unique()
-    between = 0.5 * (driver[1:] + driver[:-1])
+    along = search._drivers()[driver].unique()
+    between = 0.5 * (along[1:] + along[:-1])
     choices = []
     for q, value in zip(problem.parameters, values.tolist(), strict=True):
         if q.name.endswith(WIDTH_OF_EDGE):
@@ -161,7 +159,7 @@ def _stepped(search: Search, model: Model) -> Model | None:
     begin = torch.cartesian_prod(*choices)
     misfit = search.noise.whitening(problem).vector(problem.y - problem.evaluate(begin, [])[0]).square().sum(-1)
     begin = begin[misfit.nan_to_num(nan=torch.inf).argsort()[:STEPPED]]
-    return search._refit(model.numbers, model.candidate, begin, model.log_prior, window=model.window)
+    return _long_enough(search._refit(model.numbers, model.candidate, begin, model.log_prior, window=model.window))
 
 
 def _keep(search: Search, model: Model | None) -> None:
@@ -280,7 +278,13 @@ def refit_window(
         prior - math.log(3.0 * len(search._drivers())),
         window=dataclasses.replace(w, span=span),
     )
-    if model is None or model.window is None:
+    return _long_enough(model)
+
+
+def _long_enough(model: Model | None) -> Model | None:
+    """The model, unless its window has closed or is too short for one."""
+    if model is None or model.window is None or model.window.span is None:
         return None
+    span = model.window.span
     low, high = max(model.window.low, span.low), min(model.window.high, span.high)
     return model if high > low and Span(low, high, span.log).size >= SHORT * span.size else None

@@ -14,7 +14,7 @@ from torchcal.errors import DomainError, ShapeError, SimulatorError
 from torchcal.simulators.executor import TaskError, check_executor, run_tasks
 from torchcal.simulators.parameter import Parameter
 from torchcal.simulators.points import ArrayCall, Forgiving, PointCall, Value, failed_evaluation, raised_at
-from torchcal.simulators.static import Conditions, Simulator
+from torchcal.simulators.static import Conditions, Simulator, check_values
 
 __all__ = ["ExternalSimulator"]
 
@@ -120,11 +120,7 @@ class ExternalSimulator(Simulator):
         job = _Job(self, x, outputs)
 
         def evaluate(values: Tensor) -> Tensor:
-            if values.ndim == 0 or values.shape[-1] != len(self.names):
-                raise ShapeError(
-                    f"Expected parameter values of shape (*batch, {len(self.names)}): {', '.join(self.names)}. "
-                    f"Got {tuple(values.shape)}."
-                )
+            check_values(values, self.names)
             batch = values.shape[:-1]
             rows = values.reshape(math.prod(batch), 1, len(self.names))
             return _unflatten(_Differenced.apply(rows, job), batch)

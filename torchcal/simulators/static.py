@@ -39,6 +39,14 @@ class Linearisation:
     warm: Any = None
 
 
+def check_values(values: Tensor, names: Sequence[str]) -> None:
+    """Raise unless values are ``(*batch, d)``, one for each parameter."""
+    if values.ndim == 0 or values.shape[-1] != len(names):
+        raise ShapeError(
+            f"Expected parameter values of shape (*batch, {len(names)}): {', '.join(names)}. Got {tuple(values.shape)}."
+        )
+
+
 def check_parameters(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
     """Return the parameters as a tuple, or raise if one is not a `Parameter` or is named twice."""
     if isinstance(parameters, Parameter) or not isinstance(parameters, Iterable):
@@ -117,11 +125,7 @@ class Simulator:
         n = _length(x)
 
         def evaluate(values: Tensor) -> Tensor:
-            if values.ndim == 0 or values.shape[-1] != len(self.names):
-                raise ShapeError(
-                    f"Expected parameter values of shape (*batch, {len(self.names)}): {', '.join(self.names)}. "
-                    f"Got {tuple(values.shape)}."
-                )
+            check_values(values, self.names)
             p = {name: values[..., i : i + 1] for i, name in enumerate(self.names)}
             try:
                 result = self.function(x, p)

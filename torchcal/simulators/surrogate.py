@@ -20,7 +20,7 @@ from torchcal.errors import DomainError, ExtrapolationWarning, ShapeError, Simul
 from torchcal.simulators.design import read_npz, write_npz
 from torchcal.simulators.held_out import NUMBERS, HeldOutError
 from torchcal.simulators.parameter import Parameter, Scaling
-from torchcal.simulators.static import Conditions, Simulator
+from torchcal.simulators.static import Conditions, Simulator, check_values
 
 __all__ = ["Box", "PolynomialSurrogate", "check_box", "warned_once"]
 
@@ -151,11 +151,7 @@ class PolynomialSurrogate(Simulator):
         cast: dict[tuple[torch.dtype, torch.device], Tensor] = {}
 
         def evaluate(values: Tensor) -> Tensor:
-            if values.ndim == 0 or values.shape[-1] != len(self.names):
-                raise ShapeError(
-                    f"Expected parameter values of shape (*batch, {len(self.names)}): {', '.join(self.names)}. "
-                    f"Got {tuple(values.shape)}."
-                )
+            check_values(values, self.names)
             key = (values.dtype, values.device)
             if key not in cast:
                 cast[key] = table.T.to(values)
@@ -166,8 +162,7 @@ class PolynomialSurrogate(Simulator):
 
     def leaves_box(self, values: Tensor) -> Tensor:
         """Which parameter values ``(*batch, d)``, physical units, lie outside the box: bool ``(*batch,)``."""
-        if values.ndim == 0 or values.shape[-1] != len(self.names):
-            raise ShapeError(f"Expected values of shape (*batch, {len(self.names)}). Got {tuple(values.shape)}.")
+        check_values(values, self.names)
         eta = self.scaling.scaled(values.detach().to(torch.float64))
         return ~(eta.abs() <= 1 + _EDGE).all(-1)
 
