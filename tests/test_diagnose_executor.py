@@ -6,12 +6,14 @@ import pickle
 import threading
 import time
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from contextlib import nullcontext
 
 import pytest
 import torch
 
 import torchcal as tc
-from torchcal.errors import DomainError
+from torchcal.discovery.refits import Refit
+from torchcal.errors import ConvergenceWarning, DomainError
 from torchcal.simulators import Trajectories
 
 F64 = torch.float64
@@ -199,3 +201,53 @@ def test_what_cannot_be_sent_is_named(motion, kind, tmp_path):
     assert text.startswith("Expected a simulator and terms that can be sent to another process. Got one that cannot: ")
     assert text.endswith("Leave executor= away, or keep open files, locks and pools out of their functions.")
     assert {"lock": "_thread.lock", "file": "cannot"}[kind] in text
+
+
+# --- interrupted -----------------------------------------------------------------------------------------------
+
+
+def interrupt_after(monkeypatch, count):
+    """Ctrl-C at the refit with this number."""
+    run, seen = Refit.run, []
+
+    def interrupted(job):
+        seen.append(job)
+        if len(seen) > count:
+            raise KeyboardInterrupt
+        return run(job)
+
+    monkeypatch.setattr(Refit, "run", interrupted)
+    return seen
+
+
+@pytest.mark.parametrize("threads", [False, True])
+def test_an_interrupted_diagnosis_keeps_its_refits_and_names_nothing(motion, here, monkeypatch, threads):
+    if threads:
+        pytest.importorskip("cloudpickle")
+    seen = interrupt_after(monkeypatch, 1)
+    with (
+        ThreadPoolExecutor(1) if threads else nullcontext() as pool,
+        pytest.warns(ConvergenceWarning, match="interrupted. It keeps 1 refitted"),
+    ):
+        d = diagnose(motion, executor=pool)
+    assert len(seen) == 2
+    assert d.verdict == "ambiguous"
+    assert d.tied == [["bias force"], ["none of these"]]
+    assert d.settings["interrupted"] == "The search was interrupted before cubic stiffness had been refitted."
+    text = " ".join(str(d).split())
+    assert "As the search was interrupted, that is no name." in text
+    assert d.settings["interrupted"] in text
+    kept, whole = (next(row for row in one.ranking if row.terms == ("bias force",)) for one in (d, here))
+    assert kept.refitted
+    assert kept.misfit_removed == pytest.approx(whole.misfit_removed, rel=1e-6)
+
+
+def test_an_interruption_before_any_refit_leaves_the_screening(motion, monkeypatch):
+    interrupt_after(monkeypatch, 0)
+    with pytest.warns(ConvergenceWarning, match="It keeps 0 refitted"):
+        d = diagnose(motion)
+    assert d.verdict == "unexplained"
+    assert {row.terms for row in d.ranking if not row.refitted} >= {("bias force",), ("cubic stiffness",)}
+    assert d.settings["interrupted"].endswith("before cubic stiffness, bias force had been refitted.")
+    assert str(d).startswith("Verdict: unexplained, as far as the search went before it was interrupted")
+    assert not math.isinf(d.detection_limit[0].smallest)

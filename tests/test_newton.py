@@ -174,3 +174,16 @@ def test_what_is_not_finite_has_no_gradient():
     assert values[0] == math.inf
     assert (slopes[:2] == 0).all()
     assert slopes[2, 0] == 0.5
+
+
+def test_minima_of_one_height_are_kept_apart_where_their_places_count():
+    """A double well: whichever start is ahead by a rounding error, the other well is found too."""
+
+    def wells(u):
+        return (u[..., 0] ** 2 - 1).square() + u[..., 1].square()
+
+    starts = torch.tensor([[0.6, 0.3], [-0.6, 0.3], [0.6, -0.3], [-0.6, -0.3]], dtype=torch.float64)
+    joined = minimise(wells, starts)
+    assert len(joined.points[:, 0].sign().unique()) == 1
+    apart = minimise(wells, starts, places=torch.tensor([0]))
+    assert sorted(apart.points[:, 0].round(decimals=6).tolist()) == [-1.0, -1.0, 1.0, 1.0]

@@ -24,7 +24,7 @@ from torchcal.discovery.model import Model
 from torchcal.discovery.own_noise import explains
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.ranking import ranking
-from torchcal.discovery.records import Scores, Table
+from torchcal.discovery.records import NONE, Scores, Table
 from torchcal.discovery.result import Diagnosis
 from torchcal.discovery.rounds import settle, with_all
 from torchcal.discovery.search import Search
@@ -93,7 +93,9 @@ def diagnose(
         ConvergenceError: If the base cannot be calibrated at all.
 
     Warns:
-        ConvergenceWarning: If few starting values of the base agree, or it explains no more than a constant.
+        ConvergenceWarning: If few starting values of the base agree, or it explains no more than a constant. After
+            Ctrl-C among the refits, of which the diagnosis then keeps those that have ended: it names nothing, and says
+            what it has not refitted.
     """
     begun = time.perf_counter()
     terms = _check(simulator, recording, candidates, confidence)
@@ -142,9 +144,34 @@ def diagnose(
         if detected and terms:
             refit_several(search)
         decision = decide(search, detected, mask)
+        if search.stop.is_set():
+            _hold_back(search, decision)
         return _result(search, decision, simulator, recording, mask, confidence, begun, given, seed, suspect)
     finally:
         bar.close()
+
+
+def _hold_back(search: Search, decision: Decision) -> None:
+    """An interrupted search names nothing: what it has not refitted might explain as much."""
+    warnings.warn(
+        f"The diagnosis was interrupted. It keeps {len(search.models)} refitted hypotheses and names none of them.",
+        ConvergenceWarning,
+        stacklevel=3,
+    )
+    if decision.verdict == "named" and decision.best is not None:
+        decision.tied = [list(decision.best.names), list(NONE)]
+        decision.tied_models = [decision.best]
+        decision.verdict, decision.best = "ambiguous", None
+        decision.doubt = "As the search was interrupted, that is no name."
+
+
+def _interruption(search: Search) -> str:
+    """In words; empty where there was none."""
+    if not search.stop.is_set():
+        return ""
+    left = search.unfinished
+    missing = f"{', '.join(left)} had been refitted" if left else "several of them had been refitted together"
+    return f"The search was interrupted before {missing}."
 
 
 def _check(simulator: Any, recording: Any, candidates: Any, confidence: float) -> list[Term]:
@@ -292,6 +319,7 @@ def _result(
             "doubt": decision.doubt,
             "nearly": decision.nearly,
             "set_aside": suspect,
+            "interrupted": _interruption(search),
             "region": None if best is None else best.where,
             "solver": _solver(search.problem.simulator),
         },

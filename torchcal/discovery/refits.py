@@ -53,33 +53,30 @@ class Refit:
 
 
 def refit_all(
-    jobs: Sequence[Refit], executor: Executor | None = None, done: Callable[[int], None] = lambda index: None
-) -> list[Fitted | None]:
+    jobs: Sequence[Refit], on_result: Callable[[int, Fitted | None], None], executor: Executor | None = None
+) -> None:
     """Run all of them, in order here or spread over an executor; the results are the same.
 
     Args:
         jobs: What to fit.
+        on_result: Called with the number of each that has ended, and its fit.
         executor: Any ``concurrent.futures.Executor``, or None.
-        done: Called with the number of each that has ended.
 
     Raises:
         DomainError: If a term or the simulator cannot be sent to a worker.
         MissingDependencyError: If only cloudpickle could send it (a lambda), and it is not installed.
     """
-    results: list[Fitted | None] = [None] * len(jobs)
 
     def take(index: int, packed: bytes) -> None:
         found = pickle.loads(packed)
         if found is not None:
             found = dataclasses.replace(found, problem=jobs[index].problem, whitening=jobs[index].whitening)
-        results[index] = found
-        done(index)
+        on_result(index, found)
 
     if executor is None:
         for index, job in enumerate(jobs):
-            results[index] = job.run()
-            done(index)
-        return results
+            on_result(index, job.run())
+        return
     check_executor(executor, _run_packed)
     try:
         run_tasks(_run_packed, [_pack(job) for job in jobs], executor=executor, on_result=take)
@@ -92,7 +89,6 @@ def refit_all(
             f"{type(failure.error).__name__}: {failure.error}. Leave executor= away to refit here, or look at the "
             "worker's memory and installation."
         ) from failure.error
-    return results
 
 
 def _run_packed(packed: bytes) -> bytes:

@@ -40,14 +40,14 @@ def settle(search: Search, observed: Problem, confidence: float) -> tuple[Search
         The search, and whether there is more than noise.
     """
     detected = _refit(search, confidence)
-    apart = isolated(search) if detected else None
+    apart = isolated(search) if detected and not search.stop.is_set() else None
     if apart is not None:
         kept = search.problem.keep & ~apart
         if float(kept.sum()) >= (1 - MOST) * observed.n:
             fewer = dataclasses.replace(search, problem=observed.keeping(kept), clean=True)
             fewer.calibrate_base()
             still = _refit(fewer, confidence)
-            if outliers_alone(fewer, search, still):
+            if not search.stop.is_set() and outliers_alone(fewer, search, still):
                 search, detected = fewer, still
     return _again(search, observed, detected, confidence)
 
@@ -56,6 +56,8 @@ def _again(search: Search, observed: Problem, detected: bool, confidence: float)
     """Refit once more where others of the observed data turn out to be outliers of the best model, or noise to grow."""
     seen = [search.problem.keep]
     for _ in range(ROUNDS):
+        if search.stop.is_set():
+            break
         sticking = outliers(search, observed.keep) if detected else None
         unit = other_growth(search) if detected else None
         if sticking is not None and any(torch.equal(keep, observed.keep & ~sticking) for keep in seen):
@@ -64,10 +66,12 @@ def _again(search: Search, observed: Problem, detected: bool, confidence: float)
             break
         # Others than at the base, whose misfit hides them and looks like some; and noise that grows, or does not.
         kept = search.problem if sticking is None else observed.keeping(~sticking)
-        search = dataclasses.replace(search, problem=kept, clean=True, unit=search.unit if unit is None else unit)
-        seen.append(search.problem.keep)
-        search.calibrate_base()
-        detected = _refit(search, confidence)
+        other = dataclasses.replace(search, problem=kept, clean=True, unit=search.unit if unit is None else unit)
+        seen.append(other.problem.keep)
+        other.calibrate_base()
+        still = _refit(other, confidence)
+        if not search.stop.is_set():
+            search, detected = other, still
     return search, detected
 
 
@@ -82,6 +86,8 @@ def with_all(
     every.calibrate_base()
     every.screen_all()
     every.refit_singles()
+    if search.stop.is_set():
+        return None, ()
     odds, spare = outdone(search, every, detected)
     if odds <= EXPLAINED or spare <= 0:
         sticking = outliers(every, observed.keep)
@@ -89,6 +95,8 @@ def with_all(
             best = every.physical_leader
             return None, best.names if best is not None and odds > 0 else ()
     every, _ = _again(every, observed, _refit(every, confidence), confidence)
+    if search.stop.is_set():
+        return None, ()
     odds, spare = outdone(search, every, detected)
     return (every if odds > EXPLAINED and spare > 0 else None), ()
 
@@ -106,7 +114,7 @@ def _refit(search: Search, confidence: float) -> bool:
         elif not detected:
             alone = base_alone(search)
             detected = alone < HOPELESS or (search.p_detect < OFTEN * level and alone < level)
-        if detected and not at_once:
+        if detected and not at_once and not search.stop.is_set():
             search.models = []
             search.refit_singles()
         if detected:

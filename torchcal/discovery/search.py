@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -48,7 +49,10 @@ SAME = 0.9999
 
 @dataclass(eq=False)
 class Search:
-    """The state of a diagnosis: the base's fit, the noise, the candidates and the models refitted so far."""
+    """The state of a diagnosis: the base's fit, the noise, the candidates and the models refitted so far.
+
+    Ctrl-C among refits sets ``stop``: those that have ended stay, and no other one begins.
+    """
 
     problem: Problem
     terms: list[Term]
@@ -60,6 +64,7 @@ class Search:
     executor: Executor | None = None
     clean: bool = False
     unit: Tensor | None = None
+    stop: threading.Event = field(default_factory=threading.Event)
     base: Fitted = field(init=False)
     noise: Noise = field(init=False)
     tangents: Tangents = field(init=False)
@@ -139,6 +144,12 @@ class Search:
     def plain(self) -> dict[int, Model]:
         """Models of one term that acts everywhere, by its number."""
         return {m.numbers[0]: m for m in self.models if len(m.numbers) == 1 and m.window is None}
+
+    @property
+    def unfinished(self) -> list[str]:
+        """Candidates that an interruption has left without a fit of their own."""
+        fitted = {*self.plain, *self.merged}
+        return [c.name for i, c in enumerate(self.candidates) if self.stop.is_set() and i not in fitted]
 
     @property
     def leader(self) -> Model | None:
@@ -265,7 +276,9 @@ class Search:
         return self.refit_together([Hypothetical(numbers, candidate, begin, prior, window)])[0]
 
     def refit_together(self, wanted: Sequence[Hypothetical]) -> list[Model | None]:
-        """Refit several hypotheses, on the executor where there is one."""
+        """Refit several hypotheses, on the executor where there is one; None where no start gives a fit."""
+        if self.stop.is_set():
+            return [None] * len(wanted)
         jobs = []
         for one in wanted:
             candidate, begin = one.candidate, one.begin
@@ -277,7 +290,16 @@ class Search:
             whitening = self.noise.whitening(candidate.problem)
             jobs.append(Refit(candidate.problem, whitening, begin, candidate.free, shape, warm))
         names = [" + ".join(term.name for term in one.candidate.terms) for one in wanted]
-        found = refit_all(jobs, self.executor, lambda index: self.tick(f"refit with {names[index]}"))
+        found: list[Fitted | None] = [None] * len(jobs)
+
+        def take(index: int, fitted: Fitted | None) -> None:
+            found[index] = fitted
+            self.tick(f"refit with {names[index]}")
+
+        try:
+            refit_all(jobs, take, self.executor)
+        except KeyboardInterrupt:
+            self.stop.set()
         return [
             None if fitted is None
             else self._judge(Model(one.numbers, one.candidate, fitted, 0.0, one.prior, True, window=one.window))

@@ -46,7 +46,7 @@ def paragraph(d: Any) -> str:
         "unexplained": _unexplained,
     }[d.verdict](d)
     lines = [_headline(d), ""]
-    text = " ".join(part for part in [_detected(d), *parts, _set_aside(d)] if part)
+    text = " ".join(part for part in [_detected(d), *parts, _set_aside(d), d.settings.get("interrupted")] if part)
     lines += textwrap.wrap(text, 100)
     for title, rows in (("Equation", d.equations), ("Symptoms", d.symptoms), ("Not identified", d.identifiability)):
         if rows:
@@ -60,6 +60,8 @@ def paragraph(d: Any) -> str:
 
 
 def _headline(d: Any) -> str:
+    if d.settings.get("interrupted") and d.verdict != "ambiguous":
+        return f"Verdict: {d.verdict}, as far as the search went before it was interrupted"
     if d.verdict == "consistent":
         return "Verdict: consistent (nothing is missing that these data could show)"
     if d.verdict == "named":

@@ -118,13 +118,14 @@ def maximise(
     begin = transform.unbound(starts)
     outputs = len(problem.y)
     cost = problem.propagate.num_evaluations * outputs * begin.numel()
+    places = problem.propagate.pattern.leading.nonzero()[:, 0].to(begin.device)
     coarse = few_nodes(problem.propagate) if cost > DEAR and problem.likelihood.needs != "samples" else None
     found: Minima | None = None
     if in_time and len(begin) > 2:
         found = search(objective, problem.propagate, begin, leading, progress=show)
     elif not in_time and coarse is not None:
         found = search_with_few_nodes(
-            objective, problem.propagate, coarse, begin, outputs, alpha=coefficients, progress=show
+            objective, problem.propagate, coarse, begin, outputs, alpha=coefficients, places=places, progress=show
         )
     if found is None:
         found = minimise(
@@ -132,6 +133,7 @@ def maximise(
             begin,
             keep=MOST_KEPT if cost > DEAR else None,
             piece=pieces(problem.propagate, outputs),
+            places=places,
             progress=show,
         )
     if not bool(torch.isfinite(found.values[0])):
@@ -146,10 +148,13 @@ def maximise(
             best = coefficients(found.points[:1])
             if not problem.propagate.refine(best, tolerance=NODE_TOLERANCE if in_time else SETTLED):
                 break
-            points = found.points[: 1 if in_time else max(4, total // 4)]
-            points = torch.cat([points[:1], points[1:][(points.diff(dim=0) != 0).any(-1)]])  # those that joined, once
+            points = found.points[torch.isfinite(found.values)]
+            different = (points.diff(dim=0) != 0).any(-1)  # those that joined are one
+            points = torch.cat([points[:1], points[1:][different]])[: 1 if in_time else max(4, total // 4)]
             piece = pieces(problem.propagate, outputs)
-            found = minimise(lambda u: objective(problem.propagate, u), points, piece=piece, progress=show)
+            found = minimise(
+                lambda u: objective(problem.propagate, u), points, piece=piece, places=places, progress=show
+            )
     bar.close()
     best, ties = _first_of_the_tied(problem, found)
     if agreeing < 2 <= len(found.values):

@@ -14,8 +14,9 @@ _STEP = 1e-5
 """Central-difference step of the Hessian in scaled coordinates: gradients are good to 1e-12, so the
 Hessian is good to 1e-7 of its largest entry, and Newton steps need no more."""
 
-_SAME = 1e-8
-"""Relative difference of two objectives below which two starts are taken to be in one basin."""
+_SAME, _NEAR = 1e-8, 0.1
+"""Relative difference of two objectives, and difference of the coordinates that count, below which two starts are taken
+to be in one basin."""
 
 _ROUND = 6
 """Iterations after which the worse half of the starts is given up where they are dear."""
@@ -87,6 +88,7 @@ def minimise(
     keep: int | None = None,
     piece: int | None = None,
     curvature: Objective | None = None,
+    places: Tensor | None = None,
     progress: Callable[[int, Tensor], None] | None = None,
 ) -> Minima:
     r"""Damped Newton steps with absolute curvatures, from every start at once.
@@ -105,6 +107,8 @@ def minimise(
             is, until so many are.
         piece: Points whose objective is taken at once; all of them by default.
         curvature: A cheaper objective to take Hessians of, close to this one.
+        places: Coordinates in which two minima of the same height are two; without them one start finishes for all
+            that are equally high.
         progress: Called with the iteration and the values so far.
     """
     points = starts.detach().clone()
@@ -132,7 +136,7 @@ def minimise(
         stalls[rows] = torch.where(small, stalls[rows] + 1, 0)
         active[rows] = (stalls[rows] < 3) & (better | (stalls[rows] < 1))
         if iteration % 4 == 0:
-            join(values, active, leader)
+            join(values, active, leader, None if places is None else points[:, places])
         if keep is not None and iteration % _ROUND == 0:
             rows = active.nonzero()[:, 0]
             active[rows[values[rows].argsort()[max(keep, -(-len(rows) // 2)) :]]] = False
@@ -161,15 +165,16 @@ def directions(slope: Tensor, curvature: Tensor) -> Tensor:
     return torch.cat([steps, along[:, None] * down], dim=1)
 
 
-def join(values: Tensor, active: Tensor, leader: Tensor) -> None:
-    """Starts whose objectives agree run towards one minimum: let one of them finish for all."""
+def join(values: Tensor, active: Tensor, leader: Tensor, where: Tensor | None = None) -> None:
+    """Starts whose objectives agree, and which are near each other, run towards one minimum: let the best finish."""
     rows = active.nonzero()[:, 0]
-    rows = rows[values[rows].argsort()]
     if len(rows) < 2:
         return
-    gap = values[rows][1:] - values[rows][:-1]
-    close = gap <= _SAME * (1 + values[rows][:-1].abs())
-    same = torch.cat([torch.zeros_like(close[:1]), close])
-    first = torch.where(~same, torch.arange(len(rows), device=rows.device), 0).cummax(0).values
+    rows = rows[values[rows].argsort()]
+    here = values[rows]
+    same = here[:, None] - here <= _SAME * (1 + here.abs())
+    if where is not None:
+        same &= (where[rows][:, None] - where[rows]).abs().amax(-1) <= _NEAR
+    first = same.to(torch.uint8).argmax(1)  # of those that are as good, the best: itself where there is no better one
     leader[rows] = rows[first]
-    active[rows[same]] = False
+    active[rows[first < torch.arange(len(rows), device=rows.device)]] = False

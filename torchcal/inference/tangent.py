@@ -180,6 +180,7 @@ def search_with_few_nodes(
     outputs: int,
     *,
     alpha: Callable[[Tensor], Tensor],
+    places: Tensor,
     progress: Callable[[int, Tensor], None] | None = None,
 ) -> Minima | None:
     """Minimise with few nodes from every start, then with more of them from the best of where those ended.
@@ -195,6 +196,7 @@ def search_with_few_nodes(
         starts: ``(S, P)``.
         outputs: Number of outputs n.
         alpha: From points ``(S, P)`` to coefficients ``(S, num_alpha)``.
+        places: Columns of the means.
         progress: Called with the iteration and the values so far.
 
     Returns:
@@ -211,11 +213,12 @@ def search_with_few_nodes(
         max_iterations=30,
         tolerance=1e-6,
         piece=pieces(coarse, outputs),
+        places=places,
         progress=progress,
     )
     if not bool(torch.isfinite(rough.values[0])):
         return None
-    group = _told_apart(rough.values, alpha(rough.points)[:, propagate.pattern.leading])
+    group = _told_apart(rough.values, alpha(rough.points)[:, places])
     first = torch.stack([(group == number).nonzero()[0, 0] for number in range(int(group.max()) + 1)])
     points = rough.points[first]
     middle = coarse.copy(rule=coarse.rule_choice.size + 1)
@@ -235,7 +238,7 @@ def search_with_few_nodes(
         return None
     order = values.argsort(stable=True)
     best = order[values[order] <= values[order[0]] + _GAP]
-    same = _told_apart(values[best], alpha(points[best])[:, propagate.pattern.leading])
+    same = _told_apart(values[best], alpha(points[best])[:, places])
     for number in range(min(int(same.max()) + 1, _POLISHED)):
         rows = best[same == number]
         end = minimise(of(propagate), points[rows[:1]], piece=piece, curvature=of(middle), progress=progress)

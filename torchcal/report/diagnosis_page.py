@@ -61,6 +61,11 @@ def write(diagnosis: Any, path: str | os.PathLike[str]) -> Path:
     return target
 
 
+def _meaning(diagnosis: Any) -> str:
+    """The verdict in other words, or what an interruption left undone."""
+    return str(getattr(diagnosis, "settings", {}).get("interrupted") or MEANING.get(diagnosis.verdict, ""))
+
+
 def page(diagnosis: Any) -> str:
     """The page's text.
 
@@ -72,7 +77,7 @@ def page(diagnosis: Any) -> str:
     units = dict(diagnosis.recording.units)
     body = [
         f"<h1>{escaped(headline)}</h1>",
-        f'<p class="meaning">{escaped(MEANING.get(diagnosis.verdict, ""))}</p>',
+        f'<p class="meaning">{escaped(_meaning(diagnosis))}</p>',
         f'<p class="words">{escaped(str(diagnosis))}</p>',
         _facts(diagnosis),
         listing("Equations", _get(diagnosis, "equations")),
