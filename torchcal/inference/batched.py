@@ -45,6 +45,9 @@ _STRICT, _STRICTEST = 0.9, 0.98
 _REPEATS = 2
 """How often draws with divergences are drawn anew with smaller steps."""
 
+_FIRST = 100
+"""Draws of a chain after which a first look tells whether they are enough, and whether too many diverged."""
+
 _ENOUGH = 1.05
 """Draws that are taken over those that a wanted sample size seems to need."""
 
@@ -218,10 +221,10 @@ def run_batched(
             collector = _Collector(num_chains, len(loc), loc) if repeat else drawn
             state = moves.init(z[:num_chains], space, averaging.settled)
             judge = None if enough is None else lambda draws: enough(_alpha(draws, space, transform), owners)
-            _sample(moves, state, space, averaging.settled, collector, num_samples, judge, bar)
+            last = target_accept is not None or averaging.target >= _STRICTEST or repeat == _REPEATS
+            _sample(moves, state, space, averaging.settled, collector, num_samples, judge, bar, whatever=last)
             drawn = collector
-            few = collector.divergences <= most_divergences(collector.least * num_chains)
-            if few or target_accept is not None or averaging.target >= _STRICTEST or repeat == _REPEATS:
+            if last or not collector.too_divergent:
                 break
             # A lone divergence among thousands escapes the warm-up, which is shorter.
             bar.total += collector.least
@@ -251,14 +254,19 @@ def _sample(
     num_samples: int,
     enough: Callable[[Tensor], float] | None,
     bar: tqdm,
+    *,
+    whatever: bool,
 ) -> None:
-    """Draw until there are enough, or as many as asked for."""
-    goal = num_samples if enough is None else min(num_samples, 100)
+    """Draw until there are enough, or as many as asked for; no further where too many diverged, but ``whatever``."""
+    goal = min(num_samples, _FIRST)
     before, half, stuck = math.inf, goal, 0
     while True:
         state = collector.collect(moves, state, space, step_size, goal, bar)
-        if enough is None or goal == num_samples:
+        if goal == num_samples or (collector.too_divergent and not whatever):
             return
+        if enough is None:
+            goal = num_samples
+            continue
         more = enough(collector.draws)
         if more <= 1:
             return
@@ -400,3 +408,8 @@ class _Collector:
     def divergences(self) -> int:
         """How many of them ended a divergent trajectory."""
         return int(self.diverged[: self.least].sum())
+
+    @property
+    def too_divergent(self) -> bool:
+        """Whether these are more than chance makes of a few."""
+        return self.divergences > most_divergences(self.least * len(self.rows))
