@@ -1,11 +1,14 @@
 """Experiments that are proposed where hypotheses are tied: which there are, and when more samples are asked for."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
 import torchcal as tc
 from torchcal.discovery import experiment
 from torchcal.discovery.records import Experiment
+from torchcal.simulators import Trajectories
 
 F64 = torch.float64
 
@@ -68,3 +71,25 @@ def test_the_condition_at_which_the_models_differ_is_proposed_and_more_samples_w
     assert "dose below" in d.experiment.description
     assert ("each 4 times" in d.experiment.description) == (len(d.experiment.conditions["x"]["dose"]) == 240)
     assert d.experiment.separation > 0
+
+
+@pytest.mark.parametrize(("height", "bearable"), [(1.0, True), (0.5, False)])
+def test_an_experiment_that_a_model_does_not_bear_is_none(height, bearable):
+    """A body that falls into an attracting centre at t = 1.11 from 1.0, and at 0.39 from 0.5."""
+    fall = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"r": s["v"], "v": -p["mu"] / s["r"] ** 2},
+        states={"r": "m", "v": "m/s"},
+        parameters=[tc.Parameter("mu", low=0.1, initial=1.0)],
+        observe=("r",),
+    )
+    t = torch.linspace(0, 0.9, 10, dtype=F64)
+
+    def runs(start):
+        return tc.Recording(runs=[tc.Run(time=t, outputs={"r": torch.ones_like(t)}, initial={"r": start, "v": 0.0})])
+
+    bound = Trajectories(fall, runs(1.0))
+    model = SimpleNamespace(
+        found=SimpleNamespace(problem=SimpleNamespace(simulator=bound), values=torch.ones(1, dtype=F64))
+    )
+    noise = SimpleNamespace(sd=torch.full((10,), 0.01, dtype=F64))
+    assert experiment._bearable([model], runs(height), noise) == bearable

@@ -26,9 +26,12 @@ LEAST = 2.0
 
 #: How much larger the distance must be for a less simple experiment.
 WORTH = 1.01
+#: Solver error, in noise sd, up to which a model bears an experiment.
+SETTLED = 0.1
 
 Pair = tuple[Model, Model]
 Option = tuple[str, Recording, dict[str, Any]]
+Tried = tuple[Experiment, Recording]
 
 
 def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
@@ -37,7 +40,8 @@ def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
     Runs are repeated with other initial states, stronger or weaker inputs, or for longer; static conditions are moved
     beyond their range or gathered in a third of it. Where none separates the models well, the best is asked for with
     more samples. The predicted distance is what is left after every model's parameters have been fitted to old and new
-    data together (linearised). None where no experiment separates them by `LEAST` noise sd.
+    data together (linearised). None where no experiment separates them by `LEAST` noise sd. What one of the models does
+    not bear (an orbit that falls into its star) is no experiment.
     """
     models = models[:MOST]
     # One with a term more than another predicts what that one does, and is told from it by its cost alone.
@@ -46,12 +50,28 @@ def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
         return None
     problem = models[0].found.problem
     options = _in_time(models[0].found) if problem.in_time else _static(problem.recording)
-    best: Experiment | None = None
-    for option in options:
-        best = _better(best, option, pairs, noise)
-    if best is not None and best.separation < ENOUGH:
-        best = _better(best, _denser(best, problem.recording), pairs, noise)
-    return best if best is not None and best.separation >= LEAST else None
+    tried = [found for option in options if (found := _tried(option, pairs, noise)) is not None]
+    best = _best(tried)
+    while best is not None and best[0].separation >= LEAST and not _bearable(models, best[1], noise):
+        tried = [one for one in tried if one is not best]
+        best = _best(tried)
+    if best is not None and best[0].separation < ENOUGH:
+        denser = _tried(_denser(best[0], problem.recording), pairs, noise)
+        best = _best([best] if denser is None else [best, denser])
+    return best[0] if best is not None and best[0].separation >= LEAST else None
+
+
+def _bearable(models: Sequence[Model], recording: Recording, noise: Noise) -> bool:
+    """Whether the models' solutions in time settle there when steps are halved."""
+    for model in models:
+        simulator = model.found.problem.simulator
+        if isinstance(simulator, Trajectories):
+            bound, values = _there(model.found, simulator, recording)
+            try:
+                bound.settled(values, SETTLED * _sd(recording, noise))
+            except TorchcalError:
+                return False
+    return True
 
 
 def _holds(model: Model, other: Model) -> bool:
@@ -59,13 +79,20 @@ def _holds(model: Model, other: Model) -> bool:
     return set(other.names) < set(model.names) and other.window is None and model.window is None
 
 
-def _better(best: Experiment | None, option: Option, pairs: Sequence[Pair], noise: Noise) -> Experiment | None:
-    """The experiment with the larger predicted distance; the earlier one where it makes no difference."""
+def _tried(option: Option, pairs: Sequence[Pair], noise: Noise) -> Tried | None:
+    """An experiment in thought; None where a model cannot predict it."""
     description, recording, conditions = option
     distance = _separation(pairs, recording, noise)
-    if distance is None or (best is not None and distance < WORTH * best.separation):
-        return best
-    return Experiment(description, distance, conditions)
+    return None if distance is None else (Experiment(description, distance, conditions), recording)
+
+
+def _best(tried: Sequence[Tried]) -> Tried | None:
+    """The experiment with the largest predicted distance; an earlier one where it makes no difference."""
+    best: Tried | None = None
+    for one in tried:
+        if best is None or one[0].separation >= WORTH * best[0].separation:
+            best = one
+    return best
 
 
 def _separation(pairs: Sequence[Pair], recording: Recording, noise: Noise) -> float | None:
@@ -81,9 +108,7 @@ def _separation(pairs: Sequence[Pair], recording: Recording, noise: Noise) -> fl
             return None
         predictions.append(y)
         slopes.append(jacobian)
-    outputs = len(recording.outputs)
-    per_output = torch.stack([part[torch.isfinite(part)].median() for part in noise.sd.chunk(outputs)])
-    sd = per_output.repeat_interleave(recording.n)
+    sd = _sd(recording, noise)
     least = None
     for a, b in ((models.index(one), models.index(other)) for one, other in pairs):
         gap = (predictions[a] - predictions[b]) / sd
@@ -108,13 +133,25 @@ def _separation(pairs: Sequence[Pair], recording: Recording, noise: Noise) -> fl
     return least
 
 
+def _sd(recording: Recording, noise: Noise) -> Tensor:
+    """Of each new datum, as of the median datum of its output, ``(n_total,)``."""
+    outputs = len(recording.outputs)
+    per_output = torch.stack([part[torch.isfinite(part)].median() for part in noise.sd.chunk(outputs)])
+    return per_output.repeat_interleave(recording.n)
+
+
+def _there(found: Fitted, simulator: Trajectories, recording: Recording) -> tuple[Trajectories, Tensor]:
+    """A model at new runs, and its values; initial states are the experimenter's now: known, given in the runs."""
+    bound = simulator.bind(recording)
+    shared = {name: i for i, name in enumerate(simulator.names)}
+    return bound, torch.tensor([[_value(found, shared, name) for name in bound.names]], dtype=torch.float64)
+
+
 def _predict(found: Fitted, recording: Recording) -> tuple[Tensor, Tensor]:
     simulator = found.problem.simulator
     if isinstance(simulator, Trajectories):
-        # Initial states are the experimenter's now: known, given in the runs.
-        bound = simulator.bind(recording)
+        bound, values = _there(found, simulator, recording)
         shared = {name: i for i, name in enumerate(simulator.names)}
-        values = torch.tensor([[_value(found, shared, name) for name in bound.names]], dtype=torch.float64)
         columns = [i for i, name in enumerate(bound.names) if name in shared and shared[name] in found.free]
         result = bound.linearise(bound.x, values, recording.outputs, columns)
         jacobian = torch.zeros(result.y.shape[-1], len(found.free), dtype=torch.float64)
