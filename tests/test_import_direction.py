@@ -19,6 +19,7 @@ ROOMS = (
     "errors",
     "checks",
     "files",
+    "display",
     "data",
     "polychaos",
     "simulators",

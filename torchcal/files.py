@@ -2,8 +2,8 @@
 
 import contextlib
 import os
+import secrets
 import stat
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -39,16 +39,15 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         DomainError: If the folder does not exist.
     """
     target = check_target(path)
-    handle, name = tempfile.mkstemp(prefix=target.name[:100], suffix=".part", dir=target.parent)
-    os.close(handle)
-    temporary = Path(name)
-    os.umask(mask := os.umask(0o077))  # it cannot be read without being set
-    mode = stat.S_IMODE(target.stat().st_mode) if target.exists() else 0o666 & ~mask
+    temporary = target.with_name(f"{target.name[:100]}{secrets.token_hex(6)}.part")
+    mode = stat.S_IMODE(target.stat().st_mode) if target.exists() else None
+    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666 if mode is None else 0o600))
     try:
         yield temporary
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())  # on the disk before the old one is gone
-        temporary.chmod(mode)
+        if mode is not None:
+            temporary.chmod(mode)
         temporary.replace(target)
     finally:
         temporary.unlink(missing_ok=True)

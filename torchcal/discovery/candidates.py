@@ -12,7 +12,7 @@ from torch import Tensor
 from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.problem import Problem
 from torchcal.errors import DomainError, SimulatorError
-from torchcal.simulators import Parameter, Trajectories
+from torchcal.simulators import Parameter, Trajectories, free_parameters
 from torchcal.terms import Term, extend
 from torchcal.terms.term import neutral_of
 
@@ -77,17 +77,15 @@ class Candidate:
         return not bool((self.tangents.abs() > 0).any())
 
 
-def base_columns(problem: Problem, fixed: Mapping[str, float]) -> tuple[list[int], dict[int, float]]:
-    """Places of the base's free parameters, and values of those held."""
-    free, held = [], {}
-    for i, parameter in enumerate(problem.parameters):
-        if parameter.name in fixed:
-            held[i] = float(fixed[parameter.name])
-        elif parameter.neutral is not None:
-            held[i] = parameter.neutral
-        else:
-            free.append(i)
-    return free, held
+def base_columns(problem: Problem, fixed: Mapping[str, float] | None) -> tuple[list[int], dict[int, float]]:
+    """Places of the free parameters, and values of those held.
+
+    Raises:
+        EmbeddingError, DomainError: As `torchcal.simulators.free_parameters`.
+    """
+    free, held = free_parameters(problem.parameters, fixed)
+    place = {q.name: i for i, q in enumerate(problem.parameters)}
+    return [place[q.name] for q in free], {place[name]: value for name, value in held.items()}
 
 
 def check_repeats(problem: Problem, values: Tensor, what: str = "the simulator") -> None:

@@ -24,14 +24,15 @@ from torchcal.discovery.model import Model
 from torchcal.discovery.own_noise import explains
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.ranking import ranking
-from torchcal.discovery.records import NONE, Scores, Table
+from torchcal.discovery.records import Scores, Table
 from torchcal.discovery.result import Diagnosis
 from torchcal.discovery.rounds import settle, with_all
 from torchcal.discovery.search import Search
 from torchcal.discovery.several import refit_several
 from torchcal.discovery.verdict import PLAINLY_WHITE, Decision, decide
+from torchcal.display import NONE
 from torchcal.errors import ConvergenceWarning, DomainError, EmbeddingError, RecordingError
-from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories, free_parameters
+from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories
 from torchcal.simulators.executor import check_executor
 from torchcal.terms import Term, extend
 
@@ -106,10 +107,9 @@ def diagnose(
     terms = [term for term in given if not _contains(simulator, term)]
     problem = Problem.of(simulator, recording)
     try:
-        free_parameters(problem.parameters, fixed)
+        free, held = base_columns(problem, fixed)
     except EmbeddingError as error:  # which says of the same that it cannot be embedded
         raise DomainError(str(error)) from error
-    free, held = base_columns(problem, fixed or {})
     if problem.n <= len(free):
         raise RecordingError(
             f"Expected more data than parameters to calibrate. Got {problem.n} data and {len(free)} free parameters."
@@ -324,7 +324,7 @@ def _result(
             "solver": _solver(search.problem.simulator),
         },
         seconds=time.perf_counter() - begun,
-        drivers=search._drivers(),
+        drivers=search.drivers(),
     )
 
 

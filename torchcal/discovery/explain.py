@@ -137,7 +137,7 @@ def locate(search: Search, best: Model | None) -> Table[Location]:
     rows = []
     if best is not None and best.window is not None:
         w = best.window
-        drivers = search._drivers()[w.driver]
+        drivers = search.drivers()[w.driver]
         low = w.low if math.isfinite(w.low) else float(drivers.min())
         high = w.high if math.isfinite(w.high) else float(drivers.max())
         kind, target = _acts_on(best)

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchcal.display import DECADES
 from torchcal.simulators import Parameter
 from torchcal.terms import Term
 
@@ -18,9 +19,6 @@ __all__ = ["EDGE", "ENDS", "WIDTHS", "Span", "beyond", "force", "is_window", "lo
 EDGE, WIDTHS = 0.02, (0.004, 0.1)
 #: The narrowest of a static recording, whose ends are sought between its data: no time step has to meet them.
 STEP = 1e-4
-
-#: Ratio of the ends of a positive driver's range from which on its windows are laid out in its logarithm.
-DECADES = 30.0
 
 #: Names of the parameters of a window's ends.
 ENDS = {"from": "window from", "to": "window to"}

@@ -6,9 +6,10 @@ from torch import Tensor
 
 from torchcal.discovery import explain, verify
 from torchcal.discovery.model import PRIOR, Model
-from torchcal.discovery.records import NONE, Hypothesis, Table
+from torchcal.discovery.records import Hypothesis, Table
 from torchcal.discovery.search import Search
 from torchcal.discovery.verdict import Decision
+from torchcal.display import NONE
 
 __all__ = ["ranking"]
 

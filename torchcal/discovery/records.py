@@ -11,7 +11,6 @@ from torch import Tensor
 from torchcal.errors import MissingDependencyError
 
 __all__ = [
-    "NONE",
     "Estimate",
     "Experiment",
     "Fit",
@@ -25,9 +24,6 @@ __all__ = [
     "Scores",
     "Table",
 ]
-
-#: Terms of the hypothesis that what is missing is not in the library.
-NONE = ("none of these",)
 
 Record = TypeVar("Record")
 

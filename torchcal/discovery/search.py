@@ -209,7 +209,8 @@ class Search:
         candidate = self.candidates[int(self.screening.owner[column])]
         return candidate.amplitudes[int(self.screening.amplitude[column])]
 
-    def _drivers(self) -> dict[str, Tensor]:
+    def drivers(self) -> dict[str, Tensor]:
+        """What effects may depend on, at every datum of the calibrated base."""
         return self.base.problem.drivers(self.base.values[None], self.base.warm)
 
     def _begin(self, i: int) -> Tensor:
@@ -270,9 +271,10 @@ class Search:
                 rows.append(row)
         return torch.stack(rows)
 
-    def _refit(
+    def refit_one(
         self, numbers: tuple[int, ...], candidate: Candidate, begin: Tensor, prior: float, window: Window | None = None
     ) -> Model | None:
+        """Refit one hypothesis."""
         return self.refit_together([Hypothetical(numbers, candidate, begin, prior, window)])[0]
 
     def refit_together(self, wanted: Sequence[Hypothetical]) -> list[Model | None]:

@@ -9,9 +9,9 @@ from torchcal.discovery import explain, verify
 from torchcal.discovery.doubts import distinct, doubt, left_open
 from torchcal.discovery.model import PRIOR, Model
 from torchcal.discovery.own_noise import weigh_alone
-from torchcal.discovery.records import NONE
 from torchcal.discovery.search import Search
 from torchcal.discovery.structure import Structure
+from torchcal.display import NONE
 
 __all__ = ["Decision", "base_alone", "decide"]
 

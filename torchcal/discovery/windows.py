@@ -56,7 +56,7 @@ def refit_local(search: Search) -> None:
         if w.candidate not in same and w.z > LEAST_SCORE and w.z**2 > max(plain + 6.0, highest - 10.0):
             promising.setdefault(w.candidate, []).append(w)
     prior = math.log(PRIOR["local"] / max(len(search.candidates), 1))
-    spans = {name: Span.of(driver) for name, driver in search._drivers().items()} if promising else {}
+    spans = {name: Span.of(driver) for name, driver in search.drivers().items()} if promising else {}
     chosen = sorted((w for each in promising.values() for w in _different(each, spans)), key=lambda w: -w.z)
     for w in chosen[:MOST]:
         _keep(search, refit_window(search, w, prior))
@@ -129,7 +129,7 @@ def _refine_edges(search: Search, prior: float) -> None:
         if model.window is None or model.log_evidence < least:
             continue
         w = dataclasses.replace(model.window, amplitude=_amplitude(search, model)[2])
-        span = Span.of(search._drivers()[w.driver])
+        span = Span.of(search.drivers()[w.driver])
         scales = [span, dataclasses.replace(span, log=False)] if span.log else [span]
         found = [refit_window(search, w, prior, model, edge=True, span=scale) for scale in scales]
         other = max((one for one in found if one is not None), key=lambda one: one.weight, default=None)
@@ -146,7 +146,7 @@ def _stepped(search: Search, model: Model, driver: str) -> Model | None:
     The misfit of a step jumps from datum to datum, and slopes lead to none of its minima.
     """
     problem, values = model.candidate.problem, model.found.values
-    along = search._drivers()[driver].unique()
+    along = search.drivers()[driver].unique()
     between = 0.5 * (along[1:] + along[:-1])
     choices = []
     for q, value in zip(problem.parameters, values.tolist(), strict=True):
@@ -159,7 +159,7 @@ def _stepped(search: Search, model: Model, driver: str) -> Model | None:
     begin = torch.cartesian_prod(*choices)
     misfit = search.noise.whitening(problem).vector(problem.y - problem.evaluate(begin, [])[0]).square().sum(-1)
     begin = begin[misfit.nan_to_num(nan=torch.inf).argsort()[:STEPPED]]
-    return _long_enough(search._refit(model.numbers, model.candidate, begin, model.log_prior, window=model.window))
+    return _long_enough(search.refit_one(model.numbers, model.candidate, begin, model.log_prior, window=model.window))
 
 
 def _keep(search: Search, model: Model | None) -> None:
@@ -210,7 +210,7 @@ def _around(search: Search, model: Model) -> list[Window]:
         return []
     residual.e = residual.e + residual.tangent(value * acting[:, None])[:, 0]
     sign = plain.one_sided(search.amplitude(column))
-    named = search._drivers()
+    named = search.drivers()
     kept: dict[str, Window] = {}
     for w in sorted(windows_of(model.numbers[0], residual, response, drivers, sign)[0], key=lambda w: -w.z):
         if w.driver in named and w.driver not in kept and w.z > LEAST_SCORE:
@@ -239,7 +239,7 @@ def refit_window(
 ) -> Model | None:
     """Base and one local term, begun at the window that the screening found, from the base or near a model of it."""
     plain = search.candidates[w.candidate]
-    span = span or Span.of(search._drivers()[w.driver])
+    span = span or Span.of(search.drivers()[w.driver])
     term = plain.terms[0]
     if term.frees or not span.high > span.low:
         return None
@@ -271,11 +271,11 @@ def refit_window(
             choices.append([values.get(q.name, start)])
     begin = torch.tensor(list(itertools.product(*choices)), dtype=torch.float64)
     # Windows were searched on a grid of about 12 edges: the best of so many costs its logarithm.
-    model = search._refit(
+    model = search.refit_one(
         (w.candidate,),
         candidate,
         begin,
-        prior - math.log(3.0 * len(search._drivers())),
+        prior - math.log(3.0 * len(search.drivers())),
         window=dataclasses.replace(w, span=span),
     )
     return _long_enough(model)

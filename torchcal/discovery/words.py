@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from torchcal.discovery.channels import RUN
-from torchcal.discovery.records import NONE
+from torchcal.display import NONE, percent
 
-__all__ = ["paragraph", "percent"]
+__all__ = ["paragraph"]
 
 #: Correlation from sample to sample from which on noise is called slow.
 SLOW = 0.3
@@ -18,14 +18,9 @@ LITTLE = 0.005
 MORE = 4
 
 
-def percent(share: float) -> str:
-    """A share as text."""
-    if not math.isfinite(share):
-        return "an unknown share"
-    if 0.9995 <= share < 1:
-        return "over 99.9 %"
-    whole = 0.095 <= share < 0.995 or share < 0.001 or share >= 1
-    return f"{100 * share:.0f} %" if whole else f"{100 * share:.1f} %"
+def _share(share: float) -> str:
+    """A share in a sentence."""
+    return percent(share) if math.isfinite(share) else "an unknown share"
 
 
 def _probability(p: float) -> str:
@@ -156,12 +151,12 @@ def _where(d: Any) -> str:
     if place.driver == RUN:
         return (
             f"The mismatch sits in the {place.kind} {place.target} and differs from run to run (largest in {spans}, "
-            f"counted from 0): one change for each run removes {percent(place.share)} of the misfit beyond noise. A "
+            f"counted from 0): one change for each run removes {_share(place.share)} of the misfit beyond noise. A "
             f"parameter of the simulator with per_run=True would take it up.{_embedded(d)}"
         )
     return (
         f"The mismatch sits in the {place.kind} {place.target} and varies with {place.driver} (largest at {spans}): a "
-        f"smooth change there removes {percent(place.share)} of the misfit beyond noise.{_embedded(d)}"
+        f"smooth change there removes {_share(place.share)} of the misfit beyond noise.{_embedded(d)}"
     )
 
 
@@ -183,7 +178,7 @@ def _proof(d: Any) -> str:
         b, a = d.before.held_out, d.after.held_out
         text += (
             f"; on {b.n} data kept from both fits from {b.rmse:.4g} to {a.rmse:.4g} (log score {b.log_score:.3g} to "
-            f"{a.log_score:.3g}, 95 % intervals hold {percent(b.coverage)}, then {percent(a.coverage)})"
+            f"{a.log_score:.3g}, 95 % intervals hold {_share(b.coverage)}, then {_share(a.coverage)})"
         )
     if d.before.model_error_sd and d.after.model_error_sd is not None:
         text += (
@@ -204,7 +199,7 @@ def _named(d: Any) -> list[str]:
     probability = sum(row.probability for row in mine)
     with_others = " alone or with others" if d.tied else ""
     likely = "" if d.settings.get("nearly") else f"probability{with_others} {probability:.3f}; "
-    does = f"removes {percent(top.misfit_removed)} of the misfit beyond noise"
+    does = f"removes {_share(top.misfit_removed)} of the misfit beyond noise"
     if top.misfit_removed < LITTLE:  # the base's misfit is as large as noise, and has a shape
         does = f"lowers χ² from {d.base.chi2:.4g} to {d.final.chi2:.4g}"
     parts = [
@@ -228,7 +223,7 @@ def _named(d: Any) -> list[str]:
     if d.tied:
         parts += _larger(d)
     if d.remaining > LITTLE:
-        parts.append(f"{percent(d.remaining)} of the misfit remains unexplained.")
+        parts.append(f"{_share(d.remaining)} of the misfit remains unexplained.")
     return parts
 
 
@@ -291,7 +286,7 @@ def _unexplained(d: Any) -> list[str]:
     best = next((row for row in d.ranking if row.terms and row.refitted), None)
     if best is not None:
         parts.append(
-            f"The best of the library, {_hypothesis(d, best.terms)}, removes {percent(best.misfit_removed)} of the "
+            f"The best of the library, {_hypothesis(d, best.terms)}, removes {_share(best.misfit_removed)} of the "
             "misfit beyond noise" + (f" ({best.note})" if best.note else "") + "."
         )
     if d.settings.get("withdrawn"):

@@ -22,7 +22,7 @@ from tqdm.auto import tqdm
 
 from torchcal import embeddings, likelihoods
 from torchcal.data import Recording
-from torchcal.errors import DomainError, MissingDependencyError, RecordingError, TorchcalError, TorchcalWarning
+from torchcal.errors import DomainError, RecordingError, TorchcalError, TorchcalWarning
 from torchcal.inference.calibrate import calibrate
 from torchcal.results import Calibration, storage
 from torchcal.simulators import Simulator
@@ -263,7 +263,7 @@ class _Folder:
                         f"Expected one of torchcal.{what}s beside folder=. Got {type(item).__name__}, which cannot be "
                         "read back. Leave the folder out, and keep the results yourself."
                     )
-        self.xarray = _xarray()
+        self.xarray = storage.xarray_module()
         self.path, self.simulator = Path(folder), simulator
         self.path.mkdir(parents=True, exist_ok=True)
         bound = inspect.signature(calibrate).bind(simulator, None, **settings)
@@ -319,16 +319,6 @@ class _Folder:
                 f"Expected a result of the same inputs in {path}. Got one with another {' and '.join(other)}. Remove "
                 "it, or give another folder."
             )
-
-
-def _xarray() -> Any:
-    try:
-        import xarray
-    except ImportError as error:
-        raise MissingDependencyError(
-            "Expected xarray for folder=. It is not installed: pip install 'torchcal[arviz]'."
-        ) from error
-    return xarray
 
 
 def _text(value: Any) -> str:

@@ -9,6 +9,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from torchcal.display import percent
 from torchcal.files import check_target, replacing
 from torchcal.plots.discovery import FigurePart, figure_parts
 from torchcal.report.markup import (
@@ -19,7 +20,6 @@ from torchcal.report.markup import (
     escaped,
     figure,
     in_digits,
-    in_percent,
     in_words,
     listing,
     section,
@@ -149,9 +149,9 @@ def _facts(diagnosis: Any) -> str:
             )
         )
     if _has(diagnosis, "confidence"):
-        facts.append(("confidence", in_percent(diagnosis.confidence)))
+        facts.append(("confidence", percent(diagnosis.confidence)))
     if _has(diagnosis, "remaining"):
-        facts.append(("of the misfit beyond noise unexplained", in_percent(diagnosis.remaining)))
+        facts.append(("of the misfit beyond noise unexplained", percent(diagnosis.remaining)))
     before, after = getattr(diagnosis, "before", None), getattr(diagnosis, "after", None)
     old, new = (getattr(scores, "held_out", None) for scores in (before, after))
     if old is not None and new is not None and _accepted(diagnosis):
@@ -168,7 +168,7 @@ def _where(diagnosis: Any, units: Mapping[str, str]) -> str:
             "varies with": "time" if item.driver == "t" and "time" in units else item.driver,
             "from … to": ", ".join(f"{in_digits(low)} … {in_digits(high)}" for low, high in item.spans) or "everywhere",
             "unit": _unit(units, item.driver),
-            "share of misfit": Right(in_percent(item.share)),
+            "share of misfit": Right(percent(item.share)),
             "log evidence": Right(in_digits(item.evidence)),
         }
         for item in _get(diagnosis, "where")
@@ -197,8 +197,8 @@ def _ranking(diagnosis: Any) -> str:
             {
                 "hypothesis": " + ".join(item.terms) or "base model alone",
                 "log evidence": Right(in_digits(item.log_evidence)),
-                "probability": Right(in_percent(item.probability)),
-                "misfit removed": Right(in_percent(item.misfit_removed)),
+                "probability": Right(percent(item.probability)),
+                "misfit removed": Right(percent(item.misfit_removed)),
                 "held-out RMSE": Right(in_digits(item.held_out_rmse)),
                 "p white": Right(in_digits(item.p_white, 2)),
                 "z": Right(in_digits(item.score, 3)),
@@ -243,7 +243,7 @@ def _held_out(diagnosis: Any) -> str:
                     "model": name,
                     f"RMSE [{unit}]" if unit else "RMSE [spread]": Right(in_digits(score.rmse)),
                     "log score": Right(in_digits(score.log_score)),
-                    "coverage": Right(in_percent(score.coverage)),
+                    "coverage": Right(percent(score.coverage)),
                     "data points": Right(str(score.n)),
                     "model-error sd": Right(in_digits(getattr(scores, "model_error_sd", None))),
                 }
@@ -263,7 +263,7 @@ def _limits(diagnosis: Any) -> str:
             "smallest": Right(in_digits(item.smallest, 2)),
             "estimate": Right(in_digits(item.estimate)),
             "unit": item.unit or "",
-            "power": Right(in_percent(item.power)),
+            "power": Right(percent(item.power)),
             "remarks": item.note,
         }
         for item in _get(diagnosis, "detection_limit")

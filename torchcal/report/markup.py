@@ -13,7 +13,7 @@ from torch import Tensor
 from torchcal.plots.discovery import FigurePart
 
 __all__ = [
-    "STYLE", "Right", "bullets", "drawing", "escaped", "figure", "in_digits", "in_percent", "in_words", "listing",
+    "STYLE", "Right", "bullets", "drawing", "escaped", "figure", "in_digits", "in_words", "listing",
     "section", "table",
 ]  # fmt: skip
 
@@ -117,17 +117,6 @@ def in_digits(value: Any, digits: int = 4) -> str:
     if math.isinf(value):
         return "∞" if value > 0 else "−∞"
     return f"{value:.{digits}g}".replace("-", "−")
-
-
-def in_percent(value: Any) -> str:
-    """A share."""
-    if value is None or not math.isfinite(value):
-        return "–"
-    if 0 < value < 0.001:
-        return "<0.1 %"
-    if 0.999 < value < 1:
-        return ">99.9 %"
-    return f"{100 * value:.1f} %".replace("-", "−")
 
 
 def in_words(value: Any) -> str:

@@ -35,7 +35,8 @@ _NAME = "torchcal_name"
 """Attribute of a variable that could not be stored under its own name."""
 
 
-def _xarray() -> Any:
+def xarray_module() -> Any:
+    """xarray, or an error that says how to get it."""
     try:
         import xarray
     except ImportError as error:
@@ -196,7 +197,7 @@ def read_additive(
 
 
 def _dataset(values: Mapping[str, tuple[Any, Tensor]]) -> Any:
-    return _xarray().Dataset({name: (dims, value.numpy()) for name, (dims, value) in values.items()})
+    return xarray_module().Dataset({name: (dims, value.numpy()) for name, (dims, value) in values.items()})
 
 
 def _named_dataset(dimension: str, values: Mapping[str, Tensor]) -> Any:
@@ -207,11 +208,11 @@ def _named_dataset(dimension: str, values: Mapping[str, Tensor]) -> Any:
         while key == dimension or key in variables or (key != name and key in values):
             key += "_"
         variables[key] = (dimension, value.numpy(), {} if key == name else {_NAME: name})
-    return _xarray().Dataset(variables)
+    return xarray_module().Dataset(variables)
 
 
 def _common_groups(result: Any) -> dict[str, Any]:
-    xarray = _xarray()
+    xarray = xarray_module()
     estimate = result.map
     groups: dict[str, Any] = {}
     if result.samples is not None:
@@ -272,7 +273,7 @@ def _tree(groups: dict[str, Any], result: Any, extra: Mapping[str, Any]) -> Any:
             "runs": None if recording.runs is None else [_run_fields(run) for run in recording.runs],
         },
     }
-    tree = _xarray().DataTree.from_dict({f"/{name}": group for name, group in groups.items()})
+    tree = xarray_module().DataTree.from_dict({f"/{name}": group for name, group in groups.items()})
     tree.attrs["torchcal"] = json.dumps(meta)
     return tree
 
@@ -311,7 +312,7 @@ def _plain_fields(item: Any) -> dict[str, Any]:
 
 def _read(path: str | os.PathLike[str], kind: str) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
     try:
-        tree = _xarray().open_datatree(os.fspath(path), engine="h5netcdf")
+        tree = xarray_module().open_datatree(os.fspath(path), engine="h5netcdf")
     except (OSError, ValueError) as error:
         raise TorchcalError(f"Expected a netCDF file that torchcal wrote at {path}. Got: {error}") from error
     with tree:

@@ -263,8 +263,9 @@ class Trajectories(Simulator):
         """Outputs and their derivatives; ``warm`` is the trajectory of an earlier, nearby call.
 
         Where Newton's method does not settle from there, the trajectory is solved step by step; without ``march`` it is
-        infinite instead.
+        infinite instead. The conditions must be the recording's.
         """
+        self._check_conditions(x)
         wanted = tuple(outputs) if outputs is not None else self.recording.outputs
         values = values.detach()
         columns = list(range(values.shape[-1])) if columns is None else list(columns)

@@ -4,9 +4,10 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
+from torchcal.display import NONE, percent
 from torchcal.errors import DomainError
 from torchcal.plots import style
-from torchcal.plots.discovery.pieces import ACCEPTED, NONE, beside, draw_key, finite, join_terms, percent, plain, signed
+from torchcal.plots.discovery.pieces import ACCEPTED, beside, draw_key, finite, join_terms, plain, signed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

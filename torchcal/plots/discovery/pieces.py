@@ -10,6 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from torchcal.data import Recording
+from torchcal.display import DECADES
 from torchcal.errors import ShapeError
 from torchcal.plots import style
 
@@ -21,10 +22,8 @@ DASHES = (0, (4, 1.6))
 HELD_OUT = "#e4e4e4"  # grey (91)
 NOISE = "#d9d9d9"  # grey (87)
 LOCATED, EDGE = style.ADDITIVE_BAND, style.ADDITIVE
-NONE = ("none of these",)
 DENSE = 80  # data in one panel above which each is a dot instead of a circle
 MOST_POINTS = 2000  # drawn in one panel; more cannot be told apart
-DECADES = 30.0  # ratio of the ends of a positive driver's range from which on windows are laid out in its logarithm
 
 
 @dataclass(frozen=True)
@@ -230,16 +229,3 @@ def signed(value: float) -> str:
         return "–"
     text = f"{value:+.0f}" if abs(value) >= 1000 else f"{value:+.1f}"
     return ("0" if value == 0 else text).replace("-", "−")
-
-
-def percent(value: float) -> str:
-    """A share as text."""
-    if not math.isfinite(finite(value, math.nan)):
-        return "–"
-    if value in (0, 1):
-        return f"{100 * value:.0f} %"
-    if value < 0.001:
-        return "<0.1 %"
-    if value > 0.999:
-        return ">99.9 %"
-    return f"{100 * value:.1f} %" if value < 0.1 or value > 0.99 else f"{100 * value:.0f} %"
