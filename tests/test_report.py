@@ -108,7 +108,7 @@ def test_the_page_says_it(pages):
     best, *_ = rows = reader.rows("Ranking")
     assert best["hypothesis"] == "quadratic drag"
     assert best["log evidence"] == "312.4"
-    assert best["probability"] == "93.0 %"
+    assert best["probability"] == "93 %"
     assert best["estimates"] == "quadratic drag.c = 0.101 ± 0.004 1/m"
     assert best["remarks"] == "accepted"
     assert [row["hypothesis"] for row in rows[-2:]] == ["base model alone", "Coulomb friction"]
