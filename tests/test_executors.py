@@ -12,7 +12,7 @@ import threading
 import time
 import weakref
 from collections import Counter
-from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
 from concurrent.futures.thread import BrokenThreadPool
 from contextlib import contextmanager
 from pathlib import Path
@@ -43,6 +43,7 @@ from torchcal.errors import (
 )
 from torchcal.results import Calibration
 from torchcal.simulators import executor as executors
+from torchcal.simulators.cluster import submit
 from torchcal.simulators.executor import TaskError, run_tasks
 
 # Workers that begin in milliseconds: copies of a process that has imported everything.
@@ -341,6 +342,35 @@ def test_work_that_dask_gives_up_is_sent_again_alone(impatient, tmp_path):
     function = functools.partial(square_or_die, tmp_path, {5: "once"})
     with pytest.warns(WorkerWarning, match="died"):
         run_and_check(function, list(range(20)), tmp_path, impatient.get_executor())
+
+
+def test_a_result_that_is_lost_while_it_is_fetched_is_computed_again(client, monkeypatch):
+    """Its task, sent to another worker, fails there too: Dask's own executor then never ends the future."""
+    distributed = pytest.importorskip("distributed")
+    gather, lost = client._gather, []
+
+    async def lose_the_first(futures, *args, **options):
+        if not lost:
+            lost.extend(futures)
+            raise distributed.KilledWorker("a task", None, 1)
+        return await gather(futures, *args, **options)
+
+    monkeypatch.setattr(client, "_gather", lose_the_first)
+    values = {}
+    with pytest.warns(WorkerWarning, match="nothing is lost"):
+        run_tasks(abs, [-1, -2, -3], executor=client.get_executor(), on_result=values.__setitem__)
+    assert lost
+    assert values == {0: 1, 1: 2, 2: 3}
+
+
+def test_a_dask_executor_that_was_shut_down_is_named_and_a_cancelled_future_ends(client):
+    executor = client.get_executor()
+    future = submit(executor, time.sleep, 60)
+    assert future.cancel()
+    assert wait([future], timeout=20).done == {future}
+    executor.shutdown()
+    with pytest.raises(DomainError, match="running"):
+        run_tasks(abs, [-1], executor=executor, on_result=lambda i, value: None)
 
 
 def test_a_task_that_kills_every_dask_worker_is_named(impatient):

@@ -115,7 +115,7 @@ def test_the_page_says_it(pages):
     assert "not physical; same as x offset; sign; screened only" in [row["remarks"] for row in rows]
     assert reader.rows("Where")[0] == {
         "where": "equation v", "varies with": "v", "from … to": "−4.5 … −2.6, 2.4 … 5", "unit": "m/s",
-        "share of misfit": "81.0 %", "log evidence": "200",
+        "share of misfit": "81 %", "log evidence": "200",
     }  # fmt: skip
     assert reader.rows("Estimates") == [
         {"parameter": "k", "unit": "1/s^2", "base model": "4.02 ± 0.01", "accepted model": "4 ± 0.01"},

@@ -21,6 +21,7 @@ from concurrent.futures import (
 from typing import Any
 
 from torchcal.errors import DomainError, SimulatorError, WorkerWarning
+from torchcal.simulators.cluster import submit
 
 __all__ = ["TaskError", "check_executor", "portable", "run_tasks", "worker_died"]
 
@@ -239,7 +240,7 @@ class _Run:
         now = self.workers.now
         if not isinstance(now, ProcessPoolExecutor):
             # The label keeps Dask from answering a repeated task with the failure that it remembers.
-            return now.submit(_run_chunk, self.function, work, uuid.uuid4().hex)
+            return submit(now, _run_chunk, self.function, work, uuid.uuid4().hex)
         # Bytes: tensors that a pool pickles by itself stay in memory that is lost with a worker.
         if self.packed is None:
             self.packed = pickle.dumps(self.function)
