@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchcal.discovery.base import calibrate_base
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
-from torchcal.discovery.fitting import Fitted, refit, weighed
+from torchcal.discovery.fitting import Fitted, follow_slopes, refit, starts, weighed
 from torchcal.discovery.likeliest import Tangents, settled, with_unknown
 from torchcal.discovery.local import ENDS, is_window
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
@@ -37,6 +37,8 @@ FEW, CHANCE = 6, 0.2
 #: Shapes that a refit begins at, by their tangents; the same where the base misses the data by more than the root of
 #: `FAR` noise sd.
 SHAPES, SHAPES_FAR, FAR = 3, 8, 30.0
+#: Amplitudes tried from first guesses, as shares of the range or of the largest linear estimate.
+GUESSED = (0.1, 0.4, 0.9)
 #: Shares of the linear estimate from which refits begin.
 STEPS = (0.05, 1.0)
 #: Log evidence by which something unknown must explain the base's residual better than any noise, to be there.
@@ -190,7 +192,7 @@ class Search:
         top = self.screening.score(order[0]) if order else 0.0
         promising = [i for k, i in enumerate(order) if k < FEW or self.screening.score(i) >= CHANCE * top]
         chosen = promising[:MOST] if detected else order[:FEW]
-        wanted = [Hypothetical((i,), self.candidates[i], self._begin(i), prior) for i in [*chosen, *blind]]
+        wanted = [Hypothetical((i,), self.candidates[i], self._starts(i), prior) for i in [*chosen, *blind]]
         found = self.refit_together(wanted)
         self.failed = {one.numbers[0] for one, model in zip(wanted, found, strict=True) if model is None}
         self.models += [model for model in found if model is not None]
@@ -213,6 +215,39 @@ class Search:
         """What effects may depend on, at every datum of the calibrated base."""
         return self.base.problem.drivers(self.base.values[None], self.base.warm)
 
+    @property
+    def far(self) -> bool:
+        """Whether the base misses the data by so much that its estimates say little of the truth's."""
+        return not self.exact and self.base.chi2 > FAR * self.problem.n
+
+    def _starts(self, i: int) -> Tensor:
+        """Starting values of a candidate's refit, some of them from the base's first guesses where it is far off."""
+        begin = self._begin(i)
+        return torch.cat([begin, self._from_guesses(i, begin)]) if self.far else begin
+
+    def _from_guesses(self, i: int, begin: Tensor) -> Tensor:
+        """The base before it was bent, its initial states those recorded, with amplitudes of several sizes."""
+        candidate, base = self.candidates[i], self.base
+        guess = follow_slopes(base.problem, starts(base.problem, 1, self.seed))[0]
+        row = begin[0].clone()
+        names = [q.name for q in candidate.problem.parameters]
+        for k in base.free:
+            row[names.index(base.problem.parameters[k].name)] = guess[k]
+        rows = []
+        for place in candidate.amplitudes:
+            q = candidate.problem.parameters[place]
+            neutral = float(candidate.neutral[candidate.own.index(place)])
+            if q.low is not None and q.high is not None:
+                values = [q.low + (q.high - q.low) * share for share in GUESSED]
+            else:
+                step = float((begin[:, place] - neutral).abs().max())
+                values = [neutral + sign * factor * step for factor in GUESSED for sign in (1.0, -1.0)]
+            for value in values:
+                if q.contains(value) and value != neutral:
+                    rows.append(row.clone())
+                    rows[-1][place] = value
+        return torch.stack(rows) if rows else begin[:0]
+
     def _begin(self, i: int) -> Tensor:
         """Starting values of a candidate's refit: the linear estimate at its best shapes."""
         candidate = self.candidates[i]
@@ -222,7 +257,7 @@ class Search:
             return self._blind_begin(candidate)
         rows, used = [], set()
         # The tangents of an effect that is far from small say little of which shape it has.
-        far = not self.exact and self.base.chi2 > FAR * self.problem.n
+        far = self.far
         for column in usable[self.screening.z[usable].argsort(descending=True)].tolist():
             g = int(self.screening.shape[column])
             if g in used:

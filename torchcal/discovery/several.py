@@ -23,6 +23,8 @@ MOST, FEWER = 14, 10
 ALL = 0.99999
 #: Of them from the linear search; and the correlation of two tangents from which on they are one.
 FROM_LINEAR, NEARLY_SAME = 8, 0.999
+#: Log weight that a term's refit from where a pair ended must gain to take the place of its own.
+BETTER = 1.0
 #: Correlation of two tangents from which on a candidate is tried in the other's place beside the leading pair's.
 ALIKE = 0.9
 
@@ -56,6 +58,7 @@ def refit_several(search: Search) -> None:
         twins = _refit_sets(search, [(pair, None) for pair in _swapped(search, best) if pair not in pairs], prior)
         fitted += twins
         search.models += twins
+        _alone_again(search, best)
     if isinstance(search.problem.recording.noise, Tensor):  # else a smaller noise makes physics of any small misfit
         search.reweigh()
     if search.max_terms < 3 or not fitted:
@@ -65,6 +68,25 @@ def refit_several(search: Search) -> None:
         third = math.log(0.2 * PRIOR["several"] / (count * (count - 1) * max(count - 2, 1) / 6))
         more = [tuple(sorted((*best.numbers, j))) for j in _next_terms(search, best)[:4] if j not in best.numbers]
         search.models += _refit_sets(search, [(numbers, None) for numbers in more], third)
+
+
+def _alone_again(search: Search, pair: Model) -> None:
+    """The terms of a pair, each refitted alone from where the pair ended: from the base it may have got stuck."""
+    known = dict(zip([q.name for q in pair.candidate.problem.parameters], pair.found.values.tolist(), strict=True))
+    numbers = [i for i in pair.numbers if i not in search.gone]
+    wanted = []
+    for i in numbers:
+        candidate = search.candidates[i]
+        names = [q.name for q in candidate.problem.parameters]
+        row = candidate.begin.clone()
+        for k, name in enumerate(names):
+            row[k] = known.get(name, float(row[k]))
+        prior = math.log(PRIOR["single"] / len(search.candidates))
+        wanted.append(Hypothetical((i,), candidate, row[None], prior))
+    for i, model in zip(numbers, search.refit_together(wanted), strict=True):
+        old = search.plain.get(i)
+        if model is not None and (old is None or model.weight > old.weight + BETTER):
+            search.models = [m for m in search.models if m is not old] + [model]
 
 
 def _enough(search: Search) -> bool:
