@@ -7,7 +7,6 @@ import torch
 
 import torchcal as tc
 from torchcal.discovery import experiment
-from torchcal.discovery.records import Experiment
 from torchcal.simulators import Trajectories
 
 F64 = torch.float64
@@ -18,7 +17,7 @@ def test_denser_samples_lie_between_the_others_and_inputs_hold_as_they_did(hold)
     t = torch.tensor([0.0, 1.0, 3.0], dtype=F64)
     u = torch.tensor([1.0, 3.0, 5.0], dtype=F64)
     run = tc.Run(time=t, outputs={"x": torch.zeros(3, dtype=F64)}, inputs={"f": u}, hold=hold)
-    proposed = Experiment("a run", 1.0, {"time": t, "initial": {"x": 2.0}, "inputs": {"f": u}})
+    proposed = ("a run", tc.Recording(runs=[run]), {"time": t, "initial": {"x": 2.0}, "inputs": {"f": u}})
     text, recording, conditions = experiment._denser(proposed, tc.Recording(runs=[run]))
     assert text == "a run, sampled 4 times as densely"
     wanted = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0], dtype=F64)

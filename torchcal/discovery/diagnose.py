@@ -21,7 +21,7 @@ from torchcal.discovery.experiment import propose
 from torchcal.discovery.fitting import Fitted, starts
 from torchcal.discovery.limits import limits
 from torchcal.discovery.model import Model
-from torchcal.discovery.own_noise import explains
+from torchcal.discovery.own_noise import beside, explains
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.ranking import ranking
 from torchcal.discovery.records import Scores, Table
@@ -295,7 +295,7 @@ def _result(
         after=after,
         improved=improved,
         symptoms=explain.symptoms(search, best),
-        noise=search.noise.record(search.problem),
+        noise=(search.noise if best is None else beside(search, best)).record(search.problem),
         base=base,
         final=final,
         embedded=Table(
@@ -310,6 +310,7 @@ def _result(
         recording=recording,
         simulator=simulator,
         held_out=mask,
+        set_aside=recording.observed & ~search.problem.keep,
         p_detect=search.p_detect,
         confidence=confidence,
         library=[term.name for term in terms],

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchcal.discovery.local import force, is_window
 from torchcal.discovery.model import Model
+from torchcal.discovery.own_noise import beside
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.search import Search
 
@@ -112,7 +113,7 @@ def _noise_or_physics(search: Search, model: Model) -> str:
     Noise of unknown size that is slow is what a wrong shape leaves, too; where most of it is small, and some of it
     large, it is no noise of one size. Of a grid of conditions no correlated noise is estimated.
     """
-    noise, problem = search.noise, model.found.problem
+    noise, problem = beside(search, model), model.found.problem
     e = noise.whitening(problem).vector(model.found.residual)
     if not problem.in_time and not problem.follows and _along_rows(problem, e) > ALONG:
         return (

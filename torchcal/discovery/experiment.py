@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -31,11 +32,23 @@ SETTLED = 0.1
 
 Pair = tuple[Model, Model]
 Option = tuple[str, Recording, dict[str, Any]]
-Tried = tuple[Experiment, Recording]
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """An experiment in thought, and the predicted distance of each pair of models."""
+
+    option: Option
+    distances: list[float]
+
+    def nearest(self, told: Sequence[bool]) -> float:
+        """The smallest distance of the pairs that any experiment tells apart."""
+        return min(distance for distance, clear in zip(self.distances, told, strict=True) if clear)
 
 
 def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
-    """The experiment, among a few that anyone can do, that separates the two nearest of the models most.
+    """The experiment, among a few that anyone can do, that separates the two nearest of the models most, those aside
+    that none of them tells apart.
 
     Runs are repeated with other initial states, stronger or weaker inputs, or for longer; static conditions are moved
     beyond their range or gathered in a third of it. Where none separates the models well, the best is asked for with
@@ -50,15 +63,23 @@ def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
         return None
     problem = models[0].found.problem
     options = _in_time(models[0].found) if problem.in_time else _static(problem.recording)
-    tried = [found for option in options if (found := _tried(option, pairs, noise)) is not None]
-    best = _best(tried)
-    while best is not None and best[0].separation >= LEAST and not _bearable(models, best[1], noise):
-        tried = [one for one in tried if one is not best]
-        best = _best(tried)
-    if best is not None and best[0].separation < ENOUGH:
-        denser = _tried(_denser(best[0], problem.recording), pairs, noise)
-        best = _best([best] if denser is None else [best, denser])
-    return best[0] if best is not None and best[0].separation >= LEAST else None
+    tried = [Tried(option, found) for option in options if (found := _separations(pairs, option[1], noise)) is not None]
+    while tried:
+        told = [max(one.distances[k] for one in tried) * DENSER**0.5 >= LEAST for k in range(len(pairs))]
+        best = _best(tried, told)
+        if best is None:
+            break
+        if not _bearable(models, best.option[1], noise):
+            tried = [one for one in tried if one is not best]
+            continue
+        if best.nearest(told) < ENOUGH:
+            option = _denser(best.option, problem.recording)
+            denser = _separations(pairs, option[1], noise)
+            best = best if denser is None else _best([best, Tried(option, denser)], told) or best
+        description, _, conditions = best.option
+        untold = [(a.names, b.names) for (a, b), clear in zip(pairs, told, strict=True) if not clear]
+        return Experiment(description, best.nearest(told), conditions, untold) if best.nearest(told) >= LEAST else None
+    return None
 
 
 def _bearable(models: Sequence[Model], recording: Recording, noise: Noise) -> bool:
@@ -79,24 +100,17 @@ def _holds(model: Model, other: Model) -> bool:
     return set(other.names) < set(model.names) and other.window is None and model.window is None
 
 
-def _tried(option: Option, pairs: Sequence[Pair], noise: Noise) -> Tried | None:
-    """An experiment in thought; None where a model cannot predict it."""
-    description, recording, conditions = option
-    distance = _separation(pairs, recording, noise)
-    return None if distance is None else (Experiment(description, distance, conditions), recording)
-
-
-def _best(tried: Sequence[Tried]) -> Tried | None:
-    """The experiment with the largest predicted distance; an earlier one where it makes no difference."""
+def _best(tried: Sequence[Tried], told: Sequence[bool]) -> Tried | None:
+    """The experiment that tells the nearest of the pairs that can be told best; an earlier one where they are alike."""
     best: Tried | None = None
-    for one in tried:
-        if best is None or one[0].separation >= WORTH * best[0].separation:
+    for one in tried if any(told) else ():
+        if best is None or one.nearest(told) >= WORTH * best.nearest(told):
             best = one
     return best
 
 
-def _separation(pairs: Sequence[Pair], recording: Recording, noise: Noise) -> float | None:
-    """Smallest distance of the models of a pair at new conditions, in noise sd."""
+def _separations(pairs: Sequence[Pair], recording: Recording, noise: Noise) -> list[float] | None:
+    """Distance of the models of each pair at new conditions, in noise sd; None where a model cannot predict them."""
     models = list(dict.fromkeys(model for pair in pairs for model in pair))
     predictions, slopes = [], []
     for model in models:
@@ -109,7 +123,7 @@ def _separation(pairs: Sequence[Pair], recording: Recording, noise: Noise) -> fl
         predictions.append(y)
         slopes.append(jacobian)
     sd = _sd(recording, noise)
-    least = None
+    distances = []
     for a, b in ((models.index(one), models.index(other)) for one, other in pairs):
         gap = (predictions[a] - predictions[b]) / sd
         # Either model may move its parameters, as far as the old data allow.
@@ -128,9 +142,8 @@ def _separation(pairs: Sequence[Pair], recording: Recording, noise: Noise) -> fl
         design, target = torch.cat(rows), torch.cat(targets)
         size = design.norm(dim=0).clamp_min(1e-300)
         solution = torch.linalg.lstsq(design / size, -target, driver="gelsd").solution
-        left = float((design / size @ solution + target).norm())
-        least = left if least is None else min(least, left)
-    return least
+        distances.append(float((design / size @ solution + target).norm()))
+    return distances
 
 
 def _sd(recording: Recording, noise: Noise) -> Tensor:
@@ -241,18 +254,18 @@ def _blank(recording: Recording, x: dict[str, Tensor]) -> Recording:
     return Recording(x=x if isinstance(recording.x, dict) else x["x"], y=zeros)
 
 
-def _denser(experiment: Experiment, recording: Recording) -> Option:
+def _denser(option: Option, recording: Recording) -> Option:
     """The same with more samples: in time between the others, else of the same conditions."""
-    conditions = experiment.conditions
+    description, _, conditions = option
     if "x" in conditions:
         x = {name: values.repeat_interleave(DENSER) for name, values in conditions["x"].items()}
-        return f"{experiment.description}, each {DENSER} times", _blank(recording, x), {"x": x}
+        return f"{description}, each {DENSER} times", _blank(recording, x), {"x": x}
     run = _run(recording, conditions)
     place = torch.arange((len(run.time) - 1) * DENSER + 1, dtype=torch.float64) / DENSER
     left = place.long().clamp(max=len(run.time) - 2)
     time = run.time[left] + (place - left) * run.time.diff()[left]
     dense = {"time": time, "initial": conditions["initial"], "inputs": run.inputs_at(time)}
-    text = f"{experiment.description}, sampled {DENSER} times as densely"
+    text = f"{description}, sampled {DENSER} times as densely"
     return text, Recording(runs=[_run(recording, dense)]), dense
 
 

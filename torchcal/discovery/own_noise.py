@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "EXPLAINED",
+    "beside",
     "explains",
     "fits_by_chance",
     "isolated",
@@ -46,6 +47,8 @@ LEAST_FREE = 0.05
 LIKELIER = 3.0
 #: χ² a datum below which the noise estimated is its least, not the misfit's size: a residual so far below is rounding.
 ROUNDING = 0.01
+#: Share of the search's noise sd below which a model's own takes its place.
+OUTDATED = 0.8
 
 
 def suited(search: "Search", models: Sequence[Model]) -> Noise:
@@ -60,6 +63,14 @@ def suited(search: "Search", models: Sequence[Model]) -> Noise:
         if evidence + prior + math.log(PRIOR["none"]) > value:
             noise, value = other, evidence + prior + math.log(PRIOR["none"])
     return noise
+
+
+def beside(search: "Search", model: Model) -> Noise:
+    """The noise beside a model: its own where the search has one of a worse model, much larger, from before."""
+    if not search.noise.open:
+        return search.noise
+    own = settled(model.found, search.noise, search.tangents)[0]
+    return own if float((own.sd / search.noise.sd).median()) < OUTDATED else search.noise
 
 
 def weigh_alone(search: "Search") -> tuple[float, float]:

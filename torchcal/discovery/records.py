@@ -317,8 +317,10 @@ class Experiment:
             χ² difference).
         conditions: Ready for a new recording: in time ``{"time": (T,), "initial": {state: value}, "inputs":
             {input: (T,)}}``, otherwise ``{"x": {condition: (n,)}}``. Found for the first four tied models.
+        untold: Pairs of hypotheses, each a tuple of terms, that no simple experiment tells apart.
     """
 
     description: str
     separation: float
     conditions: dict[str, Any] = dataclasses.field(default_factory=dict, repr=False)
+    untold: list[tuple[tuple[str, ...], tuple[str, ...]]] = dataclasses.field(default_factory=list)

@@ -61,6 +61,7 @@ class Diagnosis:
         recording: The data.
         simulator: The base.
         held_out: Which outputs were held out, bool ``(n_total,)``; None where none were.
+        set_aside: Which outputs were set aside as outliers, bool ``(n_total,)``.
         p_detect: Probability of so much misfit by noise alone.
         confidence: Asked for.
         library: Names of all candidates.
@@ -95,6 +96,7 @@ class Diagnosis:
     recording: Recording
     simulator: Simulator
     held_out: Tensor | None
+    set_aside: Tensor
     p_detect: float
     confidence: float
     library: list[str]

@@ -79,8 +79,8 @@ def _alone_again(search: Search, pair: Model) -> None:
         candidate = search.candidates[i]
         names = [q.name for q in candidate.problem.parameters]
         row = candidate.begin.clone()
-        for k, name in enumerate(names):
-            row[k] = known.get(name, float(row[k]))
+        for k in candidate.free:  # what the other term frees stays neutral here
+            row[k] = known[names[k]]
         prior = math.log(PRIOR["single"] / len(search.candidates))
         wanted.append(Hypothetical((i,), candidate, row[None], prior))
     for i, model in zip(numbers, search.refit_together(wanted), strict=True):

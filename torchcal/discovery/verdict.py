@@ -39,6 +39,9 @@ LARGER, CHANCE = 1.25, 3.0
 NOTHING = 0.02
 #: Data a free parameter below which a fit without held-out data names nothing.
 LEAST_FITTED = 4
+#: Of those less likely than the base, a hypothesis is listed among the tied ones with log odds down to this against the
+#: base, and at least this probability.
+WORSE, WORTH = 1.0, 0.05
 #: Of the tied hypotheses, those that together have this probability are listed.
 TIED = 0.98
 #: Of a recording without noise, the share of the held-out misfit that a named term must remove.
@@ -151,8 +154,9 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
             continue
         if covered >= TIED and seen:
             break
-        if seen and model.weight < math.log(PRIOR["base"]):
-            break  # no better than the base is no explanation
+        behind = math.log(PRIOR["base"]) - model.weight
+        if seen and behind > 0 and (behind > WORSE or decision.probability[id(model)] < WORTH):
+            break  # clearly less likely than the base is no explanation
         seen.add(names)
         covered += groups[names]
         if any(set(tied) < names for tied in decision.tied):

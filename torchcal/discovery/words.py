@@ -14,6 +14,11 @@ __all__ = ["paragraph"]
 SLOW = 0.3
 #: Share of the misfit beyond noise below which there is hardly any to remove.
 LITTLE = 0.005
+#: Log evidence below the best place's down to which another one is told beside it.
+CLOSE = 3.0
+#: Probability from which on the base, or something unknown, is told beside tied hypotheses; and how many times as
+#: likely as the next one of these is plainly the best.
+LISTED, PLAINLY = 0.05, 3.0
 #: Hypotheses that hold a named term and more, of which the paragraph lists so many.
 MORE = 4
 
@@ -62,8 +67,16 @@ def _headline(d: Any) -> str:
     if d.verdict == "named":
         return f"Verdict: named: {_and([_with_region(d, name) for name in d.terms])}"
     if d.verdict == "ambiguous":
+        known = [tied for tied in d.tied if tuple(tied) != NONE]
+        if len(known) == 1 and _unknown(d) < LISTED:
+            return f"Verdict: ambiguous: {_hypothesis(d, known[0])}, which is not sure enough for a name"
         return "Verdict: ambiguous: " + ", or ".join(_hypothesis(d, tied) for tied in d.tied)
     return "Verdict: unexplained (something is missing that is not in this library)"
+
+
+def _unknown(d: Any) -> float:
+    """Probability of something that is not in the library."""
+    return float(sum(row.probability for row in d.ranking if row.terms == NONE))
 
 
 def _hypothesis(d: Any, terms: Sequence[str]) -> str:
@@ -95,7 +108,7 @@ def _detected(d: Any) -> str:
     text = f"Noise sd ({noise.source}): {sd}"
     correlated = [f"{name} {c:.2f}" for name, c in noise.correlation.items() if c >= 0.05]
     text += f", correlated from sample to sample ({', '.join(correlated)})" if correlated else ""
-    text += f", {noise.outliers} outliers set aside" if noise.outliers else ""
+    text += f", {noise.outliers} outlier{'s' if noise.outliers > 1 else ''} set aside" if noise.outliers else ""
     text += f". The calibrated base leaves an RMSE of {d.before.fitted.rmse:.4g}{_rmse_unit(d)}; "
     return text + f"noise alone would leave so much structure with probability {_probability(d.p_detect)}."
 
@@ -156,8 +169,16 @@ def _where(d: Any) -> str:
         )
     return (
         f"The mismatch sits in the {place.kind} {place.target} and varies with {place.driver} (largest at {spans}): a "
-        f"smooth change there removes {_share(place.share)} of the misfit beyond noise.{_embedded(d)}"
+        f"smooth change there removes {_share(place.share)} of the misfit beyond noise{_elsewhere(d)}.{_embedded(d)}"
     )
+
+
+def _elsewhere(d: Any) -> str:
+    """Where else a change would remove about as much."""
+    first = d.where[0]
+    close = [place for place in d.where[1:] if place.evidence > first.evidence - CLOSE and place.driver != RUN]
+    other = next((place for place in close if (place.kind, place.target) != (first.kind, first.target)), None)
+    return "" if other is None else f", and one of the {other.kind} {other.target} with {other.driver} about as much"
 
 
 def _embedded(d: Any) -> str:
@@ -247,14 +268,13 @@ def _larger(d: Any) -> list[str]:
 def _experiment(d: Any) -> list[str]:
     if d.experiment is None:
         return []
-    return [
-        f"What would tell them apart: {d.experiment.description} (predicted distance {d.experiment.separation:.1f} "
-        "noise sd)."
-    ]
+    text = f"What would tell them apart: {d.experiment.description} (predicted distance {d.experiment.separation:.1f} "
+    untold = [f"{_and(list(a))} from {_and(list(b))}" for a, b in d.experiment.untold]
+    return [text + "noise sd)" + (f"; no simple experiment tells {', or '.join(untold)}." if untold else ".")]
 
 
 def _ambiguous(d: Any) -> list[str]:
-    unknown = sum(row.probability for row in d.ranking if row.terms == NONE)
+    unknown = _unknown(d)
     known = [tied for tied in d.tied if tuple(tied) != NONE]
     if len(known) == 1:
         sure = sum(row.probability for row in d.ranking if set(known[0]) <= set(row.terms))
@@ -266,7 +286,18 @@ def _ambiguous(d: Any) -> list[str]:
             f"little for a name: something that is not in the library has {unknown:.2f}, other terms and the base "
             f"alone have {max(1 - sure - unknown, 0.0):.2f} together. More data, or less noise, would tell.",
         ]
-    parts = [_where(d), f"{len(known)} hypotheses explain it about as well, and these data cannot exclude any of them."]
+    shares = [sum(row.probability for row in d.ranking if set(row.terms) == set(tied)) for tied in known]
+    best = max(range(len(known)), key=lambda k: shares[k])
+    if shares[best] > PLAINLY * sorted(shares)[-2]:
+        told = f"{_hypothesis(d, known[best])} explains it best (probability {shares[best]:.2f})"
+        others = f"{len(known) - 1} other{'s' if len(known) > 2 else ''}"
+        parts = [_where(d), f"{told}; these data cannot exclude {others}."]
+    else:
+        told = f"{len(known)} hypotheses explain it about as well, and these data cannot exclude any of them."
+        parts = [_where(d), told]
+    base = sum(row.probability for row in d.ranking if not row.terms)
+    if base >= LISTED:
+        parts.append(f"The base alone has a probability of {base:.2f}.")
     shared = [name for name in known[0] if all(name in tied for tied in known)]
     if shared:
         parts.append(f"All of them have {_and(shared)}.")

@@ -156,6 +156,7 @@ def figure_parts(diagnosis: Any) -> list[FigurePart]:
         residual_map(
             recording, base, after, driver=driver, values=values, spans=spans, output=output, units=units,
             share=best.share if best is not None and spans else None, noise=diagnosis.noise,
+            set_aside=getattr(diagnosis, "set_aside", None),
             ax=fig.subplots(),
         )  # fmt: skip
 

@@ -16,6 +16,7 @@ from torchcal.plots.discovery.pieces import (
     LOCATED,
     NOISE,
     Look,
+    as_mask,
     as_numbers,
     draw_key,
     finish,
@@ -63,6 +64,7 @@ def residual_map(
     spans: Iterable[tuple[float, float]] = (),
     share: float | None = None,
     noise: Any = None,
+    set_aside: Any = None,
     output: str | None = None,
     ax: "Axes | None" = None,
     names: tuple[str, str] | None = None,
@@ -84,6 +86,7 @@ def residual_map(
         share: Share of the misfit that sits there.
         noise: Noise sd of the output, in its unit, a number or one for each condition ``(n,)``; or anything with a
             dict ``sd`` of them by output; where it is known, and by default, the recording's. Drawn as a band of ±2 sd.
+        set_aside: Mask ``(n_total,)`` of data that were taken for outliers: crosses, which no mean counts.
         output: By default the output that the base fits worst.
         ax: Where to draw; a new figure by default.
         names: What to call the two models.
@@ -120,6 +123,9 @@ def residual_map(
     ax = style.new_axes(ax)
     located = f"mismatch located here ({100 * share:.0f} % of it)" if share is not None else "mismatch located here"
     shown = np.isfinite(y[part]) & np.isfinite(x)
+    mask = as_mask(set_aside, recording)
+    aside = np.zeros_like(shown) if mask is None else mask[part] & shown
+    shown &= ~aside
     if is_log(x[shown]):
         ax.set_xscale("log")
     low, high = float(x[shown].min()), float(x[shown].max())
@@ -162,6 +168,9 @@ def residual_map(
                 centers, means, color=fit.color, ls=fit.line, lw=1.7, label=fit.name + ", local mean",
                 zorder=fit.zorder,
             )  # fmt: skip
+    if aside.any():
+        residual = (y - fits[-1].values)[part]
+        ax.plot(x[aside], residual[aside], "x", ms=5, mew=1.1, color="0.25", zorder=5, label="set aside as outliers")
     finish(ax, look.axis(driver), f"data − model, {look.axis(output)}", "")
     if legend:
         draw_key(ax)
