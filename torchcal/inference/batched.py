@@ -42,8 +42,9 @@ MOST_ELEMENTS = 2**22
 _STRICT, _STRICTEST = 0.9, 0.98
 """Mean acceptance where trajectories have diverged, at least; and from which on that is no matter of the step size."""
 
-_REPEATS = 2
-"""How often draws with divergences are drawn anew with smaller steps."""
+_REPEATS, _SHORTER = 3, 0.7
+"""How often draws with divergences are drawn anew with smaller steps, and these as a share of those before. A higher
+mean acceptance would do as well, but where few chains stand at a steep place it takes steps many times shorter."""
 
 _FIRST = 100
 """Draws of a chain after which a first look tells whether they are enough, and whether too many diverged."""
@@ -190,8 +191,8 @@ def run_batched(
         kernel: ``"nuts"`` or ``"hmc"``.
         cost: Numbers that one evaluation of one chain handles; dear densities warm up with fewer chains.
         target_accept: Mean acceptance that the step size aims at; by default `TARGET`, and more where trajectories
-            diverge at the end of the warm-up, or later (then draws are drawn anew, up to twice): a curved ridge needs
-            smaller steps than its width suggests.
+            diverge at the end of the warm-up: a curved ridge needs smaller steps than its width suggests. Where they
+            diverge later, draws are drawn anew with smaller steps, up to three times.
         max_tree_depth: Largest depth of a No-U-Turn tree, 2**depth steps.
         enough: From the draws so far, α ``(C, n, P)``, and the mode that each chain began at ``(C,)``, to the factor
             by which there must be more; at most 1 when there are enough.
@@ -216,21 +217,19 @@ def run_batched(
         space, z, averaging = _warm_up(
             moves, space, z, groups, num_warmup, averaging, bar, stricter=target_accept is None
         )
-        owners = groups[:num_chains]
+        owners, step_size = groups[:num_chains], averaging.settled
         for repeat in range(_REPEATS + 1):
             collector = _Collector(num_chains, len(loc), loc) if repeat else drawn
-            state = moves.init(z[:num_chains], space, averaging.settled)
+            state = moves.init(z[:num_chains], space, step_size)
             judge = None if enough is None else lambda draws: enough(_alpha(draws, space, transform), owners)
-            last = target_accept is not None or averaging.target >= _STRICTEST or repeat == _REPEATS
-            _sample(moves, state, space, averaging.settled, collector, num_samples, judge, bar, whatever=last)
+            last = target_accept is not None or repeat == _REPEATS
+            _sample(moves, state, space, step_size, collector, num_samples, judge, bar, whatever=last)
             drawn = collector
             if last or not collector.too_divergent:
                 break
             # A lone divergence among thousands escapes the warm-up, which is shorter.
             bar.total += collector.least
-            averaging = averaging.stricter()
-            length = max(4, round(_WINDOWS[-1] * num_warmup))
-            _, _, z, _ = _adapt(moves, space, z, averaging, length, bar, settle=True)
+            step_size *= _SHORTER
     except KeyboardInterrupt:
         if drawn.least < 4:
             raise ConvergenceError("The sampler was interrupted before it had drawn anything.") from None

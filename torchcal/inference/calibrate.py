@@ -98,7 +98,8 @@ def calibrate(
             model, chain after chain, which is the reference.
         target_accept: Mean acceptance that the step size aims at, between 0 and 1; by default 0.65 for
             ``"nuts"``, 0.8 for the others, and more where trajectories diverge: draws among which more than one in
-            10,000 diverged are drawn anew with smaller steps, up to twice (not by ``"pyro"``, nor where this is given).
+            10,000 diverged are drawn anew with smaller steps, up to three times (not by ``"pyro"``, nor where this is
+            given).
         progress: Whether to show a bar.
 
     Returns:

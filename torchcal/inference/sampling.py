@@ -175,13 +175,17 @@ def _mode(problem: Problem, mode: Laplace, started: bool) -> Mode:
 def _more(alpha: Tensor, groups: Tensor, target: float) -> float:
     """By which factor draws ``(C, n, P)`` must grow to reach a sample size and an R-hat; at most 1 if they do.
 
-    Each group ``(C,)`` of chains, those that began at one mode, is judged by itself and must reach its share of the
-    target: modes that chains never leave would otherwise keep R-hat up however long they are.
+    Where all chains together do not, each group ``(C,)`` of them, those that began at one mode, is judged by itself and
+    must reach its share of the target: modes that chains never leave would otherwise keep R-hat up however long they
+    are.
     """
     if alpha.shape[1] < 4:
         return 2.0
+    whole = _missing(figures(alpha), target)
+    if whole <= 1 or len(groups.unique()) == 1:
+        return whole
     shares = [(alpha[groups == group], float((groups == group).double().mean())) for group in groups.unique()]
-    return max(_missing(figures(chains), target * share) for chains, share in shares)
+    return min(whole, max(_missing(figures(chains), target * share) for chains, share in shares))
 
 
 def _missing(found: Figures, target: float) -> float:
