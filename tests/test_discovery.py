@@ -1083,3 +1083,50 @@ def test_arguments_of_the_wrong_kind(options):
 def test_candidates_that_are_no_sequence():
     with pytest.raises(tc.errors.DomainError):
         quiet(costly(10**9), DATA, 5)
+
+
+# --- a base that is bent far away ----------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_term_that_acts_only_near_the_true_initial_states_is_found():
+    """A drone that climbs out of the ground effect: the base moves its starts to where there is none."""
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"z": s["v"], "v": p["k"] * u["u"] - 9.81 - p["c"] * s["v"]},
+        states={"z": "m", "v": "m/s"},
+        parameters=[tc.Parameter("k", unit="m/s^2", low=0.0, initial=19.0),
+                    tc.Parameter("c", unit="1/s", low=0.0, initial=0.2)],
+        observe=("z",),
+    )  # fmt: skip
+    ground = tc.Term(
+        "ground effect",
+        equation="v",
+        rate=lambda t, s, p, u: p["k"] * u["u"] * (1 / (1 - (p["R"] / (4 * s["z"].clamp_min(0.25))) ** 2) - 1),
+        parameters=[tc.Parameter("R", unit="m", low=0.0, high=0.99)],
+    )
+    wind = tc.Term(
+        "vertical wind",
+        equation="v",
+        rate=lambda t, s, p, u: p["c"] * p["w"],
+        parameters=[tc.Parameter("w", unit="m/s")],
+    )
+    t = torch.linspace(0, 10, 80, dtype=F64)
+    heights, thrusts = (0.30, 0.28, 2.5), (0.500, 0.497, 0.495)
+    inputs = [{"u": level + 0.012 * torch.sin(1.1 * t) + 0.01 * (t > 4)} for level in thrusts]
+    runs = [
+        tc.Run(time=t, outputs={"z": torch.zeros_like(t)}, inputs=u, initial={"z": z, "v": 0.0})
+        for z, u in zip(heights, inputs, strict=True)
+    ]
+    z = simulate(extend(base, [ground]), runs, k=19.6, c=0.35, **{"ground effect__R": 0.9})["z"].reshape(3, -1)
+    recording = tc.Recording(
+        runs=[
+            tc.Run(time=t, outputs={"z": one + draw(80, 0.02, 5 + k)}, inputs=u, initial={"v": 0.0})
+            for k, (one, u) in enumerate(zip(z, inputs, strict=True))
+        ]
+    )
+    d = quiet(base, recording, [ground, wind])
+    assert d.before.fitted.rmse > 10 * 0.02
+    assert (d.verdict, d.terms) == ("named", ["ground effect"])
+    found = estimate_of(d, "ground effect.R")
+    assert abs(found.value - 0.9) < 4 * found.sd
+    assert d.noise.sd["z"] == pytest.approx(0.02, rel=0.2)

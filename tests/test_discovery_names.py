@@ -128,6 +128,39 @@ def test_a_term_that_gives_an_output_anew_loses_nothing_of_others(order):
     ]
 
 
+def test_a_term_tried_alone_where_a_pair_ended_leaves_what_the_other_frees():
+    """An isotherm of another exponent, with an uptake in proportion beside it: neither alone is what both are."""
+    rng = np.random.default_rng(3)
+    pressure, temperature = (
+        torch.as_tensor(v.ravel()) for v in np.meshgrid(np.geomspace(0.03, 20, 22), [280.0, 300.0, 320.0])
+    )
+
+    def langmuir(x, p):
+        z = (p["b"] * torch.exp(p["E"] * (1 / x["T"] - 1 / 300)) * x["P"]) ** p["n"]
+        return {"q": p["qm"] * z / (1 + z)}
+
+    simulator = tc.Simulator(
+        langmuir,
+        [
+            tc.Parameter("qm", low=0.0, high=20.0, initial=3.0),
+            tc.Parameter("b", low=1e-3, high=50.0, initial=1.0),
+            tc.Parameter("E", low=0.0, high=8000.0, initial=2000.0),
+            tc.Parameter("n", low=0.3, high=2.0, neutral=1.0),
+        ],
+    )
+    x = {"P": pressure, "T": temperature}
+    truth = langmuir(x, {"qm": 3.1, "b": 0.8, "E": 2200.0, "n": 0.8})["q"] + 0.02 * pressure
+    recording = tc.Recording(x=x, y={"q": truth + 0.03 * torch.as_tensor(rng.standard_normal(66))}, noise=0.03)
+    sips = tc.Term("Sips", frees=("n",))
+    henry = tc.Term(
+        "Henry", outputs={"q": lambda x, p, y: y + p["h"] * x["P"]}, parameters=[tc.Parameter("h", low=0.0)]
+    )
+    d = tc.diagnose(simulator, recording, [sips, henry], seed=0, progress=False)
+    alone = {row.terms: row.log_evidence for row in d.ranking if row.refitted}
+    assert (d.verdict, set(d.terms)) == ("named", {"Sips", "Henry"})
+    assert alone[("Henry",)] < alone[tuple(sorted(d.terms, reverse=True))] - 10
+
+
 # --- doubts --------------------------------------------------------------------------------------------------------
 
 
