@@ -739,6 +739,7 @@ def test_outliers_are_set_aside():
     x[[15, 40, 77]] += torch.tensor([0.6, -0.5, 0.8], dtype=F64)
     for noise in (None, 0.02):
         d = quiet(body, tc.Recording(runs=[run_of(x)], noise=noise), library)
+        assert d.set_aside.nonzero()[:, 0].tolist() == [15, 40, 77]
         assert d.noise.outliers == 3
         assert d.terms == ["bias force"]
     null = pushed(0.0)[1].y.clone()

@@ -330,6 +330,21 @@ def test_residuals_are_data_minus_model_against_the_driver():
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [min]", "data − model, y [°C]")
 
 
+def test_data_set_aside_are_crosses_that_no_mean_counts():
+    x = torch.linspace(0, 1, 100, dtype=torch.float64)
+    y = torch.zeros_like(x)
+    y[50] = 9.0
+    recording = Recording(x=x, y=y)
+    aside = torch.zeros(100, dtype=torch.bool)
+    aside[50] = True
+    ax = plots.residual_map(recording, torch.zeros_like(y), set_aside=aside)
+    crosses = curve(ax, "set aside as outliers")
+    assert (crosses.get_xdata().tolist(), crosses.get_ydata().tolist()) == ([float(x[50])], [9.0])
+    assert np.abs(curve(ax, "base model, local mean").get_ydata()).max() == 0.0
+    with pytest.raises(ShapeError, match="mask"):
+        plots.residual_map(recording, torch.zeros_like(y), set_aside=aside[:3])
+
+
 def test_a_detailed_simulation_has_no_noise_band():
     d = cooling()
     told = plots.residual_map(d.recording, d.base, noise=NoiseModel({"y": 0.1}, {"y": 0.0}, "estimated"))
