@@ -239,6 +239,7 @@ def test_an_interrupted_diagnosis_keeps_its_refits_and_names_nothing(motion, her
     assert d.settings["interrupted"] in text
     kept, whole = (next(row for row in one.ranking if row.terms == ("bias force",)) for one in (d, here))
     assert kept.refitted
+    assert "no fit" not in "".join(row.note for row in d.ranking)
     assert kept.misfit_removed == pytest.approx(whole.misfit_removed, rel=1e-6)
 
 
@@ -251,3 +252,13 @@ def test_an_interruption_before_any_refit_leaves_the_screening(motion, monkeypat
     assert d.settings["interrupted"].endswith("before cubic stiffness, bias force had been refitted.")
     assert str(d).startswith("Verdict: unexplained, as far as the search went before it was interrupted")
     assert not math.isinf(d.detection_limit[0].smallest)
+
+
+def test_an_interruption_among_pairs_names_no_single_term_as_missing(motion, monkeypatch):
+    terms = [term for term in tc.terms.mechanics() if term.name in ("cubic stiffness", "bias force", "linear drag")]
+    interrupt_after(monkeypatch, 2)
+    with pytest.warns(ConvergenceWarning, match="It keeps 2 refitted"):
+        d = diagnose(motion, terms)
+    assert d.settings["interrupted"] == (
+        "The search was interrupted before several of them had been refitted together."
+    )

@@ -92,3 +92,37 @@ def test_an_experiment_that_a_model_does_not_bear_is_none(height, bearable):
     )
     noise = SimpleNamespace(sd=torch.full((10,), 0.01, dtype=F64))
     assert experiment._bearable([model], runs(height), noise) == bearable
+
+
+def test_pairs_that_nothing_tells_apart_are_left_aside_and_said(monkeypatch):
+    """Of three models two are alike: 1.5 sd, and 1.9 with more samples. The third is told from both."""
+    models = [SimpleNamespace(names=(name,), where=None, window=None) for name in "abc"]
+    recording = tc.Recording(x={"x": torch.linspace(0, 1, 9, dtype=F64)}, y=torch.zeros(9, dtype=F64))
+    for model in models:
+        model.found = SimpleNamespace(problem=SimpleNamespace(in_time=False, recording=recording, simulator=None))
+    monkeypatch.setattr(
+        experiment, "_separations", lambda pairs, new, noise: [1.5, 50.0, 40.0] if new.n == 9 else [1.9, 99.0, 98.0]
+    )
+    found = experiment.propose(models, SimpleNamespace())
+    assert found.separation == 40.0
+    assert found.untold == [("a", "b")]
+    monkeypatch.setattr(experiment, "_separations", lambda pairs, new, noise: [0.1, 0.2, 0.3])
+    assert experiment.propose(models, SimpleNamespace()) is None
+
+
+def test_a_solution_that_blows_up_is_not_bearable():
+    growth = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"r": p["a"] * s["r"] ** 2},
+        states={"r": "m"},
+        parameters=[tc.Parameter("a", low=0.1, initial=1.0)],
+        observe=("r",),
+    )
+    t = torch.linspace(0, 1.02, 10, dtype=F64)
+    blank = tc.Recording(runs=[tc.Run(time=t, outputs={"r": torch.ones_like(t)}, initial={"r": 1.0})])
+    model = SimpleNamespace(
+        found=SimpleNamespace(
+            problem=SimpleNamespace(simulator=Trajectories(growth, blank)), values=torch.ones(1, dtype=F64)
+        )
+    )
+    noise = SimpleNamespace(sd=torch.full((10,), 0.01, dtype=F64))
+    assert not experiment._bearable([model], blank, noise)

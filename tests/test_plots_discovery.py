@@ -343,6 +343,12 @@ def test_data_set_aside_are_crosses_that_no_mean_counts():
     assert np.abs(curve(ax, "base model, local mean").get_ydata()).max() == 0.0
     with pytest.raises(ShapeError, match="mask"):
         plots.residual_map(recording, torch.zeros_like(y), set_aside=aside[:3])
+    two = Recording(x=x, y={"a": torch.sin(9 * x), "b": y})
+    mask = torch.cat([torch.zeros_like(aside), aside])
+    fitted = torch.zeros(200, dtype=torch.float64)
+    assert "a" in plots.residual_map(two, fitted, set_aside=mask).get_ylabel()  # b is fitted exactly but for that
+    every = torch.cat([torch.zeros_like(aside), torch.ones_like(aside)])
+    assert plots.residual_map(two, fitted, set_aside=every, output="b", noise=0.1) is not None
 
 
 def test_a_detailed_simulation_has_no_noise_band():

@@ -136,12 +136,13 @@ def diagnose(
             mask = verify.within(recording)
         search, detected = settle(search, problem, confidence)
         suspect: tuple[str, ...] = ()
-        if terms and search.problem.n < problem.n and not (detected and explains(search)):
+        aside = search.problem.n < problem.n and not search.stop.is_set()
+        if terms and aside and not (detected and explains(search)):
             # What the best model misses is no outlier of it; where there is none, all physics may have been set aside.
             every, suspect = with_all(search, problem, detected, confidence)
             if every is not None:
                 search, detected = every, True
-        if detected and terms:
+        if detected and terms and not search.stop.is_set():
             refit_several(search)
         decision = decide(search, detected, mask)
         if search.stop.is_set():

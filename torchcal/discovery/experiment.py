@@ -64,8 +64,12 @@ def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
     problem = models[0].found.problem
     options = _in_time(models[0].found) if problem.in_time else _static(problem.recording)
     tried = [Tried(option, found) for option in options if (found := _separations(pairs, option[1], noise)) is not None]
+    hopeless: set[int] = set()
     while tried:
-        told = [max(one.distances[k] for one in tried) * DENSER**0.5 >= LEAST for k in range(len(pairs))]
+        told = [
+            k not in hopeless and max(one.distances[k] for one in tried) * DENSER**0.5 >= LEAST
+            for k in range(len(pairs))
+        ]
         best = _best(tried, told)
         if best is None:
             break
@@ -76,21 +80,31 @@ def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
             option = _denser(best.option, problem.recording)
             denser = _separations(pairs, option[1], noise)
             best = best if denser is None else _best([best, Tried(option, denser)], told) or best
+        if best.nearest(told) < LEAST:
+            hopeless.add(min((k for k, clear in enumerate(told) if clear), key=best.distances.__getitem__))
+            continue
         description, _, conditions = best.option
-        untold = [(a.names, b.names) for (a, b), clear in zip(pairs, told, strict=True) if not clear]
-        return Experiment(description, best.nearest(told), conditions, untold) if best.nearest(told) >= LEAST else None
+        untold = [(_called(a), _called(b)) for (a, b), clear in zip(pairs, told, strict=True) if not clear]
+        return Experiment(description, best.nearest(told), conditions, untold)
     return None
 
 
+def _called(model: Model) -> str:
+    """A model's terms, and where they act."""
+    return " with ".join(model.names) + (f" where {model.where}" if model.where else "")
+
+
 def _bearable(models: Sequence[Model], recording: Recording, noise: Noise) -> bool:
-    """Whether the models' solutions in time settle there when steps are halved."""
+    """Whether the models' solutions in time settle there when steps are halved, and do not blow up."""
     for model in models:
         simulator = model.found.problem.simulator
         if isinstance(simulator, Trajectories):
             bound, values = _there(model.found, simulator, recording)
             try:
-                bound.settled(values, SETTLED * _sd(recording, noise))
+                settled = bound.settled(values, SETTLED * _sd(recording, noise))
             except TorchcalError:
+                return False
+            if not bool(torch.isfinite(settled.outputs_of(values, settled.solve(values))).all()):
                 return False
     return True
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchcal.discovery.problem import Problem, Whitening
 from torchcal.simulators import Trajectories
 
-__all__ = ["Fitted", "fit", "starts"]
+__all__ = ["Fitted", "fit", "follow_slopes", "refit", "starts", "weighed"]
 
 #: Relative change of χ² below which a fit has converged.
 TOLERANCE = 1e-7

@@ -313,14 +313,14 @@ class Experiment:
 
     Attributes:
         description: In words.
-        separation: Predicted distance of the two nearest tied models there, in noise sd (root of the expected
-            χ² difference).
+        separation: Predicted distance of the two nearest tied models of those that it tells apart, in noise sd (root
+            of the expected χ² difference).
         conditions: Ready for a new recording: in time ``{"time": (T,), "initial": {state: value}, "inputs":
             {input: (T,)}}``, otherwise ``{"x": {condition: (n,)}}``. Found for the first four tied models.
-        untold: Pairs of hypotheses, each a tuple of terms, that no simple experiment tells apart.
+        untold: Pairs of hypotheses that no simple experiment tells apart.
     """
 
     description: str
     separation: float
     conditions: dict[str, Any] = dataclasses.field(default_factory=dict, repr=False)
-    untold: list[tuple[tuple[str, ...], tuple[str, ...]]] = dataclasses.field(default_factory=list)
+    untold: list[tuple[str, str]] = dataclasses.field(default_factory=list)

@@ -115,8 +115,11 @@ def _refit(search: Search, confidence: float) -> bool:
             alone = base_alone(search)
             detected = alone < HOPELESS or (search.p_detect < OFTEN * level and alone < level)
         if detected and not at_once and not search.stop.is_set():
-            search.models = []
+            before, search.models = search.models, []
             search.refit_singles()
-        if detected:
+            again = {model.numbers for model in search.models}
+            search.models += [model for model in before if search.stop.is_set() and model.numbers not in again]
+            search.left -= {i for model in before for i in model.numbers}
+        if detected and not search.stop.is_set():
             refit_local(search)
     return detected

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.base import calibrate_base
-from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
+from torchcal.discovery.candidates import Candidate, base_columns, drivers_scale, prepare
 from torchcal.discovery.fitting import Fitted, follow_slopes, refit, starts, weighed
 from torchcal.discovery.likeliest import Tangents, settled, with_unknown
 from torchcal.discovery.local import ENDS, is_window
@@ -81,6 +81,7 @@ class Search:
     twins: dict[int, int] = field(init=False, default_factory=dict)
     gone: set[int] = field(init=False, default_factory=set)
     failed: set[int] = field(init=False, default_factory=set)
+    left: set[int] = field(init=False, default_factory=set)
     p_detect: float = field(init=False, default=1.0)
     least: Tensor = field(init=False)
     _unknown: dict[int, tuple[Fitted, tuple[Noise, float]]] = field(init=False, default_factory=dict)
@@ -150,8 +151,7 @@ class Search:
     @property
     def unfinished(self) -> list[str]:
         """Candidates that an interruption has left without a fit of their own."""
-        fitted = {*self.plain, *self.merged}
-        return [c.name for i, c in enumerate(self.candidates) if self.stop.is_set() and i not in fitted]
+        return [self.candidates[i].name for i in sorted(self.left)]
 
     @property
     def leader(self) -> Model | None:
@@ -162,6 +162,11 @@ class Search:
     def physical_leader(self) -> Model | None:
         """The physical model with the most weight, where there is any."""
         return max((model for model in self.models if model.physical), key=lambda model: model.weight, default=None)
+
+    @property
+    def prior(self) -> float:
+        """Log prior odds of a single term that acts everywhere."""
+        return math.log(PRIOR["single"] / max(len(self.candidates), 1))
 
     def merge(self) -> None:
         """Candidates whose tangents and refits cannot be told apart become one hypothesis, under the first name."""
@@ -186,7 +191,7 @@ class Search:
     def refit_singles(self, *, detected: bool = True) -> None:
         """Every candidate that the screening leaves a chance; where nothing was detected only the leading few."""
         count = len(self.candidates)
-        prior = math.log(PRIOR["single"] / max(count, 1))
+        prior = self.prior
         blind = [i for i in range(count) if self.screening.best[i] < 0 and self.candidates[i].blind]
         order = sorted((i for i in range(count) if self.screening.best[i] >= 0), key=lambda i: -self.screening.score(i))
         top = self.screening.score(order[0]) if order else 0.0
@@ -194,7 +199,9 @@ class Search:
         chosen = promising[:MOST] if detected else order[:FEW]
         wanted = [Hypothetical((i,), self.candidates[i], self._starts(i), prior) for i in [*chosen, *blind]]
         found = self.refit_together(wanted)
-        self.failed = {one.numbers[0] for one, model in zip(wanted, found, strict=True) if model is None}
+        none = {one.numbers[0] for one, model in zip(wanted, found, strict=True) if model is None}
+        self.left = none if self.stop.is_set() else set()
+        self.failed = none - self.left
         self.models += [model for model in found if model is not None]
         self.reweigh()
         self.merge()
@@ -228,8 +235,12 @@ class Search:
     def _from_guesses(self, i: int, begin: Tensor) -> Tensor:
         """The base before it was bent, its initial states those recorded, with amplitudes of several sizes."""
         candidate, base = self.candidates[i], self.base
-        guess = follow_slopes(base.problem, starts(base.problem, 1, self.seed))[0]
+        held = base_columns(base.problem, self.fixed)[1]
+        guess = follow_slopes(base.problem, starts(base.problem, 1, self.seed, held))[0]
         row = begin[0].clone()
+        row[candidate.amplitudes] = torch.tensor(
+            [float(candidate.neutral[candidate.own.index(place)]) for place in candidate.amplitudes], dtype=row.dtype
+        )
         names = [q.name for q in candidate.problem.parameters]
         for k in base.free:
             row[names.index(base.problem.parameters[k].name)] = guess[k]

@@ -81,12 +81,12 @@ def _alone_again(search: Search, pair: Model) -> None:
         row = candidate.begin.clone()
         for k in candidate.free:  # what the other term frees stays neutral here
             row[k] = known[names[k]]
-        prior = math.log(PRIOR["single"] / len(search.candidates))
-        wanted.append(Hypothetical((i,), candidate, row[None], prior))
+        wanted.append(Hypothetical((i,), candidate, row[None], search.prior))
     for i, model in zip(numbers, search.refit_together(wanted), strict=True):
         old = search.plain.get(i)
         if model is not None and (old is None or model.weight > old.weight + BETTER):
             search.models = [m for m in search.models if m is not old] + [model]
+            search.merge()
 
 
 def _enough(search: Search) -> bool:

@@ -269,7 +269,7 @@ def _experiment(d: Any) -> list[str]:
     if d.experiment is None:
         return []
     text = f"What would tell them apart: {d.experiment.description} (predicted distance {d.experiment.separation:.1f} "
-    untold = [f"{_and(list(a))} from {_and(list(b))}" for a, b in d.experiment.untold]
+    untold = [f"{a} from {b}" for a, b in d.experiment.untold]
     return [text + "noise sd)" + (f"; no simple experiment tells {', or '.join(untold)}." if untold else ".")]
 
 
@@ -288,7 +288,7 @@ def _ambiguous(d: Any) -> list[str]:
         ]
     shares = [sum(row.probability for row in d.ranking if set(row.terms) == set(tied)) for tied in known]
     best = max(range(len(known)), key=lambda k: shares[k])
-    if shares[best] > PLAINLY * sorted(shares)[-2]:
+    if all(shares) and shares[best] > PLAINLY * sorted(shares)[-2]:  # another name of the same model has no share
         told = f"{_hypothesis(d, known[best])} explains it best (probability {shares[best]:.2f})"
         others = f"{len(known) - 1} other{'s' if len(known) > 2 else ''}"
         parts = [_where(d), f"{told}; these data cannot exclude {others}."]

@@ -207,7 +207,7 @@ def run_batched(
     most, cheap = max(4, MOST_ELEMENTS // max(1, cost)), max(_FEW_WARM_UP_CHAINS, _WARM_UP_ELEMENTS // max(1, cost))
     crowd = max(num_chains, min(_WARM_UP_CHAINS, most, cheap))
     bar = tqdm(total=num_warmup + num_samples, desc=kernel.upper(), disable=not progress, leave=False)
-    drawn = _Collector(num_chains, len(loc), loc)
+    drawn = collector = _Collector(num_chains, len(loc), loc)
     try:
         space = Whitened(log_density, loc, modes[0].scale_tril)
         z, groups = starting_points(space, modes, crowd, generator)
@@ -219,7 +219,7 @@ def run_batched(
         )
         owners, step_size = groups[:num_chains], averaging.settled
         for repeat in range(_REPEATS + 1):
-            collector = _Collector(num_chains, len(loc), loc) if repeat else drawn
+            collector = _Collector(num_chains, len(loc), loc) if repeat else collector
             state = moves.init(z[:num_chains], space, step_size)
             judge = None if enough is None else lambda draws: enough(_alpha(draws, space, transform), owners)
             last = target_accept is not None or repeat == _REPEATS
@@ -231,6 +231,8 @@ def run_batched(
             bar.total += collector.least
             step_size *= _SHORTER
     except KeyboardInterrupt:
+        if collector.least >= min(drawn.least, _FIRST):  # those before were given up
+            drawn = collector
         if drawn.least < 4:
             raise ConvergenceError("The sampler was interrupted before it had drawn anything.") from None
         warnings.warn(

@@ -278,9 +278,11 @@ def _experiment(diagnosis: Any) -> str:
         return ""
     rows = [{"condition": str(name), "value": in_words(value)} for name, value in experiment.conditions.items()]
     text = (
-        f"<p>{escaped(experiment.description)}</p><p>The two nearest hypotheses would differ there by "
-        f"{escaped(in_digits(experiment.separation, 3))} noise sd.</p>"
+        f"<p>{escaped(experiment.description)}</p><p>The two nearest hypotheses that it tells apart would differ there "
+        f"by {escaped(in_digits(experiment.separation, 3))} noise sd.</p>"
     )
+    for one, other in getattr(experiment, "untold", ()):
+        text += f"<p>No simple experiment tells {escaped(one)} from {escaped(other)}.</p>"
     return section("Experiment that would decide", text + table(rows))
 
 

@@ -24,7 +24,16 @@ if TYPE_CHECKING:
     from torchcal.results.additive import AdditiveCalibration
     from torchcal.results.calibration import Calibration
 
-__all__ = ["additive_tree", "calibration_tree", "read_additive", "read_calibration", "scaling_of", "to_arviz", "write"]
+__all__ = [
+    "additive_tree",
+    "calibration_tree",
+    "read_additive",
+    "read_calibration",
+    "scaling_of",
+    "to_arviz",
+    "write",
+    "xarray_module",
+]
 
 FORMAT = 1
 

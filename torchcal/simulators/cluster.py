@@ -19,6 +19,7 @@ def submit(executor: Executor, function: Callable[..., Any], *args: Any) -> "Fut
     if getattr(executor, "_shutdown", False):
         raise RuntimeError("cannot schedule new futures after shutdown")
     remote = client.submit(function, *args, **options)
+    executor._futures.add(remote)  # type: ignore[attr-defined]  # which its shutdown cancels, or waits for
     future: Future[Any] = Future()
 
     async def hand_over() -> None:

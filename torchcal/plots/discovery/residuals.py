@@ -20,6 +20,7 @@ from torchcal.plots.discovery.pieces import (
     as_numbers,
     draw_key,
     finish,
+    finite,
     is_log,
     places_of,
     rms,
@@ -104,9 +105,11 @@ def residual_map(
     fits = curves_of(recording, before, after, names)
     look = Look(units={**recording.units, **(units or {})}, labels=labels or {})
     y = recording.y.cpu().numpy()
+    mask = as_mask(set_aside, recording)
     if output is None:
         scaled = (y - fits[0].values) / recording.spread.cpu().numpy()
-        output = max(recording.outputs, key=lambda name: rms(scaled[places_of(recording, name)]))
+        scaled = scaled if mask is None else np.where(mask, np.nan, scaled)
+        output = max(recording.outputs, key=lambda name: finite(rms(scaled[places_of(recording, name)]), -1.0))
     elif output not in recording.outputs:
         raise DomainError(f"Expected output among {list(recording.outputs)}. Got {output!r} (check the spelling).")
     columns = conditions_of(recording.x, recording)
@@ -122,13 +125,12 @@ def residual_map(
     part = places_of(recording, output)
     ax = style.new_axes(ax)
     located = f"mismatch located here ({100 * share:.0f} % of it)" if share is not None else "mismatch located here"
-    shown = np.isfinite(y[part]) & np.isfinite(x)
-    mask = as_mask(set_aside, recording)
-    aside = np.zeros_like(shown) if mask is None else mask[part] & shown
-    shown &= ~aside
-    if is_log(x[shown]):
+    seen = np.isfinite(y[part]) & np.isfinite(x)
+    aside = np.zeros_like(seen) if mask is None else mask[part] & seen
+    shown = seen & ~aside
+    if is_log(x[seen]):
         ax.set_xscale("log")
-    low, high = float(x[shown].min()), float(x[shown].max())
+    low, high = float(x[seen].min()), float(x[seen].max())
     inside = [(start, end) for start, end in spans if end >= low and start <= high]
     for i, (start, end) in enumerate(inside):
         ax.axvspan(
@@ -136,7 +138,7 @@ def residual_map(
             label=located if i == 0 else "_located",
         )  # fmt: skip
     sd = _noise_of(noise, recording, output)
-    if sd is not None:
+    if sd is not None and shown.any():
         band: dict[str, Any] = {"facecolor": NOISE, "lw": 0, "zorder": 1, "label": "±2 noise sd", "alpha": 0.75}
         levels, which = np.unique(x[shown], return_inverse=True)
         if np.ptp(sd[shown]) <= 1e-6 * sd[shown].max() or len(levels) < 2:
