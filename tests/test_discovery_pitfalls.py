@@ -543,7 +543,7 @@ def test_a_hopeless_base_is_a_misfit_whatever_is_left_looks_like(monkeypatch):
     """Noise that grows with the value took up a lag of 300 log units, and the verdict was that nothing is missing."""
     search = types.SimpleNamespace(
         models=[], exact=False, p_detect=0.6, terms=["lag"], few=False, screen_all=lambda: None,
-        refit_singles=lambda detected=True: None, stop=threading.Event(),
+        refit_singles=lambda detected=True: None, stop=threading.Event(), left=set(),
     )  # fmt: skip
     for alone, detected in ((1e-9, True), (0.04, False)):
         monkeypatch.setattr(rounds, "base_alone", lambda search, alone=alone: alone)
