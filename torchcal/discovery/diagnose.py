@@ -345,7 +345,7 @@ def _solver(simulator: Simulator) -> str:
 def _improved(simulator: Simulator, best: Model) -> Simulator:
     """The user's simulator with the accepted terms, begun at their estimates."""
     improved = extend(simulator, best.candidate.terms)
-    estimate = dict(zip([q.name for q in best.found.problem.parameters], best.found.values.tolist(), strict=True))
+    estimate = best.found.by_name
     own = {best.found.problem.parameters[i].name for i in best.candidate.own}
     parameters = []
     for q in improved.parameters:

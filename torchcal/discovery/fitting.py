@@ -72,6 +72,11 @@ class Fitted:
         inverse = 1.0 / values.clamp_min(1e-13 * max(float(values.max()), 1e-300))
         return (vectors * inverse) @ vectors.T / (scale[:, None] * scale)
 
+    @property
+    def by_name(self) -> dict[str, float]:
+        """Values of all parameters, free or not."""
+        return dict(zip([q.name for q in self.problem.parameters], self.values.tolist(), strict=True))
+
     def sd(self) -> Tensor:
         """Standard deviations ``(P,)``; 0 for those held."""
         found = torch.zeros_like(self.values)

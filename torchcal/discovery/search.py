@@ -197,7 +197,8 @@ class Search:
         top = self.screening.score(order[0]) if order else 0.0
         promising = [i for k, i in enumerate(order) if k < FEW or self.screening.score(i) >= CHANCE * top]
         chosen = promising[:MOST] if detected else order[:FEW]
-        wanted = [Hypothetical((i,), self.candidates[i], self._starts(i), prior) for i in [*chosen, *blind]]
+        guess = self._guess() if self.far else None
+        wanted = [Hypothetical((i,), self.candidates[i], self._starts(i, guess), prior) for i in [*chosen, *blind]]
         found = self.refit_together(wanted)
         none = {one.numbers[0] for one, model in zip(wanted, found, strict=True) if model is None}
         self.left = none if self.stop.is_set() else set()
@@ -227,16 +228,19 @@ class Search:
         """Whether the base misses the data by so much that its estimates say little of the truth's."""
         return not self.exact and self.base.chi2 > FAR * self.problem.n
 
-    def _starts(self, i: int) -> Tensor:
+    def _starts(self, i: int, guess: Tensor | None) -> Tensor:
         """Starting values of a candidate's refit, some of them from the base's first guesses where it is far off."""
         begin = self._begin(i)
-        return torch.cat([begin, self._from_guesses(i, begin)]) if self.far else begin
+        return begin if guess is None else torch.cat([begin, self._from_guess(i, begin, guess)])
 
-    def _from_guesses(self, i: int, begin: Tensor) -> Tensor:
-        """The base before it was bent, its initial states those recorded, with amplitudes of several sizes."""
+    def _guess(self) -> Tensor:
+        """First guesses of the base's parameters ``(P,)``, its initial states those recorded."""
+        held = base_columns(self.base.problem, self.fixed)[1]
+        return follow_slopes(self.base.problem, starts(self.base.problem, 1, self.seed, held))[0]
+
+    def _from_guess(self, i: int, begin: Tensor, guess: Tensor) -> Tensor:
+        """The base before it was bent, with amplitudes of several sizes."""
         candidate, base = self.candidates[i], self.base
-        held = base_columns(base.problem, self.fixed)[1]
-        guess = follow_slopes(base.problem, starts(base.problem, 1, self.seed, held))[0]
         row = begin[0].clone()
         row[candidate.amplitudes] = torch.tensor(
             [float(candidate.neutral[candidate.own.index(place)]) for place in candidate.amplitudes], dtype=row.dtype

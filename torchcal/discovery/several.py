@@ -72,7 +72,7 @@ def refit_several(search: Search) -> None:
 
 def _alone_again(search: Search, pair: Model) -> None:
     """The terms of a pair, each refitted alone from where the pair ended: from the base it may have got stuck."""
-    known = dict(zip([q.name for q in pair.candidate.problem.parameters], pair.found.values.tolist(), strict=True))
+    known = pair.found.by_name
     numbers = [i for i in pair.numbers if i not in search.gone]
     wanted = []
     for i in numbers:
@@ -204,9 +204,7 @@ def _hypothetical(
         single = plain.get(lead)
         row = candidate.begin.clone()
         if single is not None:
-            known = dict(
-                zip([q.name for q in single.candidate.problem.parameters], single.found.values.tolist(), strict=True)
-            )
+            known = single.found.by_name
             for k, name in enumerate(names):
                 if name in known:
                     row[k] = known[name]

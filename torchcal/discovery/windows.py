@@ -257,7 +257,7 @@ def refit_window(
     if near is None:
         size *= 0.02
     else:
-        values = dict(zip([q.name for q in near.found.problem.parameters], near.found.values.tolist(), strict=True))
+        values = near.found.by_name
     values[names[amplitude]] = float(plain.neutral[plain.own.index(amplitude)]) + size
     ends = {f"{term.name}.{ENDS['from']}": w.low, f"{term.name}.{ENDS['to']}": w.high}
     shift = span.size * (FINE if edge else SHIFT)

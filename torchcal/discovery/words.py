@@ -289,12 +289,12 @@ def _ambiguous(d: Any) -> list[str]:
     shares = [sum(row.probability for row in d.ranking if set(row.terms) == set(tied)) for tied in known]
     best = max(range(len(known)), key=lambda k: shares[k])
     if all(shares) and shares[best] > PLAINLY * sorted(shares)[-2]:  # another name of the same model has no share
-        told = f"{_hypothesis(d, known[best])} explains it best (probability {shares[best]:.2f})"
         others = f"{len(known) - 1} other{'s' if len(known) > 2 else ''}"
-        parts = [_where(d), f"{told}; these data cannot exclude {others}."]
+        told = f"{_hypothesis(d, known[best])} explains it best (probability {shares[best]:.2f}); these data cannot "
+        told += f"exclude {others}."
     else:
         told = f"{len(known)} hypotheses explain it about as well, and these data cannot exclude any of them."
-        parts = [_where(d), told]
+    parts = [_where(d), told]
     base = sum(row.probability for row in d.ranking if not row.terms)
     if base >= LISTED:
         parts.append(f"The base alone has a probability of {base:.2f}.")
