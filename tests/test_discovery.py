@@ -256,6 +256,7 @@ def test_improved_is_a_simulator_like_any_other(windy):
     assert math.isinf(row.smallest)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_diagnosis():
     body, motion, candidates = pushed(0.05)
     candidates = candidates[-2:]
@@ -551,6 +552,7 @@ def test_a_hidden_state_is_named():
     assert len(d.improved.states) == 3
 
 
+@pytest.mark.slow
 def test_two_causes_with_one_formula_are_tied():
     first, *rest = named(tc.terms.mechanics(), "bias force", "quadratic drag", "cubic stiffness")
     tilt = tc.Term("tilt", equation="v", rate=lambda t, s, p, u: -9.81 * p["slope"], parameters=[tc.Parameter("slope")])
@@ -689,6 +691,7 @@ def test_a_best_explanation_that_is_not_probable_enough_is_no_name(monkeypatch, 
     d.report(tmp_path / "report.html")
 
 
+@pytest.mark.slow
 def test_a_later_term_of_the_same_name_replaces_an_earlier_one():
     body, motion, library = pushed(0.1)
     mine = tc.Term("bias force", equation="v", rate=lambda t, s, p, u: p["mine"], parameters=[tc.Parameter("mine")])
@@ -732,6 +735,7 @@ def test_correlated_noise():
     assert abs(b.value - 0.25) < 5 * b.sd
 
 
+@pytest.mark.slow
 def test_outliers_are_set_aside():
     body, motion, library = pushed(0.08)
     library = library[-3:]
@@ -747,6 +751,7 @@ def test_outliers_are_set_aside():
     assert quiet(body, tc.Recording(runs=[run_of(null)], noise=0.02), library).verdict == "consistent"
 
 
+@pytest.mark.slow
 def test_quantised_samples():
     body, motion, library = pushed(0.08)
     library = library[-3:]
@@ -758,6 +763,7 @@ def test_quantised_samples():
     assert quiet(body, tc.Recording(runs=[run_of(null)]), library).verdict == "consistent"
 
 
+@pytest.mark.slow
 def test_missing_samples():
     body, motion, library = pushed(0.08)
     x = motion.y.clone()
@@ -771,6 +777,7 @@ def test_missing_samples():
     assert bool(torch.isfinite(d.final.prediction).all())
 
 
+@pytest.mark.slow
 def test_uneven_times():
     body = oscillator()
     library = named(tc.terms.mechanics(), *NAMES)
@@ -811,6 +818,7 @@ def test_several_runs_with_unknown_initial_states_and_parameters_of_their_own():
     assert d.held_out.nonzero()[:, 0].tolist() == [*range(53, 70), *range(108, 120)]
 
 
+@pytest.mark.slow
 def test_outputs_of_different_size_that_are_functions_of_the_states():
     body = tc.ODESimulator(
         lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"] - p["c"] * s["v"] + u["f"]}, {"x": "m", "v": "m/s"},
@@ -838,6 +846,7 @@ def test_outputs_of_different_size_that_are_functions_of_the_states():
 # --- other fields -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_thermal():
     t = torch.linspace(0, 60, 61, dtype=F64)
     body = tc.ODESimulator(lambda t, s, p, u: {"T": -p["k"] * (s["T"] - 20.0)}, {"T": "degC"},
@@ -857,6 +866,7 @@ def test_thermal():
     assert d.verdict == "consistent"
 
 
+@pytest.mark.slow
 def test_kinetics():
     t = torch.linspace(0, 40, 41, dtype=F64)
     body = tc.ODESimulator(lambda t, s, p, u: {"A": -p["k"] * s["A"], "B": p["k"] * s["A"]},
@@ -1065,6 +1075,7 @@ def test_progress_can_be_silenced(capsys):
     assert "diagnose" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_no_warning_where_all_goes_well():
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -120,6 +120,7 @@ def dose_response(binding, ripple, seed, *, rho=0.0, n=90):
     return diagnose(base, data, terms)
 
 
+@pytest.mark.slow
 def test_a_ripple_over_decades_of_a_condition_is_something_unknown(binding):
     # Taken for noise, it has a correlation of 0.9.
     d = dose_response(binding, 0.06, 0)

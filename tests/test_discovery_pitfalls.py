@@ -63,7 +63,8 @@ def heated():
     return base, tc.Recording(runs=runs), [term for term in library if term.name in ("heater lag", "lag of T")]
 
 
-@pytest.mark.parametrize("order", [1, pytest.param(-1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("order", [1, -1])
 def test_what_does_the_same_is_tied_in_whatever_order_it_is_given(heated, order):
     # The noise is estimated anew during the search, by a factor of three: all that was likely is fitted again.
     base, recording, terms = heated
@@ -116,6 +117,7 @@ def test_what_the_base_has_everywhere_may_be_missing_in_a_window():
     assert str(best.estimates[0]) in words
 
 
+@pytest.mark.slow
 def test_a_name_leaves_no_more_than_the_noise_that_is_given():
     # An offset in one of three runs. Correlated noise of the given size can stand in for it, but not of its size.
     base, recording = decays(noise=0.01)

@@ -217,6 +217,7 @@ def test_the_nearest_of_the_library_is_no_name_where_far_more_than_noise_is_left
     assert d.terms == []
 
 
+@pytest.mark.slow
 def test_an_unseen_angle_is_that_of_no_other_turn():
     # Of a glider only the height is seen. Its base does not tell whole turns of the path apart; damping does.
     t = np.linspace(0, 30, 121)
@@ -303,6 +304,7 @@ def test_what_does_the_same_as_another_is_not_paired_with_it():
     assert len({frozenset(tied) for tied in d.tied}) == len(d.tied)
 
 
+@pytest.mark.slow
 def test_a_first_sample_that_is_an_outlier_is_no_physics():
     # The unknown initial state follows it, which bends the samples behind it too.
     rng = np.random.default_rng(6)
@@ -332,6 +334,7 @@ def test_a_datum_at_the_edge_of_two_conditions_is_rarely_an_outlier_by_chance():
     assert seen <= 6 + 3 * 6**0.5  # three standard deviations of a Poisson number
 
 
+@pytest.mark.slow
 def test_a_smooth_misfit_that_an_initial_state_takes_up_is_no_outlier():
     # Without the first sample the unknown initial state takes up what a quadratic loss does: nothing would be missing.
     t = np.linspace(0, 12, 40)

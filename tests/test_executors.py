@@ -373,6 +373,7 @@ def test_a_dask_executor_that_was_shut_down_is_named_and_a_cancelled_future_ends
         run_tasks(abs, [-1], executor=executor, on_result=lambda i, value: None)
 
 
+@pytest.mark.slow
 def test_a_task_that_kills_every_dask_worker_is_named(impatient):
     simulator = ExternalSimulator(dies, [A], executor=impatient.get_executor())
     with pytest.raises(SimulatorError, match=r"worker process died at x = 2.0, p = \{'a': 1.0\} .*Attempted to run"):

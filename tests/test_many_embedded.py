@@ -62,7 +62,7 @@ def followed(monkeypatch):
     [
         ("abc", tc.embeddings.Gaussian(), "abc"),
         ("ab", tc.embeddings.PolynomialChaos(order=2), "abc"),
-        ("ab", tc.embeddings.Gaussian(), "gaussian_marginal"),
+        pytest.param("ab", tc.embeddings.Gaussian(), "gaussian_marginal", marks=pytest.mark.slow),
     ],
 )
 def test_the_same_maximum_as_on_the_whole_rule_from_every_start(monkeypatch, names, embedding, likelihood):

@@ -1,7 +1,7 @@
 """Every built-in term is planted once in a base model of its field, hidden by calibration and noise, and looked for.
 
 It must come back named, or among the tied, or as an alias of one that is, or be called part of the base model where
-that is the truth. A fifth of them runs always, the rest with the slow tests.
+that is the truth. An eighth of them runs always, the rest with the slow tests.
 """
 
 from collections.abc import Callable
@@ -113,7 +113,7 @@ def plane() -> Field:
             "bias force along vx": {"b": 0.4},
             "bias force along vy": {"b": 0.4},
         },
-        ("quadratic drag", "bias force along vy"),
+        ("bias force along vy",),
         ("bias force along vy",),
     )
 
@@ -151,7 +151,7 @@ def thermal() -> Field:
             "lag of T": {"a": 1.0, "t90": 1.5},
             "delay of T": {"a": 1.0, "D": 1.0},
         },
-        ("heater gain error", "second heat capacity", "lag of T"),
+        ("heater gain error", "second heat capacity"),
         ("Newton cooling", "heater gain error"),
     )
 
@@ -187,7 +187,7 @@ def hydraulics() -> Field:
             "discharge exponent": {"m": 0.15},
             "clogging": {"r": 0.0006},
         },
-        ("leak", "overflow"),
+        ("overflow",),
     )
 
 
@@ -247,7 +247,7 @@ def kinetics() -> Field:
             "lag of B": {"a": 1.0, "t90": 3.0},
             "delay of B": {"a": 1.0, "D": 1.0},
         },
-        ("reverse reaction", "reaction order", "activation energy", "offset of B", "lag of A"),
+        ("reverse reaction", "offset of B", "lag of A"),
     )
 
 
@@ -370,9 +370,9 @@ def test_every_term_of_every_field_is_planted():
         if name != "coil":
             assert set(field.effects) == {term.name for term in field.library}, name
         assert set(field.quick) <= set(field.effects)
-        assert len(field.quick) >= len(field.effects) // 6
+        assert len(field.quick) >= len(field.effects) // 10
     quick = sum(len(field.quick) for field in FIELDS.values())
-    assert quick >= 0.19 * len(CASES)
+    assert quick >= 0.12 * len(CASES)
 
 
 @pytest.mark.parametrize(("name", "effect"), CASES)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcal.errors import ConvergenceError
+from torchcal.inference.bends import LEAST, Bend, found_in
 
 __all__ = ["Laplace", "Whitened", "dealt_out", "gathered", "group_means", "starting_points"]
 
@@ -38,10 +39,15 @@ class Laplace:
 
 
 class Whitened:
-    """A log-density in coordinates z with u = loc + scale_tril z, with its gradient for the sampler."""
+    """A log-density in coordinates z with u = loc + scale_tril (z + shifts), with its gradient for the sampler.
 
-    def __init__(self, log_density: Callable[[Tensor], Tensor], loc: Tensor, scale_tril: Tensor) -> None:
-        self.log_density, self.loc, self.scale_tril = log_density, loc, scale_tril
+    Shifts are those of a `Bend`, if there is one.
+    """
+
+    def __init__(
+        self, log_density: Callable[[Tensor], Tensor], loc: Tensor, scale_tril: Tensor, bend: Bend | None = None
+    ) -> None:
+        self.log_density, self.loc, self.scale_tril, self.bend = log_density, loc, scale_tril, bend
         self._downhill = -scale_tril
 
     def potential(self, z: Tensor) -> tuple[Tensor, Tensor]:
@@ -51,6 +57,8 @@ class Whitened:
             value = self.log_density(u)
             (slope,) = torch.autograd.grad(value.sum(), u)  # with grad_outputs=, PyTorch would import SymPy first
         energy, slope = -value.detach(), slope @ self._downhill
+        if self.bend is not None:
+            slope = slope + self.bend.pulled_back(z, slope)
         good = torch.isfinite(energy + slope.sum(-1))  # which is not finite where any of them is not
         return torch.where(good, energy, torch.inf), torch.where(good[:, None], slope, 0.0)
 
@@ -61,29 +69,47 @@ class Whitened:
         return torch.where(torch.isfinite(value), value, torch.inf)
 
     def outer(self, z: Tensor) -> Tensor:
-        """u of z."""
-        return torch.addmm(self.loc, z, self.scale_tril.T) if z.ndim == 2 else self.loc + z @ self.scale_tril.T
+        """U of z, ``(..., P)``."""
+        flat = z.reshape(-1, z.shape[-1])
+        return torch.addmm(self.loc, self._bent(flat), self.scale_tril.T).reshape(z.shape)
 
     def inner(self, u: Tensor) -> Tensor:
         """Z of u, ``(C, P)``."""
-        return torch.linalg.solve_triangular(self.scale_tril, (u - self.loc).T, upper=False).T
+        z = torch.linalg.solve_triangular(self.scale_tril, (u - self.loc).T, upper=False).T
+        return z if self.bend is None else z - self.bend.shift(z)  # no shift moves a driver
+
+    def _bent(self, z: Tensor) -> Tensor:
+        return z if self.bend is None else z + self.bend.shift(z)
 
     def refined(self, z: Tensor, groups: Tensor, *, weight: float = 5.0) -> "Whitened":
         """Coordinates in which pooled draws are white: z ``(S, P)``, each about the mean of its group ``(S,)``.
 
-        Groups are the modes that chains began at: where they stay apart, the distance between modes is no width.
+        Groups are the modes that chains began at: where they stay apart, the distance between modes is no width. Where
+        they are places on one bent ridge, all draws together fill less room when it is straightened.
         """
-        count, size = z.shape
-        means = group_means(z, groups)
-        offset = z - means[groups]
-        mean = means[0]
-        # Shrunk to what the coordinates assume already, with the weight of a few draws; in double precision, as single
-        # precision loses a narrow direction beside a long one.
-        identity = torch.eye(size, dtype=torch.float64, device=z.device)
-        wide = offset.double()
-        covariance = (wide.T @ wide + weight * identity) / (count + weight)
-        factor = torch.linalg.cholesky(covariance).to(z.dtype)
-        return Whitened(self.log_density, self.outer(mean[None])[0], self.scale_tril @ factor)
+        # In double precision, as single precision loses a narrow direction beside a long one.
+        wide = self._bent(z).double()
+        means = group_means(wide, groups)
+        center, factor = means[0], _factor(wide - means[groups], weight)
+        middle, whole = wide.mean(0), _factor(wide - wide.mean(0), weight)
+        white = torch.linalg.solve_triangular(whole, (wide - middle).T, upper=False).T
+        bend, found = None, found_in(white)
+        apart = 2 * float(factor.diagonal().log().sum() - whole.diagonal().log().sum())
+        if found is not None and found[1] < apart + math.log(LEAST):
+            rest = white - found[0].shift(white)
+            offset = rest.mean(0)  # drivers have no part in it
+            inner = _factor(rest - offset, weight * math.exp(found[1]))
+            bend = found[0].seen_from(inner).to(z.dtype)
+            center, factor = middle + whole @ offset, whole @ inner
+        center, factor = center.to(z.dtype), factor.to(z.dtype)
+        return Whitened(self.log_density, self.loc + self.scale_tril @ center, self.scale_tril @ factor, bend)
+
+
+def _factor(offset: Tensor, weight: float) -> Tensor:
+    """Of the covariance of draws ``(S, P)``, shrunk to what their coordinates assume with the weight of a few draws."""
+    count, size = offset.shape
+    identity = torch.eye(size, dtype=offset.dtype, device=offset.device)
+    return torch.linalg.cholesky((offset.T @ offset + weight * identity) / (count + weight))
 
 
 def group_means(values: Tensor, groups: Tensor) -> Tensor:

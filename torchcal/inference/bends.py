@@ -1,0 +1,185 @@
+r"""Ridges straightened: coordinates that follow the squares of others.
+
+A spread of an embedded parameter that the data do not need is densest at zero, and what it adds to a variance is made
+up for by another: the posterior is a parabola, narrow across and bent along. White coordinates cannot make it round.
+With drivers :math:`t_k = w_k \cdot z` and shifts q at right angles to all of them,
+
+.. math:: z \mapsto z + \sum_{k \le l} q_{kl}\, t_k t_l
+
+can, and leaves volumes as they are, so that densities need no correction. It is the second-order case of the triangular
+maps of Parno & Marzouk (2018), SIAM/ASA J. Uncertainty Quantification 6, 645-682, learned from draws as these are.
+"""
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+__all__ = ["LEAST", "Bend", "found_in"]
+
+#: What of the squared volume one driver must leave, at most, and every further one of that, to be worth a bend: less
+#: than skew and heavy-tailed draws seem to be bent; and drivers at most.
+LEAST, FURTHER, MOST = 0.4, 0.5, 3
+#: What a driver must leave of the volume to be looked at together with others.
+NEXT = 0.7
+#: Share of all other directions' variance, in units of one, from which on a square is looked at.
+WORTH = 0.1
+#: Directions from which the smallest volume is looked for, and steps on the way.
+TRIED, STEPS = 3, 15
+#: Draws for each coordinate without which nothing is said of bends, and most draws that are looked at.
+DRAWS, ENOUGH = 40, 4000
+#: Coordinates at most: the work grows with their third power.
+LARGEST = 60
+
+
+@dataclass(frozen=True)
+class Bend:
+    """Shifts by products of drivers.
+
+    Attributes:
+        drivers: W, ``(P, K)``.
+        shifts: q, one row for each pair k ≤ l, ``(K (K + 1) / 2, P)``, all at right angles to W.
+    """
+
+    drivers: Tensor
+    shifts: Tensor
+    _pairs: tuple[Tensor, Tensor] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        size = self.drivers.shape[1]
+        first, second = torch.triu_indices(size, size, device=self.drivers.device).unbind(0)
+        object.__setattr__(self, "_pairs", (first, second))
+
+    def products(self, z: Tensor) -> Tensor:
+        """Of the drivers, every pair once, ``(C, F)``."""
+        t = z @ self.drivers
+        first, second = self._pairs
+        return t[:, first] * t[:, second]
+
+    def shift(self, z: Tensor) -> Tensor:
+        """What is added to z ``(C, P)``."""
+        return self.products(z) @ self.shifts
+
+    def pulled_back(self, z: Tensor, slope: Tensor) -> Tensor:
+        """What the shift adds to a gradient ``(C, P)``, given the one in shifted coordinates."""
+        t, along = z @ self.drivers, slope @ self.shifts.T
+        first, second = self._pairs
+        turned = torch.zeros_like(t).index_add(1, first, along * t[:, second]).index_add(1, second, along * t[:, first])
+        return turned @ self.drivers.T
+
+    def seen_from(self, factor: Tensor) -> "Bend":
+        """The same in coordinates y with z = factor y (+ shifts)."""
+        return Bend(factor.T @ self.drivers, torch.linalg.solve_triangular(factor, self.shifts.T, upper=False).T)
+
+    def to(self, dtype: torch.dtype) -> "Bend":
+        """In another dtype."""
+        return Bend(self.drivers.to(dtype), self.shifts.to(dtype))
+
+
+def found_in(z: Tensor) -> tuple[Bend, float] | None:
+    """The bends of draws that are white, ``(S, P)``, and the log of the squared volume that is left of one.
+
+    One driver after another is taken in, as long as the volume that the straightened draws fill shrinks. None where no
+    ridge is bent.
+    """
+    size = z.shape[1]
+    found = here = None
+    if size > LARGEST or len(z[:, 0].unique()) < DRAWS * size:  # a chain that stands still tells nothing anew
+        return found
+    z = z[:: max(1, len(z) // ENOUGH)]
+    drivers, volume = z.new_zeros(size, 0), 0.0
+    for number in range(1, min(MOST, size - 1) + 1):
+        rest = z if here is None else z - here.shift(z)
+        ends = [_sharpened(z, torch.cat([drivers, new[:, None]], dim=1)) for new in _candidates(rest)]
+        best = min(ends, key=lambda end: end.volume, default=None)
+        if best is None or not best.volume < volume + math.log(NEXT):
+            break
+        drivers, volume = best.drivers, best.volume
+        here = Bend(drivers, best.shifts)
+        if volume < math.log(LEAST * FURTHER ** (number - 1)):
+            found = here, volume
+    return found
+
+
+class _Straight:
+    """Draws straightened by drivers ``(P, K)``, which are brought to unit variance.
+
+    Shifts are by least squares on products, beside the drivers themselves. They do not move these, as nothing of them
+    is left to be explained.
+    """
+
+    def __init__(self, z: Tensor, drivers: Tensor) -> None:
+        self.drivers = drivers / (z @ drivers).std(0)
+        first, second = torch.triu_indices(drivers.shape[1], drivers.shape[1], device=z.device)
+        self.t = z @ self.drivers
+        pairs = self.t[:, first] * self.t[:, second]
+        # An orthonormal basis of what is fitted: a constant, the drivers, their products.
+        self.basis, upper = torch.linalg.qr(torch.cat([torch.ones_like(self.t[:, :1]), self.t, pairs], dim=1))
+        slopes = torch.linalg.solve_triangular(upper, self.basis.T @ z, upper=True)
+        self.shifts = slopes[1 + drivers.shape[1] :]
+        rest = z - pairs @ self.shifts
+        self.rest = rest - rest.mean(0)
+        self.factor = _root(self.rest)
+        self.volume = 2 * float(self.factor.diagonal().log().sum())
+
+    def moved(self, z: Tensor) -> Tensor:
+        """A Gauss-Newton step of the drivers towards a smaller volume, ``(P, K)``."""
+        size, number = self.drivers.shape
+        # What is not fitted, and what every product of a coordinate and a driver adds to it, in its own sd.
+        left = z - self.basis @ (self.basis.T @ z)
+        white = torch.linalg.solve_triangular(self.factor, left.T, upper=False)  # (P, S)
+        shifts = torch.linalg.solve_triangular(self.factor, self.shifts.T, upper=False)  # (P, F)
+        first, second = torch.triu_indices(number, number, device=z.device)
+        along = shifts.new_zeros(size, number, number)
+        along[:, first, second] += shifts
+        along[:, second, first] += shifts
+        terms = (z[:, :, None] * self.t[:, None, :]).flatten(1)
+        terms = terms - self.basis @ (self.basis.T @ terms)
+        terms = terms.unflatten(1, (size, number))
+        slope = torch.einsum("ps,sjl,pkl->jk", white, terms, along)
+        curve = torch.einsum("sjl,smn,pkl,pon->jkmo", terms, terms, along, along).reshape(size * number, -1)
+        curve = curve + 1e-9 * curve.diagonal().mean() * torch.eye(len(curve)).to(curve)
+        return torch.linalg.solve(curve, slope.reshape(-1)).reshape(size, number)
+
+
+def _sharpened(z: Tensor, drivers: Tensor) -> _Straight:
+    """Drivers near some that leave the smallest volume: how narrow a ridge becomes tells its direction well."""
+    here = _Straight(z, drivers)
+    for _ in range(STEPS):
+        step = here.moved(z)
+        before = here.volume
+        for length in (1.0, 0.3, 0.1):
+            there = _Straight(z, here.drivers + length * step)
+            if there.volume < here.volume:
+                here = there
+                break
+        if not here.volume < before - 1e-3:
+            break
+    return here
+
+
+def _candidates(rest: Tensor) -> Tensor:
+    """Directions ``(n, P)`` whose squares go along with much of some other, by third moments, which are rough."""
+    count, size = rest.shape
+    rest = rest - rest.mean(0)
+    factor = _root(rest)
+    white = torch.linalg.solve_triangular(factor, rest.T, upper=False).T
+    third = torch.einsum("si,sj,sk->ijk", white, white, white) / count
+    # A direction that is skew stands out with itself too, and does not drive itself.
+    others = 1 - torch.eye(size).to(white)
+    directions = torch.linalg.eigh(third * others[:, :, None] * others[:, None, :]).eigenvectors
+    directions = directions.transpose(1, 2).reshape(-1, size)
+    t = white @ directions.T
+    square = t.square() - 1
+    square = square - (square * t).mean(0) * t
+    share = (white.T @ (square / square.square().mean(0).sqrt()) / count).square().sum(0)
+    best = share.argsort(descending=True)[:TRIED]
+    best = best[share[best] > WORTH]
+    return torch.linalg.solve_triangular(factor.T, directions[best].T, upper=True).T
+
+
+def _root(offset: Tensor) -> Tensor:
+    """Triangular root of the covariance of draws about their mean, whose coordinates are of the order of one."""
+    tiny = 1e-12 * torch.eye(offset.shape[1]).to(offset)
+    return torch.linalg.cholesky(offset.T @ offset / len(offset) + tiny)
