@@ -176,7 +176,7 @@ def test_divergences_are_counted(kernel):
     def wall(u):
         return torch.where(u[..., 0] > 0.5, -math.inf, -0.5 * u.square().sum(-1))
 
-    draws = run(wall, 2, num_samples=100, target_accept=0.8, kernel=kernel)
+    draws = run(wall, 2, num_samples=40, num_warmup=10, target_accept=0.8, kernel=kernel)
     assert draws.divergences > 0
 
 

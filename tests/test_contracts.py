@@ -51,7 +51,8 @@ def test_other_times_and_runs_are_converted_to_the_units_of_the_recording(decay)
 def test_times_a_rounding_beside_a_sample_do_not_bend_a_cubic_input():
     time = torch.arange(21, dtype=torch.float64) / 10
     u = 5 + torch.sin(7 * time)
-    run = tc.Run(time, outputs={"x": torch.zeros(21)}, inputs={"u": u}, initial={"x": 0.0}, hold="cubic")
+    x = 2.5 * (1 - torch.exp(-2 * time))
+    run = tc.Run(time, outputs={"x": x}, inputs={"u": u}, initial={"x": 0.0}, hold="cubic")
     model = tc.ODESimulator(lambda t, s, p, u: {"x": u["u"] - p["k"] * s["x"]}, {"x": None}, [tc.Parameter("k")])
     fit = tc.calibrate(model, tc.Recording(runs=[run]), likelihood=tc.likelihoods.ABC(epsilon=0.1), num_samples=0)
     exact = fit.predict(time).map.mean

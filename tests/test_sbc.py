@@ -16,7 +16,7 @@ import torch
 
 import torchcal as tc
 from torchcal import likelihoods, models, priors
-from torchcal.errors import ConvergenceWarning, ToleranceWarning
+from torchcal.errors import ConvergenceWarning, IdentifiabilityWarning, ToleranceWarning
 from torchcal.inference import diagnostics
 
 stats = pytest.importorskip("scipy.stats")
@@ -110,10 +110,11 @@ FAMILIES = {
 
 
 def quietly(function, *arguments, **options):
-    """With the warnings off that few draws of each chain, or a wide tolerance, cause."""
+    """With the warnings off that few draws of each chain, a wide tolerance, or a truth at its bound cause."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         warnings.simplefilter("ignore", ToleranceWarning)
+        warnings.simplefilter("ignore", IdentifiabilityWarning)
         return function(*arguments, **options)
 
 
