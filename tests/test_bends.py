@@ -24,6 +24,11 @@ def turned(draws, generator):
     return draws @ torch.linalg.qr(torch.randn(size, size, dtype=torch.float64, generator=generator)).Q
 
 
+def found_in(draws, chains=None):
+    """With every draw of a chain of its own where nothing else is said."""
+    return bends.found_in(draws, torch.arange(len(draws)) if chains is None else chains)
+
+
 def parabola(count, size, width, generator):
     """One direction follows the square of another, both turned out of the axes."""
     draws = torch.randn(count, size, dtype=torch.float64, generator=generator)
@@ -42,7 +47,7 @@ def two_drivers(count, generator):
 def test_a_parabola_is_straightened_whichever_way_it_lies(size):
     generator = torch.Generator().manual_seed(size)
     draws = white(parabola(600, size, 0.2, generator))
-    bend, volume = bends.found_in(draws)
+    bend, volume = found_in(draws)
     assert bend.drivers.shape == (size, 1)
     straight = draws - bend.shift(draws)
     # Of the variance 0.04 + 2 of one direction 0.04 is left: a squared volume of 0.02, 7 sd of 600 draws about it.
@@ -54,7 +59,7 @@ def test_a_parabola_is_straightened_whichever_way_it_lies(size):
 def test_two_drivers_and_their_product():
     generator = torch.Generator().manual_seed(1)
     draws = white(two_drivers(900, generator))
-    bend, volume = bends.found_in(draws)
+    bend, volume = found_in(draws)
     assert bend.drivers.shape == (6, 2)
     assert bend.shifts.shape == (3, 6)
     # No shift moves a driver.
@@ -70,16 +75,28 @@ def test_what_is_not_bent_is_left_alone(size):
         generator = torch.Generator().manual_seed(seed)
         draws = torch.randn(bends.DRAWS * size, size, dtype=torch.float64, generator=generator)
         waits = -torch.rand(draws.shape, dtype=torch.float64, generator=generator).log()
-        heavy = draws / waits.sqrt()[:, :1]
-        for sample in (draws, turned(-waits.log(), generator), heavy.clamp(-8, 8)):
-            assert bends.found_in(white(sample)) is None
+        heavy, cauchy = draws / waits.sqrt()[:, :1], draws / torch.randn(draws.shape, generator=generator).double()
+        for sample in (draws, turned(-waits.log(), generator), heavy, cauchy):
+            assert found_in(white(sample)) is None
+
+
+@pytest.mark.parametrize("size", [2, 5, 14])
+def test_chains_that_hardly_move_are_not_bent(size):
+    """A correlation of 0.99 from draw to draw: as many places as chains."""
+    for seed in range(10):
+        generator = torch.Generator().manual_seed(seed)
+        noise = torch.randn(40 * size // 64 + 9, 64, size, dtype=torch.float64, generator=generator)
+        draws = [noise[0]]
+        for new in noise[1:]:
+            draws.append(0.99 * draws[-1] + math.sqrt(1 - 0.99**2) * new)
+        assert found_in(white(torch.cat(draws)), torch.arange(64).repeat(len(draws))) is None
 
 
 def test_few_draws_say_nothing_of_bends():
     generator = torch.Generator().manual_seed(0)
     stuck = white(torch.randn(8, 3, dtype=torch.float64, generator=generator)).repeat(100, 1)  # as many as chains
-    assert bends.found_in(stuck) is None
-    assert bends.found_in(white(parabola(190, 5, 0.2, generator))) is None
+    assert found_in(stuck) is None
+    assert found_in(white(parabola(190, 5, 0.2, generator))) is None
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
@@ -89,7 +106,7 @@ def test_maps_are_inverse_keep_volumes_and_pull_gradients_back(dtype):
     factor = eye + 0.2 * torch.ones(6, 6, dtype=dtype).tril(-1)
     space = Whitened(lambda u: -(u.square() * u.exp()).sum(-1), 0.3 * eye[0], factor)
     draws = space.inner(two_drivers(900, generator).to(dtype))
-    bent = space.refined(draws, torch.zeros(900, dtype=torch.long))
+    bent = space.refined(draws, torch.zeros(900, dtype=torch.long), torch.arange(900))
     assert bent.bend is not None
     assert bent.scale_tril.dtype == bent.bend.drivers.dtype == dtype
     z = torch.randn(20, 6, generator=generator, dtype=torch.float64).to(dtype)
@@ -106,7 +123,7 @@ def test_maps_are_inverse_keep_volumes_and_pull_gradients_back(dtype):
     torch.testing.assert_close(energy, value.detach())
     torch.testing.assert_close(slope, expected, **tolerance)
     # The draws are nearly white there, and refining again goes on from what is known.
-    again = bent.refined(bent.inner(space.outer(draws)), torch.zeros(900, dtype=torch.long))
+    again = bent.refined(bent.inner(space.outer(draws)), torch.zeros(900, dtype=torch.long), torch.arange(900))
     covariance = again.inner(space.outer(draws)).double().T.cov()
     assert float((covariance - torch.eye(6)).abs().max()) < 0.03
     assert again.bend is not None
@@ -145,7 +162,7 @@ def test_a_bent_ridge_takes_few_gradients_and_keeps_its_distribution(kernel, mon
         ess = float(diagnostics.figures(values[..., None]).ess_bulk[0])
         every = max(1, math.ceil(2 * values.numel() / ess))
         assert stats.kstest(values[:, ::every].flatten().numpy(), "norm").pvalue > 1e-3
-    monkeypatch.setattr("torchcal.inference.coordinates.found_in", lambda z: None)
+    monkeypatch.setattr("torchcal.inference.coordinates.found_in", lambda z, chains: None)
     assert rate > 3 * run(banana, 25)[1]
 
 
@@ -158,9 +175,9 @@ def test_several_maxima_on_one_ridge_are_seen_as_one():
     draws[:, 0], draws[:, 1] = along, 0.1 * draws[:, 1] + along.square()
     space = Whitened(banana, torch.zeros(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64))
     groups = torch.arange(800) // 400
-    assert space.refined(draws, groups).bend is not None
+    assert space.refined(draws, groups, torch.arange(800)).bend is not None
     # Two humps far apart are no ridge: widths stay those within each.
     far = torch.randn(800, 3, dtype=torch.float64, generator=generator) + 50 * (groups[:, None] - 0.5)
-    apart = space.refined(far, groups)
+    apart = space.refined(far, groups, torch.arange(800))
     assert apart.bend is None
     assert float(apart.scale_tril.diagonal().max()) < 1.2

@@ -303,12 +303,16 @@ def _warm_up(
         length = max(4, round(share * num_warmup))
         last = number == len(_WINDOWS) - 1
         pooled, owners, z, diverging = _adapt(moves, space, z, averaging, length, bar, settle=last)
-        if not last:
-            other = space.refined(pooled, groups[owners])
-            z = other.inner(space.outer(z))
-            space = other
-            z = moves.tune(z, groups, space, averaging.settled)
-            averaging = _DualAveraging(averaging.averaged, averaging.target)
+        other = space.refined(pooled, groups[owners], owners)
+        # A bend shows only when chains have come near the ridge, and then best in coordinates that follow it already.
+        if last and other.bend is None:
+            break
+        z = other.inner(space.outer(z))
+        space = other
+        z = moves.tune(z, groups, space, averaging.settled)
+        averaging = _DualAveraging(averaging.averaged, averaging.target)
+        if last:
+            _, _, z, diverging = _adapt(moves, space, z, averaging, length, bar, settle=True)
     while stricter and diverging > DIVERGING and averaging.target < _STRICTEST:
         averaging = averaging.stricter()
         _, _, z, diverging = _adapt(moves, space, z, averaging, length, bar, settle=True)

@@ -18,18 +18,15 @@ from torch import Tensor
 
 __all__ = ["LEAST", "Bend", "found_in"]
 
-#: What of the squared volume one driver must leave, at most, and every further one of that, to be worth a bend: less
-#: than skew and heavy-tailed draws seem to be bent; and drivers at most.
-LEAST, FURTHER, MOST = 0.4, 0.5, 3
-#: What a driver must leave of the volume to be looked at together with others.
-NEXT = 0.7
-#: Share of all other directions' variance, in units of one, from which on a square is looked at.
+#: What of the squared volume bends must leave, at most, to be taken in; one driver more of that; drivers at most.
+LEAST, NEXT, MOST = 0.5, 0.7, 3
+#: Squared correlations of a square with all coordinates, summed, from which on it is looked at.
 WORTH = 0.1
 #: Directions from which the smallest volume is looked for, and steps on the way.
 TRIED, STEPS = 3, 15
 #: Draws for each coordinate without which nothing is said of bends, and most draws that are looked at.
 DRAWS, ENOUGH = 40, 4000
-#: Coordinates at most: the work grows with their third power.
+#: Coordinates at most: the work grows with draws times their square.
 LARGEST = 60
 
 
@@ -77,29 +74,56 @@ class Bend:
         return Bend(self.drivers.to(dtype), self.shifts.to(dtype))
 
 
-def found_in(z: Tensor) -> tuple[Bend, float] | None:
-    """The bends of draws that are white, ``(S, P)``, and the log of the squared volume that is left of one.
+def found_in(z: Tensor, chains: Tensor) -> tuple[Bend, float] | None:
+    """The bends of draws that are about white, and the log of what they leave of the squared volume.
 
-    One driver after another is taken in, as long as the volume that the straightened draws fill shrinks. None where no
-    ridge is bent.
+    Bends that half of the chains show must straighten the draws of the other half too: chains that hardly move, and
+    single draws far out, bend by chance.
+
+    Args:
+        z: Draws ``(S, P)``.
+        chains: Whose each is ``(S,)``.
+
+    Returns:
+        None where no ridge is bent.
     """
     size = z.shape[1]
-    found = here = None
-    if size > LARGEST or len(z[:, 0].unique()) < DRAWS * size:  # a chain that stands still tells nothing anew
-        return found
-    z = z[:: max(1, len(z) // ENOUGH)]
-    drivers, volume = z.new_zeros(size, 0), 0.0
-    for number in range(1, min(MOST, size - 1) + 1):
-        rest = z if here is None else z - here.shift(z)
+    if size > LARGEST or len(z) < DRAWS * size:
+        return None
+    if len(z) > ENOUGH:
+        chosen = torch.randperm(len(z), generator=torch.Generator().manual_seed(0))[:ENOUGH].to(z.device)
+        z, chains = z[chosen], chains[chosen]
+    found = _fitted(z)
+    if found is None or not found[1] < math.log(LEAST):
+        return None
+    first = chains // 2 % 2 == 0  # pairs, as neighbours may begin at modes in turn
+    gain = 0.0
+    for fit, held in ((z[first], z[~first]), (z[~first], z[first])):
+        half = _fitted(fit) if len(fit) > size and len(held) > size else None
+        if half is None:
+            return None
+        gain += 0.5 * (_volume(held - half[0].shift(held)) - _volume(held))
+    return found if gain < math.log(NEXT) else None
+
+
+def _fitted(z: Tensor) -> tuple[Bend, float] | None:
+    """One driver after another, as long as the volume that the straightened draws fill shrinks."""
+    found = None
+    drivers, before, volume = z.new_zeros(z.shape[1], 0), _volume(z), 0.0
+    while drivers.shape[1] < min(MOST, z.shape[1] - 1):
+        rest = z if found is None else z - found[0].shift(z)
         ends = [_sharpened(z, torch.cat([drivers, new[:, None]], dim=1)) for new in _candidates(rest)]
         best = min(ends, key=lambda end: end.volume, default=None)
-        if best is None or not best.volume < volume + math.log(NEXT):
+        if best is None or not best.volume - before < volume + math.log(NEXT):
             break
-        drivers, volume = best.drivers, best.volume
-        here = Bend(drivers, best.shifts)
-        if volume < math.log(LEAST * FURTHER ** (number - 1)):
-            found = here, volume
+        drivers, volume = best.drivers, best.volume - before
+        found = Bend(drivers, best.shifts), volume
     return found
+
+
+def _volume(draws: Tensor) -> float:
+    """Log of the squared volume that draws fill about their mean, as normal ones would."""
+    return 2 * float(_root(draws - draws.mean(0)).diagonal().log().sum())
 
 
 class _Straight:
@@ -119,8 +143,7 @@ class _Straight:
         slopes = torch.linalg.solve_triangular(upper, self.basis.T @ z, upper=True)
         self.shifts = slopes[1 + drivers.shape[1] :]
         rest = z - pairs @ self.shifts
-        self.rest = rest - rest.mean(0)
-        self.factor = _root(self.rest)
+        self.factor = _root(rest - rest.mean(0))
         self.volume = 2 * float(self.factor.diagonal().log().sum())
 
     def moved(self, z: Tensor) -> Tensor:
@@ -140,7 +163,7 @@ class _Straight:
         slope = torch.einsum("ps,sjl,pkl->jk", white, terms, along)
         curve = torch.einsum("sjl,smn,pkl,pon->jkmo", terms, terms, along, along).reshape(size * number, -1)
         curve = curve + 1e-9 * curve.diagonal().mean() * torch.eye(len(curve)).to(curve)
-        return torch.linalg.solve(curve, slope.reshape(-1)).reshape(size, number)
+        return torch.linalg.solve_ex(curve, slope.reshape(-1)).result.reshape(size, number)
 
 
 def _sharpened(z: Tensor, drivers: Tensor) -> _Straight:
@@ -180,6 +203,7 @@ def _candidates(rest: Tensor) -> Tensor:
 
 
 def _root(offset: Tensor) -> Tensor:
-    """Triangular root of the covariance of draws about their mean, whose coordinates are of the order of one."""
+    """Triangular root of the covariance of draws about their mean; not a number where there is none."""
     tiny = 1e-12 * torch.eye(offset.shape[1]).to(offset)
-    return torch.linalg.cholesky(offset.T @ offset / len(offset) + tiny)
+    factor, failed = torch.linalg.cholesky_ex(offset.T @ offset / len(offset) + tiny)
+    return torch.where(failed == 0, factor, torch.nan)

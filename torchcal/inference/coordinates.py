@@ -81,8 +81,8 @@ class Whitened:
     def _bent(self, z: Tensor) -> Tensor:
         return z if self.bend is None else z + self.bend.shift(z)
 
-    def refined(self, z: Tensor, groups: Tensor, *, weight: float = 5.0) -> "Whitened":
-        """Coordinates in which pooled draws are white: z ``(S, P)``, each about the mean of its group ``(S,)``.
+    def refined(self, z: Tensor, groups: Tensor, chains: Tensor, *, weight: float = 5.0) -> "Whitened":
+        """Coordinates in which draws of chains are white: z ``(S, P)``, each about the mean of its group ``(S,)``.
 
         Groups are the modes that chains began at: where they stay apart, the distance between modes is no width. Where
         they are places on one bent ridge, all draws together fill less room when it is straightened.
@@ -93,7 +93,7 @@ class Whitened:
         center, factor = means[0], _factor(wide - means[groups], weight)
         middle, whole = wide.mean(0), _factor(wide - wide.mean(0), weight)
         white = torch.linalg.solve_triangular(whole, (wide - middle).T, upper=False).T
-        bend, found = None, found_in(white)
+        bend, found = None, found_in(white, chains)
         apart = 2 * float(factor.diagonal().log().sum() - whole.diagonal().log().sum())
         if found is not None and found[1] < apart + math.log(LEAST):
             rest = white - found[0].shift(white)
@@ -208,7 +208,8 @@ def gathered(
         if bool(settled.any()) and bool(stuck.any()):
             chosen = torch.multinomial(settled.to(z.dtype), int(stuck.sum()), replacement=True, generator=generator)
             z = z.index_copy(0, stuck.nonzero()[:, 0], z[chosen])
-    other = space.refined(pool, mode, weight=0.05)
+    chains = torch.arange(count, device=z.device).repeat(len(ways))[torch.cat(near)]
+    other = space.refined(pool, mode, chains, weight=0.05)
     return other, other.inner(space.outer(z))
 
 
