@@ -5,12 +5,13 @@ import hashlib
 import json
 import math
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks.concealed import generate, score
+from benchmarks.concealed import generate, ideal, score
 from benchmarks.concealed.check import tied_correlation
 from benchmarks.concealed.experiment import planted as planted_of
 from benchmarks.concealed.experiment import repeat
@@ -301,6 +302,73 @@ def test_an_experiment_in_time_takes_what_it_is_given():
                       "inputs": {"Ta": run.inputs["Ta"].tolist()}, "initial": {}}]}  # fmt: skip
     more = repeat(case, answer, {"initial": {"T": 200.0}, "time": [0.0, 10.0], "inputs": {"Ta": [20.0, 20.0]}})
     assert more["runs"][1]["outputs"]["T"] == pytest.approx([200.0, 20 + 180 * math.exp(-0.2)])
+
+
+# --- the judge who knows everything but the name --------------------------------------------------------
+
+
+def judged_line(monkeypatch, sd, *more, amplitude=0.1):
+    """`line` with a bend planted, other candidates beside it."""
+    family = line()
+    family = replace(family, effects=(*family.effects, *more))
+    monkeypatch.setitem(FAMILIES, "line", family)
+    case = {"family": "line", "x": {"x": [1.0, 2.0, 3.0]}, "y": {"y": [0.0, None, 1.0]}}
+    answer = {
+        "family": "line",
+        "effects": [{"name": "bend", "amplitude": amplitude, "shapes": {}, "gate": None}],
+        "rivals": [],
+        "noise": {"sd": {"y": sd}},
+        "parameters": {"m": 1.5},
+        "initial": [],
+        "refit": {"m": 1.6},
+    }
+    return ideal.judged(case, answer)
+
+
+def outputs(power):
+    return {"y": lambda t, s, p, u, y, c: y + c["a"] * u["x"] ** power}
+
+
+def test_the_judge_of_two_names_by_hand(monkeypatch):
+    """For one rival he is right with probability Φ(D / 2), D being the distance of its best fit in noise sd."""
+    sd, x = 0.015, np.array([1.0, 2.0, 3.0])
+    design = np.stack([x, x**3], axis=1)
+    truth = 0.1 * x**2
+    gap = np.linalg.norm(truth - design @ np.linalg.lstsq(design, truth, rcond=None)[0]) / sd
+    found = judged_line(monkeypatch, sd, Effect("cube", outputs=outputs(3)))
+    assert found["distances"] == {"cube": pytest.approx(gap, rel=1e-5)}
+    chance = 0.5 * (1 + math.erf(gap / 2 / math.sqrt(2)))
+    assert 0.7 < chance < 0.95  # or the test would see nothing
+    assert found["first"] == pytest.approx(chance, abs=5 * math.sqrt(chance * (1 - chance) / ideal.DRAWS))
+
+
+def test_the_judge_of_names_that_mean_the_same(monkeypatch):
+    """Of the planted effect under two other names he can say no more than that it is one of the three."""
+    found = judged_line(monkeypatch, 0.01, Effect("two", outputs=outputs(2)), Effect("three", outputs=outputs(2)))
+    assert list(found["distances"].values()) == pytest.approx([0, 0], abs=1e-4)
+    assert found["first"] == pytest.approx(1 / 3)
+
+
+def test_the_judge_knows_what_cannot_be(monkeypatch):
+    """A rival that would have to be stronger than any is none."""
+    weak = Effect("weak", outputs={"y": lambda t, s, p, u, y, c: y + c["a"] * (u["x"] - 1) * (u["x"] - 2)},
+                  within=(1e-9, 1e-8, None))  # fmt: skip
+    assert judged_line(monkeypatch, 0.01, weak) == {"first": 1.0, "distances": {}}
+
+
+def test_the_judge_allows_for_autocorrelation():
+    """Lengths are those of the exact covariance ρ^|i − j| within every output of every run, and none across."""
+    rho, rng = 0.6, np.random.default_rng(0)
+    runs = (RunSetting(np.arange(4.0)), RunSetting(np.arange(6.0)))
+    residual = rng.standard_normal(20)
+    covariance = np.zeros((20, 20))
+    for first, length in ((0, 4), (4, 6), (10, 4), (14, 6)):
+        i = np.arange(length)
+        covariance[first : first + length, first : first + length] = rho ** abs(i[:, None] - i)
+    left = ideal.white(residual, Setting(runs, observed=("a", "b")), rho)
+    assert left @ left == pytest.approx(residual @ np.linalg.solve(covariance, residual))
+    still = ideal.white(residual, Setting(x={"x": np.arange(10.0)}, observed=("a", "b")), 0.0)
+    np.testing.assert_array_equal(still, residual)
 
 
 def test_a_system_that_blows_up_is_a_failure():

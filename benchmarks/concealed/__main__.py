@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from benchmarks.concealed import followup, generate, peers, run, score
+from benchmarks.concealed import followup, generate, ideal, peers, run, score
 from benchmarks.concealed.workers import read
 
 SMALL = 16
@@ -32,6 +32,7 @@ def main() -> None:
     if not given.small:
         followup.experiments(given.out, workers=given.workers, limit=given.limit)
         followup.limits(given.out, workers=given.workers, limit=given.limit)
+        ideal.run(given.out, workers=given.workers)
         if not given.no_peers:
             peers.run(given.out, workers=given.workers)
     print(score.score(given.out))

@@ -17,7 +17,7 @@ from benchmarks.concealed.workers import read, run_all
 OTHER_UNITS = ("radiation", "evaporation", "lag of")
 
 
-def _setting(case: Mapping[str, Any], answer: Mapping[str, Any]) -> Setting:
+def setting_of(case: Mapping[str, Any], answer: Mapping[str, Any]) -> Setting:
     if "runs" not in case:
         return Setting(x={k: np.asarray(v, dtype=float) for k, v in case["x"].items()}, observed=tuple(case["y"]))
     runs = tuple(
@@ -40,7 +40,7 @@ def plant_at_limit(
     Returns:
         The case, the term and the stated power; None where no candidate is fit for it.
     """
-    family, setting = FAMILIES[answer["family"]], _setting(case, answer)
+    family, setting = FAMILIES[answer["family"]], setting_of(case, answer)
     able = {
         e.name: e for e in family.library
         if not e.shapes and not e.name.startswith(OTHER_UNITS) and all(o in setting.observed for o in e.outputs)

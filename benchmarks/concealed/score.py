@@ -10,6 +10,8 @@ What the numbers mean:
 - *top-1 as stated*: the same as far as the tool's own probabilities go, the mean over the cases of the first
   hypothesis' share of all that have terms (0 with another verdict). Beyond it top-1 can only be luck, if the
   probabilities are right; if they are, the two agree.
+- *top-1 of a judge*: what it would be for a judge who knows everything but the name (`ideal.py`): nobody can be
+  expected to reach more.
 - *tied-set hit*: named right, or ``ambiguous`` with the planted term among the tied hypotheses.
 - *false alarm*: any verdict but ``consistent`` on a null; for a peer any term.
 - *wrong name*: verdict ``named`` where the effect is not in the library.
@@ -326,6 +328,7 @@ def table(
     results: Mapping[str, Mapping[str, Any]],
     answers: Mapping[str, Mapping[str, Any]],
     cases: Mapping[str, Mapping[str, Any]] | None = None,
+    ideal: Mapping[str, float] | None = None,
 ) -> dict[str, dict[str, Any]]:
     """Every measure for torchcal, by band and over all. A case that failed counts as no answer."""
     rows: dict[str, dict[str, Any]] = {}
@@ -343,6 +346,8 @@ def table(
         keys = pick(single, name)
         column["top-1"] = share(top(results[k], answers[k]) for k in keys)
         column["top-1 as stated"] = average(first_share(results[k]) for k in keys)
+        if ideal:
+            column["top-1 of a judge"] = average(ideal[k] for k in keys if k in ideal)
         column["named right"] = share(credit(results[k], answers[k]) for k in keys)
         column["tied-set hit"] = share(tied_hit(results[k], answers[k]) for k in keys)
         column["two terms, credit"] = share(credit(results[k], answers[k]) for k in pick(("two",), name))
@@ -509,7 +514,8 @@ def score(out: Path) -> str:
     results = {row["id"]: row for row in read(out / "results.jsonl")}
     peers = {row["id"]: row for row in read(out / "peers.jsonl")}
     cases = {key: json.loads((out / "cases" / f"{key}.json").read_text()) for key in answers if key in results}
-    rows = table(results, answers, cases)
+    ideal = {row["id"]: row["first"] for row in read(out / "ideal.jsonl") if "first" in row}
+    rows = table(results, answers, cases, ideal)
     points = reliability(results, answers)
     parts = [f"{len(results)} of {len(answers)} cases. Intervals: Wilson 95 % (medians: quartiles).", "",
              markdown(rows, goals=True)]  # fmt: skip
