@@ -164,7 +164,8 @@ def oscillator(rho, size, seed, n=250):
     return base, tc.Recording(runs=[run])
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
 def test_correlated_noise_is_estimated_beside_the_term_that_is_there(seed):
     base, data = oscillator(0.75, 0.02, seed)
     library = [term for term in tc.terms.mechanics() if term.name in TERMS]

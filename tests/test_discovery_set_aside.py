@@ -253,6 +253,7 @@ def test_an_unseen_angle_is_that_of_no_other_turn():
     assert d.terms == ["pitch damping"]
 
 
+@pytest.mark.slow
 def test_a_scale_that_the_base_leaves_open_leaves_no_term_open():
     # Neither the unseen mRNA nor its scale is known, so that the number in its saturation is open, too. It is there.
     t = np.linspace(0, 40, 81)

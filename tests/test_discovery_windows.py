@@ -121,6 +121,7 @@ def test_outliers_that_a_strong_local_effect_hid_are_set_aside(binding):
     assert len(wrong) <= d.noise.outliers <= 2 * len(wrong)
 
 
+@pytest.mark.slow
 def test_outliers_are_judged_on_all_data_however_often():
     # Setting one more aside in the first round must not bring all others back in the second.
     rng = np.random.default_rng(2)
@@ -169,6 +170,7 @@ def test_a_term_called_window_is_judged_like_any_other():
     assert d.verdict != "named"
 
 
+@pytest.mark.slow
 def test_a_strong_local_change_of_an_output_is_found_around_its_own_fit():
     # A valve whose flow depends on viscosity only where it is wide open.
     rng = np.random.default_rng(5)

@@ -8,8 +8,9 @@ import pytest
 
 DOCS = Path(__file__).parents[1] / "docs"
 GUIDES = sorted(path for path in (DOCS / "how_to").glob("*.md") if path.stem != "index")
-#: About finding what was left out: seconds each. The others sample for a minute or more.
-QUICK = ("diagnose_in_time", "diagnose_static", "write_a_term", "read_a_diagnosis", "what_is_noise", "hold_out")
+#: About finding what was left out: seconds each, or some more. The others sample for a minute or longer.
+QUICK = ("diagnose_static", "write_a_term", "what_is_noise", "hold_out")
+LONGER = ("diagnose_in_time", "read_a_diagnosis")
 
 
 def blocks(pattern: str, text: str) -> list[str]:
@@ -20,7 +21,7 @@ def code(page: Path) -> str:
     return "\n".join(blocks(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8")))
 
 
-@pytest.mark.parametrize("name", QUICK)
+@pytest.mark.parametrize("name", [*QUICK, *(pytest.param(name, marks=pytest.mark.slow) for name in LONGER)])
 def test_guide_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(plt, "show", lambda *args, **kwargs: None)

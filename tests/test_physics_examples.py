@@ -149,12 +149,15 @@ def test_evaporation_predicts_the_second_half_of_the_mug(loss: str | None, rmse:
     assert fit_mug(loss, until=120.0)[2] == pytest.approx(rmse, abs=5e-3)
 
 
-def test_the_mug_is_told_to_evaporate():
+@pytest.mark.parametrize("among", ["losses", pytest.param("all", marks=pytest.mark.slow)])
+def test_the_mug_is_told_to_evaporate(among: str):
     needs_mug()
+    losses = ("natural convection", "radiation", "evaporation", "second heat capacity")
+    candidates = [term for term in cooling_water.candidates() if among == "all" or term.name in losses]
     diagnosis = tc.diagnose(
         cooling_water.simulator(),
         cooling_water.recording(),
-        cooling_water.candidates(),
+        candidates,
         holdout=cooling_water.later(),
         progress=False,
     )
@@ -468,7 +471,11 @@ def test_forty_years_of_mercury_need_relativity():
 
 
 @pytest.mark.parametrize(
-    "years", [pytest.param(0.5, id="half a year"), pytest.param(4.0, id="4 years", marks=pytest.mark.slow)]
+    "years",
+    [
+        pytest.param(0.5, id="half a year", marks=pytest.mark.slow),
+        pytest.param(4.0, id="4 years", marks=pytest.mark.slow),
+    ],
 )
 def test_relativity_is_named(years: float):
     needs_ephemeris()

@@ -1,7 +1,7 @@
 """Every built-in term is planted once in a base model of its field, hidden by calibration and noise, and looked for.
 
 It must come back named, or among the tied, or as an alias of one that is, or be called part of the base model where
-that is the truth. An eighth of them runs always, the rest with the slow tests.
+that is the truth. A twelfth of them runs always, the rest with the slow tests.
 """
 
 from collections.abc import Callable
@@ -82,7 +82,7 @@ def mechanics() -> Field:
             "lag of x": {"a": 1.0, "t90": 0.5},
             "delay of x": {"a": 1.0, "D": 0.3},
         },
-        ("bias force", "linear spring", "offset of x"),
+        ("linear spring", "offset of x"),
         ("linear drag", "linear spring"),
     )
 
@@ -151,7 +151,7 @@ def thermal() -> Field:
             "lag of T": {"a": 1.0, "t90": 1.5},
             "delay of T": {"a": 1.0, "D": 1.0},
         },
-        ("heater gain error", "second heat capacity"),
+        ("heater gain error",),
         ("Newton cooling", "heater gain error"),
     )
 
@@ -247,7 +247,7 @@ def kinetics() -> Field:
             "lag of B": {"a": 1.0, "t90": 3.0},
             "delay of B": {"a": 1.0, "D": 1.0},
         },
-        ("reverse reaction", "offset of B", "lag of A"),
+        ("offset of B",),
     )
 
 
@@ -276,7 +276,7 @@ def electrical() -> Field:
             "non-linear capacitance": {"a": 0.25},
             "self-heating": {"a": 0.4, "tau": 2.0},
         },
-        ("shunt", "leakage current", "series resistance"),
+        ("shunt", "series resistance"),
         ("shunt",),
     )
 
@@ -370,9 +370,9 @@ def test_every_term_of_every_field_is_planted():
         if name != "coil":
             assert set(field.effects) == {term.name for term in field.library}, name
         assert set(field.quick) <= set(field.effects)
-        assert len(field.quick) >= len(field.effects) // 10
+        assert field.quick
     quick = sum(len(field.quick) for field in FIELDS.values())
-    assert quick >= 0.12 * len(CASES)
+    assert quick >= len(CASES) / 12
 
 
 @pytest.mark.parametrize(("name", "effect"), CASES)

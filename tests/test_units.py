@@ -62,7 +62,7 @@ def test_the_default_tolerance_respects_known_noise():
     x = torch.linspace(-1, 1, 21, dtype=torch.float64)
     sd = noise / float((x - x.mean()).square().sum().sqrt())
     z = []
-    for seed in range(4):
+    for seed in range(2):
         generator = torch.Generator().manual_seed(seed)
         y = 1 + 2 * x + noise * torch.randn(21, generator=generator, dtype=torch.float64)
         simulator = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
@@ -70,10 +70,11 @@ def test_the_default_tolerance_respects_known_noise():
         slope = result.propagate.parameter_moments(result.draws)[0][:, 1]
         assert float(slope.std()) > 0.5 * sd
         z.append((float(slope.mean()) - 2) / float(slope.std()))
-    # Four standard normal numbers: the largest is past 4 once in 4000 times; a posterior half as wide doubles them.
+    # Two standard normal numbers: the larger is past 4 once in 8000 times; a posterior half as wide doubles them.
     assert max(abs(value) for value in z) < 8
 
 
+@pytest.mark.slow
 def test_a_users_own_bounded_model_is_sampled_with_the_defaults_of_nuts():
     """Pyro starts in the middle of the support's coordinates: spreads there are small against the ranges."""
     x = torch.linspace(0, 3, 6, dtype=torch.float64)
