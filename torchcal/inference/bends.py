@@ -44,9 +44,7 @@ class Bend:
     _pairs: tuple[Tensor, Tensor] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        size = self.drivers.shape[1]
-        first, second = torch.triu_indices(size, size, device=self.drivers.device).unbind(0)
-        object.__setattr__(self, "_pairs", (first, second))
+        object.__setattr__(self, "_pairs", _pairs(self.drivers))
 
     def products(self, z: Tensor) -> Tensor:
         """Of the drivers, every pair once, ``(C, F)``."""
@@ -72,6 +70,12 @@ class Bend:
     def to(self, dtype: torch.dtype) -> "Bend":
         """In another dtype."""
         return Bend(self.drivers.to(dtype), self.shifts.to(dtype))
+
+
+def _pairs(drivers: Tensor) -> tuple[Tensor, Tensor]:
+    """Numbers k ≤ l of every pair of drivers ``(P, K)``."""
+    first, second = torch.triu_indices(drivers.shape[1], drivers.shape[1], device=drivers.device).unbind(0)
+    return first, second
 
 
 def found_in(z: Tensor, chains: Tensor) -> tuple[Bend, float] | None:
@@ -135,7 +139,8 @@ class _Straight:
 
     def __init__(self, z: Tensor, drivers: Tensor) -> None:
         self.drivers = drivers / (z @ drivers).std(0)
-        first, second = torch.triu_indices(drivers.shape[1], drivers.shape[1], device=z.device)
+        self.pairs = _pairs(self.drivers)
+        first, second = self.pairs
         self.t = z @ self.drivers
         pairs = self.t[:, first] * self.t[:, second]
         # An orthonormal basis of what is fitted: a constant, the drivers, their products.
@@ -153,7 +158,7 @@ class _Straight:
         left = z - self.basis @ (self.basis.T @ z)
         white = torch.linalg.solve_triangular(self.factor, left.T, upper=False)  # (P, S)
         shifts = torch.linalg.solve_triangular(self.factor, self.shifts.T, upper=False)  # (P, F)
-        first, second = torch.triu_indices(number, number, device=z.device)
+        first, second = self.pairs
         along = shifts.new_zeros(size, number, number)
         along[:, first, second] += shifts
         along[:, second, first] += shifts
