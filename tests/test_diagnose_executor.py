@@ -1,8 +1,10 @@
-"""`diagnose(executor=)`: the same diagnosis from workers, and what cannot be sent to them."""
+"""`diagnose(executor=)`: the same diagnosis from workers, what cannot be sent to them; and Ctrl-C."""
 
 import math
 import multiprocessing
 import pickle
+import signal
+import sys
 import threading
 import time
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
@@ -13,6 +15,8 @@ import torch
 
 import torchcal as tc
 from torchcal.discovery.refits import Refit
+from torchcal.discovery.search import Search
+from torchcal.discovery.stop import Stop
 from torchcal.errors import ConvergenceWarning, DomainError
 from torchcal.simulators import Trajectories
 
@@ -262,3 +266,69 @@ def test_an_interruption_among_pairs_names_no_single_term_as_missing(motion, mon
     assert d.settings["interrupted"] == (
         "The search was interrupted before several of them had been refitted together."
     )
+
+
+@pytest.mark.parametrize("place", ["calibrate_base", "screen_all"])
+def test_an_interruption_outside_of_refits_keeps_what_there_is(motion, monkeypatch, place):
+    """As the terminal sends it, while the base is calibrated or candidates are screened."""
+    work = getattr(Search, place)
+
+    def interrupted(search):
+        signal.raise_signal(signal.SIGINT)
+        return work(search)
+
+    monkeypatch.setattr(Search, place, interrupted)
+    with pytest.warns(ConvergenceWarning, match="It keeps 0 refitted"):
+        d = diagnose(motion)
+    assert d.verdict == "unexplained"
+    assert d.settings["interrupted"].endswith("before cubic stiffness, bias force had been refitted.")
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_interruption_of_a_finished_search_changes_nothing(motion, monkeypatch):
+    module = sys.modules["torchcal.discovery.diagnose"]  # whose name is that of its function, too
+    work = module._result
+
+    def interrupted(*args):
+        signal.raise_signal(signal.SIGINT)
+        return work(*args)
+
+    monkeypatch.setattr(module, "_result", interrupted)
+    d = diagnose(motion, library()[-1:])
+    assert (d.verdict, d.terms, d.settings["interrupted"]) == ("named", ["bias force"], "")
+
+
+def test_a_second_interruption_ends_all(motion, monkeypatch):
+    def impatient(search):
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Search, "screen_all", impatient)
+    with pytest.raises(KeyboardInterrupt):
+        diagnose(motion)
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_a_signal_among_refits_ends_the_one_under_way():
+    stop = Stop()
+    with stop.listening():
+        with stop.refitting():
+            signal.raise_signal(signal.SIGINT)
+            raise AssertionError("went on")
+        assert stop.is_set()
+
+
+def test_nobody_elses_handler_is_replaced():
+    def own(number, frame):
+        pass
+
+    stop = Stop()
+    before = signal.signal(signal.SIGINT, own)
+    try:
+        with stop.listening():
+            assert signal.getsignal(signal.SIGINT) is own
+    finally:
+        signal.signal(signal.SIGINT, before)
+    with ThreadPoolExecutor(1) as pool:  # where no handler can be set
+        pool.submit(lambda: stop.listening().__enter__()).result()
+    assert signal.getsignal(signal.SIGINT) is before

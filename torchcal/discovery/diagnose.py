@@ -95,8 +95,7 @@ def diagnose(
 
     Warns:
         ConvergenceWarning: If few starting values of the base agree, or it explains no more than a constant. After
-            Ctrl-C among the refits, of which the diagnosis then keeps those that have ended: it names nothing, and says
-            what it has not refitted.
+            Ctrl-C, the diagnosis keeps the refits that have ended: it names nothing, and says what it has not refitted.
     """
     begun = time.perf_counter()
     terms = _check(simulator, recording, candidates, confidence)
@@ -130,24 +129,29 @@ def diagnose(
 
     try:
         search = Search(problem, terms, fixed or {}, seed, num_starts, max_terms, tick, executor)
-        tick("calibrate the base")
-        search.calibrate_base()
-        if holdout is None and mask is not None and _beyond_prediction(search, mask):
-            mask = verify.within(recording)
-        search, detected = settle(search, problem, confidence)
-        suspect: tuple[str, ...] = ()
-        aside = search.problem.n < problem.n and not search.stop.is_set()
-        if terms and aside and not (detected and explains(search)):
-            # What the best model misses is no outlier of it; where there is none, all physics may have been set aside.
-            every, suspect = with_all(search, problem, detected, confidence)
-            if every is not None:
-                search, detected = every, True
-        if detected and terms and not search.stop.is_set():
-            refit_several(search)
-        decision = decide(search, detected, mask)
-        if search.stop.is_set():
-            _hold_back(search, decision)
-        return _result(search, decision, simulator, recording, mask, confidence, begun, given, seed, suspect)
+        with search.stop.listening():
+            tick("calibrate the base")
+            search.calibrate_base()
+            if holdout is None and mask is not None and _beyond_prediction(search, mask):
+                mask = verify.within(recording)
+            search, detected = settle(search, problem, confidence)
+            suspect: tuple[str, ...] = ()
+            aside = search.problem.n < problem.n and not search.stop.is_set()
+            if terms and aside and not (detected and explains(search)):
+                # What the best model misses is no outlier of it; where there is none, all physics may have been set
+                # aside.
+                every, suspect = with_all(search, problem, detected, confidence)
+                if every is not None:
+                    search, detected = every, True
+            if detected and terms and not search.stop.is_set():
+                refit_several(search)
+            decision = decide(search, detected, mask)
+            interrupted = _interruption(search)
+            if interrupted:
+                _hold_back(search, decision)
+            return _result(
+                search, decision, simulator, recording, mask, confidence, begun, given, seed, suspect, interrupted
+            )
     finally:
         bar.close()
 
@@ -261,6 +265,7 @@ def _result(
     terms: list[Term],
     seed: int,
     suspect: tuple[str, ...],
+    interrupted: str,
 ) -> Diagnosis:
     best = decision.best
     shown = best or (decision.tied_models[0] if decision.tied_models else None)
@@ -321,7 +326,7 @@ def _result(
             "doubt": decision.doubt,
             "nearly": decision.nearly,
             "set_aside": suspect,
-            "interrupted": _interruption(search),
+            "interrupted": interrupted,
             "region": None if best is None else best.where,
             "solver": _solver(search.problem.simulator),
         },

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -21,6 +20,7 @@ from torchcal.discovery.own_noise import suited
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.refits import Refit, refit_all
 from torchcal.discovery.screen import Screening, Window, screen, windows
+from torchcal.discovery.stop import Stop
 from torchcal.discovery.structure import Residual, Structure, analyse
 from torchcal.discovery.verify import HeldOut, held_out_fit
 from torchcal.simulators import Trajectories
@@ -53,7 +53,7 @@ SAME = 0.9999
 class Search:
     """The state of a diagnosis: the base's fit, the noise, the candidates and the models refitted so far.
 
-    Ctrl-C among refits sets ``stop``: those that have ended stay, and no other one begins.
+    Ctrl-C sets ``stop``: refits that have ended stay, and no other one begins.
     """
 
     problem: Problem
@@ -66,7 +66,7 @@ class Search:
     executor: Executor | None = None
     clean: bool = False
     unit: Tensor | None = None
-    stop: threading.Event = field(default_factory=threading.Event)
+    stop: Stop = field(default_factory=Stop)
     base: Fitted = field(init=False)
     noise: Noise = field(init=False)
     tangents: Tangents = field(init=False)
@@ -348,10 +348,8 @@ class Search:
             found[index] = fitted
             self.tick(f"refit with {names[index]}")
 
-        try:
+        with self.stop.refitting():
             refit_all(jobs, take, self.executor)
-        except KeyboardInterrupt:
-            self.stop.set()
         return [
             None if fitted is None
             else self._judge(Model(one.numbers, one.candidate, fitted, 0.0, one.prior, True, window=one.window))
