@@ -9,15 +9,16 @@ He says the name whose curve is nearest to the recording in the metric of the no
 of noisy recordings in which that is the planted name is the case's *top-1 of a judge*. A tool, which must find those
 numbers from the recording, has less to go by.
 
-Left out are candidates that the truth could not have held: of a strength that no case has, or an amplitude that nature
-does not have. Shapes are tried on a grid, and gates for none but the planted effect, so that a rival may be a little
-nearer yet.
+Left out are candidates with an amplitude that nature does not have; how strong the suite's effects are is told to
+nobody. Shapes are tried on a grid, and gates for none but the planted effect, so that a rival may be a little nearer
+yet.
 """
 
 import argparse
 import functools
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +26,26 @@ import numpy as np
 
 from benchmarks.concealed.experiment import planted
 from benchmarks.concealed.families import FAMILIES
-from benchmarks.concealed.families.base import Array, Effect, Failure, Planted, Setting, simulate, stacked, truth_vector
+from benchmarks.concealed.families.base import (
+    Array,
+    Effect,
+    Failure,
+    Planted,
+    Setting,
+    simulate,
+    stacked,
+    truth_vector,
+    unknowns,
+)
 from benchmarks.concealed.followup import setting_of
-from benchmarks.concealed.generate import STRENGTHS, largest, recalibrate, strength
+from benchmarks.concealed.generate import largest, recalibrate
 from benchmarks.concealed.peers import read_case, shape_grid
 from benchmarks.concealed.score import names_of
 from benchmarks.concealed.workers import read, run_all
 
 DRAWS = 20_000
+PARTS = 2
+"""Time steps a sample."""
 SAME = 0.01
 """Distance in noise sd below which a rival's curve is the planted effect's own, and the judge guesses."""
 
@@ -51,31 +64,35 @@ def nearest(case: Mapping[str, Any], answer: Mapping[str, Any], effect: Effect) 
     """The truth less a candidate's best fit to it, white and in units of the noise; None where none is possible."""
     family, setting, sd = FAMILIES[answer["family"]], setting_of(case, answer), answer["noise"]["sd"]
     theta = truth_vector(family, setting, answer["parameters"])
-    target = stacked(family, setting, simulate(family, setting, theta, planted(answer)), sd)[0]
-    refit = np.array([value for value in answer["refit"].values()])
-    best: Array | None = None
-    for shapes in shape_grid(read_case(case), effect):
-        for sign in (effect.sign,) if effect.sign else (1, -1):
-            for start in (theta, refit):
-                item = Planted(effect, sign * (effect.guess if effect.stiff else 0.05 * effect.guess), shapes)
-                try:
-                    z, residual = recalibrate(
-                        family, setting, target, sd, start, np.random.default_rng(0), starts=1, planted=[item]
-                    )
-                    item = Planted(effect, float(z[-1]), shapes)
-                    traces = simulate(family, setting, z[:-1], [item])
-                    size = strength(family, item, traces)
-                except Failure:
-                    continue
-                if effect.within is not None:
-                    low, high, driver = effect.within
-                    unit = 1.0 if driver is None else largest(setting, traces, driver)
-                    if not low * unit <= abs(item.amplitude) <= high * unit:
-                        continue
-                if STRENGTHS[0] <= size <= STRENGTHS[1]:
-                    left = white(residual, setting, answer["noise"].get("rho", 0.0))
-                    best = left if best is None or left @ left < best @ best else best
-    return best
+    truth = simulate(family, setting, theta, planted(answer), quick=PARTS)  # with the steps of the fits
+    target = stacked(family, setting, truth, sd)[0]
+    first = effect.guess if effect.stiff else 0.05 * effect.guess
+
+    def fitted(start: Array, item: Planted) -> tuple[Array, Planted] | None:
+        try:
+            z, residual = recalibrate(
+                family, setting, target, sd, start, np.random.default_rng(0), starts=1, planted=[item], parts=PARTS
+            )
+            item = replace(item, amplitude=float(z[-1]))
+            if effect.within is not None:
+                low, high, driver = effect.within
+                unit = 1.0 if driver is None else largest(setting, simulate(family, setting, z[:-1], [item]), driver)
+                if not low * unit <= abs(item.amplitude) <= high * unit:
+                    return None
+        except Failure:
+            return None
+        return white(residual, setting, answer["noise"].get("rho", 0.0)), item
+
+    def best(found: Iterable[tuple[Array, Planted] | None]) -> tuple[Array, Planted] | None:
+        return min(filter(None, found), key=lambda one: float(one[0] @ one[0]), default=None)
+
+    shapes = shape_grid(read_case(case), effect)
+    places = [name if number is None else f"{name}(0)[{number}]" for name, number in unknowns(family, setting)]
+    refit = np.array([answer["refit"][place] for place in places])
+    near = best(fitted(refit, Planted(effect, (effect.sign or 1) * first, shape)) for shape in shapes)
+    if near is not None:  # once more from the truth
+        near = best([near, fitted(theta, near[1])])
+    return None if near is None else near[0]
 
 
 def judged(case: Mapping[str, Any], answer: Mapping[str, Any]) -> dict[str, Any]:
