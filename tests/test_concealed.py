@@ -307,7 +307,7 @@ def test_an_experiment_in_time_takes_what_it_is_given():
 # --- the judge who knows everything but the name --------------------------------------------------------
 
 
-def judged_line(monkeypatch, sd, *more, amplitude=0.1):
+def judged_line(monkeypatch, sd, *more, gate=None):
     """`line` with a bend planted, other candidates beside it."""
     family = line()
     family = replace(family, effects=(*family.effects, *more))
@@ -315,7 +315,7 @@ def judged_line(monkeypatch, sd, *more, amplitude=0.1):
     case = {"family": "line", "x": {"x": [1.0, 2.0, 3.0]}, "y": {"y": [0.0, None, 1.0]}}
     answer = {
         "family": "line",
-        "effects": [{"name": "bend", "amplitude": amplitude, "shapes": {}, "gate": None}],
+        "effects": [{"name": "bend", "amplitude": 0.1, "shapes": {}, "gate": gate}],
         "rivals": [],
         "noise": {"sd": {"y": sd}},
         "parameters": {"m": 1.5},
@@ -347,6 +347,14 @@ def test_the_judge_of_names_that_mean_the_same(monkeypatch):
     found = judged_line(monkeypatch, 0.01, Effect("two", outputs=outputs(2)), Effect("three", outputs=outputs(2)))
     assert list(found["distances"].values()) == pytest.approx([0, 0], abs=1e-4)
     assert found["first"] == pytest.approx(1 / 3)
+
+
+def test_rivals_of_a_local_effect_may_act_in_its_range(monkeypatch):
+    """At the only datum in the range a bend and a cube of the right sizes are one."""
+    gate = {"driver": "x", "low": 2.5, "high": None, "width": 0.0}
+    found = judged_line(monkeypatch, 0.01, Effect("cube", outputs=outputs(3)), gate=gate)
+    assert found["distances"] == {"cube": pytest.approx(0, abs=1e-4)}
+    assert found["first"] == pytest.approx(1 / 2)
 
 
 def test_the_judge_knows_what_cannot_be(monkeypatch):

@@ -10,8 +10,8 @@ of noisy recordings in which that is the planted name is the case's *top-1 of a 
 numbers from the recording, has less to go by.
 
 Left out are candidates with an amplitude that nature does not have; how strong the suite's effects are is told to
-nobody. Shapes are tried on a grid, and gates for none but the planted effect, so that a rival may be a little nearer
-yet.
+nobody. Shapes are tried on a grid; where the planted effect acts in a range alone, so may its rivals, in that same
+range. So a rival may be a little nearer yet.
 """
 
 import argparse
@@ -86,10 +86,11 @@ def nearest(case: Mapping[str, Any], answer: Mapping[str, Any], effect: Effect) 
     def best(found: Iterable[tuple[Array, Planted] | None]) -> tuple[Array, Planted] | None:
         return min(filter(None, found), key=lambda one: float(one[0] @ one[0]), default=None)
 
-    shapes = shape_grid(read_case(case), effect)
+    gates = {None, planted(answer)[0].gate}
+    kinds = [(shape, gate) for shape in shape_grid(read_case(case), effect) for gate in gates]
     places = [name if number is None else f"{name}(0)[{number}]" for name, number in unknowns(family, setting)]
     refit = np.array([answer["refit"][place] for place in places])
-    near = best(fitted(refit, Planted(effect, (effect.sign or 1) * first, shape)) for shape in shapes)
+    near = best(fitted(refit, Planted(effect, (effect.sign or 1) * first, *kind)) for kind in kinds)
     if near is not None:  # once more from the truth
         near = best([near, fitted(theta, near[1])])
     return None if near is None else near[0]
