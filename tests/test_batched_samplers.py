@@ -180,6 +180,7 @@ def test_divergences_are_counted(kernel):
     assert draws.divergences > 0
 
 
+@pytest.mark.slow
 def test_draws_with_divergences_are_drawn_anew_with_smaller_steps():
     """A mild funnel: the warm-up, which is short, hardly meets its neck, and a long run does."""
 

@@ -85,6 +85,7 @@ def test_a_target_changes_how_many_draws_and_not_which(reached):
     assert plain.map.objective == result.map.objective
 
 
+@pytest.mark.slow
 def test_nor_does_it_with_trees_of_any_length():
     """Chains are not equally far when the first 100 draws of each are looked at."""
     options = {"num_samples": 110, "num_chains": 4, "num_warmup": 40}

@@ -219,6 +219,7 @@ def test_more_data_do_not_narrow_the_map_prediction(model: str, trial: float) ->
     assert 1 - many / few == pytest.approx(trial, abs=0.01)
 
 
+@pytest.mark.slow
 def test_more_data_narrow_the_posterior_and_the_conventional_push_forward() -> None:
     # 30 %: with few data the ends of the interval weigh more, where residuals are large; the posterior of the
     # additive model is Student's, with 9 degrees of freedom at N = 11.

@@ -268,6 +268,15 @@ def test_an_interruption_among_pairs_names_no_single_term_as_missing(motion, mon
     )
 
 
+@pytest.fixture
+def terminal():
+    """Python's own handler, which a process begun in the background may lack."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("terminal")
 @pytest.mark.parametrize("place", ["calibrate_base", "screen_all"])
 def test_an_interruption_outside_of_refits_keeps_what_there_is(motion, monkeypatch, place):
     """As the terminal sends it, while the base is calibrated or candidates are screened."""
@@ -285,6 +294,7 @@ def test_an_interruption_outside_of_refits_keeps_what_there_is(motion, monkeypat
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@pytest.mark.usefixtures("terminal")
 def test_an_interruption_of_a_finished_search_changes_nothing(motion, monkeypatch):
     module = sys.modules["torchcal.discovery.diagnose"]  # whose name is that of its function, too
     work = module._result
@@ -298,6 +308,7 @@ def test_an_interruption_of_a_finished_search_changes_nothing(motion, monkeypatc
     assert (d.verdict, d.terms, d.settings["interrupted"]) == ("named", ["bias force"], "")
 
 
+@pytest.mark.usefixtures("terminal")
 def test_a_second_interruption_ends_all(motion, monkeypatch):
     def impatient(search):
         signal.raise_signal(signal.SIGINT)
@@ -309,6 +320,7 @@ def test_a_second_interruption_ends_all(motion, monkeypatch):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@pytest.mark.usefixtures("terminal")
 def test_a_signal_among_refits_ends_the_one_under_way():
     stop = Stop()
     with stop.listening():
@@ -318,17 +330,16 @@ def test_a_signal_among_refits_ends_the_one_under_way():
         assert stop.is_set()
 
 
+@pytest.mark.usefixtures("terminal")
 def test_nobody_elses_handler_is_replaced():
     def own(number, frame):
         pass
 
     stop = Stop()
-    before = signal.signal(signal.SIGINT, own)
-    try:
-        with stop.listening():
-            assert signal.getsignal(signal.SIGINT) is own
-    finally:
-        signal.signal(signal.SIGINT, before)
     with ThreadPoolExecutor(1) as pool:  # where no handler can be set
         pool.submit(lambda: stop.listening().__enter__()).result()
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    for other in (own, signal.SIG_IGN):
+        signal.signal(signal.SIGINT, other)
+        with stop.listening():
+            assert signal.getsignal(signal.SIGINT) is other

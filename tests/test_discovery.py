@@ -532,6 +532,7 @@ def test_an_effect_in_a_region_is_found_there():
     assert d.improved.parameters[3].initial == pytest.approx(low)
 
 
+@pytest.mark.slow
 def test_a_faulty_sensor_is_named():
     library = [*named(tc.terms.mechanics(), "quadratic drag", "bias force", "cubic stiffness"),
                *named(tc.terms.sensor(("x",)), "offset of x", "drift of x", "saturation of x")]  # fmt: skip
@@ -613,9 +614,8 @@ def test_what_the_base_holds_already_is_never_named():
         assert next(r for r in d.ranking if r.terms == (name,)).note == "already in the base model"
 
 
-@pytest.mark.parametrize(
-    ("truth", "bounds"), [(-0.2, {"low": 0.0}), pytest.param(0.2, {"high": 0.0}, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("truth", "bounds"), [(-0.2, {"low": 0.0}), (0.2, {"high": 0.0})])
 def test_an_estimate_that_wants_to_cross_its_bound_is_not_named(truth, bounds):
     # Only hardening, or only softening, is allowed, and it is what the spring does not do.
     def term(**bounds):

@@ -55,6 +55,7 @@ def test_both_calibrations_of_two_outputs(scale):
     torch.testing.assert_close(found[0][1], found[1][1], rtol=1e-4, atol=0)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::torchcal.errors.ToleranceWarning")  # the model is exact: there is only noise
 def test_the_default_tolerance_respects_known_noise():
     """An exact line with noise s = 0.3: the slope's posterior cannot be much narrower than least squares allows."""
