@@ -543,6 +543,7 @@ def test_a_faulty_sensor_is_named():
     assert d.where[0].kind == "output"
 
 
+@pytest.mark.slow
 def test_a_hidden_state_is_named():
     library = named(tc.terms.mechanics(), "quadratic drag", "cubic stiffness", "bias force", "viscoelastic branch")
     body, _, x = spring(named(library, "viscoelastic branch"),

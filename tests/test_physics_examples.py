@@ -233,10 +233,10 @@ def test_the_cell_lacks_two_resistances_and_neither_is_enough():
     assert 1 / both["gsh"] == pytest.approx(52.9, abs=0.1)
 
 
-def test_both_resistances_of_the_cell_are_named():
-    diagnosis = tc.diagnose(
-        photovoltaic.simulator(), photovoltaic.recording(), photovoltaic.candidates(), progress=False
-    )
+@pytest.mark.parametrize("among", [3, pytest.param(None, marks=pytest.mark.slow)])
+def test_both_resistances_of_the_cell_are_named(among: int | None):
+    candidates = photovoltaic.candidates()[:among]
+    diagnosis = tc.diagnose(photovoltaic.simulator(), photovoltaic.recording(), candidates, progress=False)
     assert diagnosis.verdict == "named"
     assert set(diagnosis.terms) == {"series resistance", "shunt"}
     found = estimates(diagnosis)
