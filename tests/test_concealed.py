@@ -358,7 +358,7 @@ def test_rivals_of_a_local_effect_may_act_in_its_range(monkeypatch):
 
 
 def test_the_judge_knows_what_cannot_be(monkeypatch):
-    """A rival that would have to be stronger than any is none."""
+    """A rival with an amplitude that nature does not have is none."""
     weak = Effect("weak", outputs={"y": lambda t, s, p, u, y, c: y + c["a"] * (u["x"] - 1) * (u["x"] - 2)},
                   within=(1e-9, 1e-8, None))  # fmt: skip
     assert judged_line(monkeypatch, 0.01, weak) == {"first": 1.0, "distances": {}}

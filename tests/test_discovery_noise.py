@@ -302,7 +302,7 @@ def test_the_stated_limit_is_where_detection_begins():
     limit = diagnosed(decay(60, 1, known=True)).detection_limit[0]
     assert limit.term == "offset"
     assert limit.power == 0.95
-    seeds = 8
+    seeds = 12
     seen = {
         factor: sum(
             diagnosed(decay(60, 4000 + s, known=True, offset=factor * limit.smallest), max_terms=1).verdict

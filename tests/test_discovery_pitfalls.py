@@ -449,7 +449,7 @@ def test_a_misfit_that_grows_with_the_value_is_not_noise_that_does():
     # A peak's missing asymmetry, coarsely sampled: most where the peak is high. Once it is named, its noise is even.
     x = torch.linspace(-5, 5, 30, dtype=F64)
     found = []
-    for seed in range(5, 8):
+    for seed in range(5, 11):
         noise = 0.005 * torch.randn(30, generator=torch.Generator().manual_seed(seed), dtype=F64)
         peak = tc.Simulator(
             lambda x, p: p["a"] / (1 + (x / p["w"]) ** 2)
@@ -461,7 +461,7 @@ def test_a_misfit_that_grows_with_the_value_is_not_noise_that_does():
         y = 1 / (1 + x**2) + 0.3 * x / (1 + x**2) ** 2 + noise
         d = diagnose(peak, tc.Recording(x=x, y=y), terms)
         found.append((d.verdict, tuple(d.terms), dict(d.noise.range)))
-    assert found.count(("named", ("asymmetry",), {})) >= 2
+    assert found.count(("named", ("asymmetry",), {})) >= 5
 
 
 def test_an_outlier_among_small_values_of_growing_noise_stays_out():

@@ -8,7 +8,7 @@ import numpy as np
 from benchmarks.concealed.families import FAMILIES
 from benchmarks.concealed.families.base import Array, Gate, Planted, RunSetting, Setting, simulate, truth_vector
 
-__all__ = ["repeat"]
+__all__ = ["planted", "repeat", "setting_of"]
 
 
 def planted(answer: Mapping[str, Any]) -> list[Planted]:
@@ -27,6 +27,22 @@ def planted(answer: Mapping[str, Any]) -> list[Planted]:
             )
         found.append(Planted(family.effect(row["name"]), row["amplitude"], row["shapes"], gate))
     return found
+
+
+def setting_of(case: Mapping[str, Any], answer: Mapping[str, Any]) -> Setting:
+    """Its conditions, and where every state begins."""
+    if "runs" not in case:
+        return Setting(x={k: np.asarray(v, dtype=float) for k, v in case["x"].items()}, observed=tuple(case["y"]))
+    runs = tuple(
+        RunSetting(
+            np.asarray(run["time"]),
+            {k: np.asarray(v, dtype=float) for k, v in run["inputs"].items()},
+            start,
+            tuple(run["initial"]),
+        )
+        for run, start in zip(case["runs"], answer["initial"], strict=True)
+    )
+    return Setting(runs, observed=tuple(case["runs"][0]["outputs"]))
 
 
 def repeat(

@@ -8,28 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.concealed.experiment import setting_of
 from benchmarks.concealed.families import FAMILIES
-from benchmarks.concealed.families.base import Failure, Planted, RunSetting, Setting, simulate, truth_vector
+from benchmarks.concealed.families.base import Failure, Planted, simulate, truth_vector
 from benchmarks.concealed.score import credit
 from benchmarks.concealed.workers import read, run_all
 
 #: Terms whose amplitude the tool counts in other units than the generator.
 OTHER_UNITS = ("radiation", "evaporation", "lag of")
-
-
-def setting_of(case: Mapping[str, Any], answer: Mapping[str, Any]) -> Setting:
-    if "runs" not in case:
-        return Setting(x={k: np.asarray(v, dtype=float) for k, v in case["x"].items()}, observed=tuple(case["y"]))
-    runs = tuple(
-        RunSetting(
-            np.asarray(run["time"]),
-            {k: np.asarray(v, dtype=float) for k, v in run["inputs"].items()},
-            start,
-            tuple(run["initial"]),
-        )
-        for run, start in zip(case["runs"], answer["initial"], strict=True)
-    )
-    return Setting(runs, observed=tuple(case["runs"][0]["outputs"]))
 
 
 def plant_at_limit(

@@ -27,6 +27,7 @@ from benchmarks.concealed.families.base import (
     Planted,
     Setting,
     Trace,
+    labels,
     simulate,
     stacked,
     truth_vector,
@@ -573,8 +574,7 @@ def write_case(
         "rivals": rivals(found, rng) if found.planted else [],
         "parameters": found.parameters,
         "initial": [dict(run.initial) for run in setting.runs],
-        "refit": {f"{name}" if n is None else f"{name}(0)[{n}]": float(value)
-                  for (name, n), value in zip(unknowns(family, setting), found.refit, strict=True)},
+        "refit": dict(zip(labels(family, setting), found.refit.tolist(), strict=True)),
         "rmse_base": {name: found.rmse * scale for name, scale in found.scales.items()},
         "truth": [{name: numbers(v[:, 0]) for name, v in trace.outputs.items()} for trace in found.traces],
         "states": [{name: numbers(v[:, 0]) for name, v in trace.states.items() if name in family.states}

@@ -18,13 +18,13 @@ import argparse
 import functools
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.concealed.experiment import planted
+from benchmarks.concealed.experiment import planted, setting_of
 from benchmarks.concealed.families import FAMILIES
 from benchmarks.concealed.families.base import (
     Array,
@@ -32,14 +32,13 @@ from benchmarks.concealed.families.base import (
     Failure,
     Planted,
     Setting,
+    labels,
     simulate,
     stacked,
     truth_vector,
-    unknowns,
 )
-from benchmarks.concealed.followup import setting_of
 from benchmarks.concealed.generate import largest, recalibrate
-from benchmarks.concealed.peers import read_case, shape_grid
+from benchmarks.concealed.peers import Case, read_case, shape_grid, visible
 from benchmarks.concealed.score import names_of
 from benchmarks.concealed.workers import read, run_all
 
@@ -52,27 +51,55 @@ SAME = 0.01
 
 def white(residual: Array, setting: Setting, rho: float) -> Array:
     """What is left of a residual (in units of the noise) that has an autocorrelation, in units of white noise."""
-    size = len(setting.runs) * len(setting.observed) or 1
-    lengths = [len(run.time) for run in setting.runs] * len(setting.observed) or [len(residual) // size]
+    lengths = [len(run.time) for run in setting.runs] * len(setting.observed) or [len(residual)]
     parts = []
     for block in np.split(residual, np.cumsum(lengths)[:-1]):
         parts += [block[:1], (block[1:] - rho * block[:-1]) / np.sqrt(1 - rho**2)]
     return np.concatenate(parts)
 
 
-def nearest(case: Mapping[str, Any], answer: Mapping[str, Any], effect: Effect) -> Array | None:
+@dataclass(frozen=True)
+class Truth:
+    """A case without its noise.
+
+    Args:
+        seen: The case as the peers see it.
+        setting: Its conditions, and where every state begins.
+        theta: The unknowns.
+        refit: Those of the base alone, calibrated to the truth.
+        target: The outputs in units of the noise, with the time steps of the fits.
+        answer: The rest.
+    """
+
+    seen: Case
+    setting: Setting
+    theta: Array
+    refit: Array
+    target: Array
+    answer: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, case: Mapping[str, Any], answer: Mapping[str, Any]) -> "Truth":
+        """From a recording and its answer."""
+        family, setting = FAMILIES[answer["family"]], setting_of(case, answer)
+        theta = truth_vector(family, setting, answer["parameters"])
+        traces = simulate(family, setting, theta, planted(answer), quick=PARTS)
+        target = stacked(family, setting, traces, answer["noise"]["sd"])[0]
+        refit = np.array([answer["refit"][label] for label in labels(family, setting)])
+        return cls(read_case(case), setting, theta, refit, target, answer)
+
+
+def nearest(truth: Truth, effect: Effect) -> Array | None:
     """The truth less a candidate's best fit to it, white and in units of the noise; None where none is possible."""
-    family, setting, sd = FAMILIES[answer["family"]], setting_of(case, answer), answer["noise"]["sd"]
-    theta = truth_vector(family, setting, answer["parameters"])
-    truth = simulate(family, setting, theta, planted(answer), quick=PARTS)  # with the steps of the fits
-    target = stacked(family, setting, truth, sd)[0]
+    family, setting, noise = truth.seen.family, truth.setting, truth.answer["noise"]
     first = effect.guess if effect.stiff else 0.05 * effect.guess
 
     def fitted(start: Array, item: Planted) -> tuple[Array, Planted] | None:
         try:
             z, residual = recalibrate(
-                family, setting, target, sd, start, np.random.default_rng(0), starts=1, planted=[item], parts=PARTS
-            )
+                family, setting, truth.target, noise["sd"], start, np.random.default_rng(0), starts=1, planted=[item],
+                parts=PARTS,
+            )  # fmt: skip
             item = replace(item, amplitude=float(z[-1]))
             if effect.within is not None:
                 low, high, driver = effect.within
@@ -81,41 +108,38 @@ def nearest(case: Mapping[str, Any], answer: Mapping[str, Any], effect: Effect) 
                     return None
         except Failure:
             return None
-        return white(residual, setting, answer["noise"].get("rho", 0.0)), item
+        return white(residual, setting, noise.get("rho", 0.0)), item
 
     def best(found: Iterable[tuple[Array, Planted] | None]) -> tuple[Array, Planted] | None:
         return min(filter(None, found), key=lambda one: float(one[0] @ one[0]), default=None)
 
-    gates = {None, planted(answer)[0].gate}
-    kinds = [(shape, gate) for shape in shape_grid(read_case(case), effect) for gate in gates]
-    places = [name if number is None else f"{name}(0)[{number}]" for name, number in unknowns(family, setting)]
-    refit = np.array([answer["refit"][place] for place in places])
-    near = best(fitted(refit, Planted(effect, (effect.sign or 1) * first, *kind)) for kind in kinds)
+    gates = {None, planted(truth.answer)[0].gate}
+    kinds = [(shape, gate) for shape in shape_grid(truth.seen, effect) for gate in gates]
+    near = best(fitted(truth.refit, Planted(effect, (effect.sign or 1) * first, *kind)) for kind in kinds)
     if near is not None:  # once more from the truth
-        near = best([near, fitted(theta, near[1])])
+        near = best([near, fitted(truth.theta, near[1])])
     return None if near is None else near[0]
 
 
 def judged(case: Mapping[str, Any], answer: Mapping[str, Any]) -> dict[str, Any]:
     """The judge's share of one case, and each rival's distance in units of the noise."""
-    family, setting = FAMILIES[answer["family"]], setting_of(case, answer)
-    same = names_of(answer["effects"][0]["name"], answer)
+    truth, same = Truth.of(case, answer), names_of(answer["effects"][0]["name"], answer)
     left = {}
-    for effect in family.library:
-        if effect.name not in same and all(name in setting.observed for name in effect.outputs):
-            found = nearest(case, answer, effect)
+    for effect in visible(truth.seen):
+        if effect.name not in same:
+            found = nearest(truth, effect)
             if found is not None:
                 left[effect.name] = found
     sizes = {name: float(np.sqrt(gap @ gap)) for name, gap in left.items()}
     gaps = [gap for name, gap in left.items() if sizes[name] > SAME]
     guess = 1 / (1 + len(left) - len(gaps))
-    rng, ahead = np.random.default_rng(0), np.ones(DRAWS, dtype=bool)
+    ahead = 1.0
     if gaps:
         # The recording is the truth and noise; a rival is the truth less its gap.
         rivals = np.array(gaps)
-        ahead = rng.standard_normal((DRAWS, rivals.shape[1])) @ rivals.T + 0.5 * np.sum(rivals**2, axis=1) > 0
-        ahead = ahead.all(1)
-    return {"first": guess * float(np.mean(ahead)), "distances": dict(sorted(sizes.items(), key=lambda row: row[1]))}
+        noise = np.random.default_rng(0).standard_normal((DRAWS, rivals.shape[1]))
+        ahead = float(np.mean((noise @ rivals.T + 0.5 * np.sum(rivals**2, axis=1) > 0).all(1)))
+    return {"first": guess * ahead, "distances": dict(sorted(sizes.items(), key=lambda row: row[1]))}
 
 
 def _judged(folder: str, name: str) -> dict[str, Any]:

@@ -175,6 +175,11 @@ def unknowns(family: Family, setting: Setting) -> list[tuple[str, int | None]]:
     return free
 
 
+def labels(family: Family, setting: Setting) -> list[str]:
+    """The unknowns as answers spell them: ``k``, ``x(0)[1]``."""
+    return [name if number is None else f"{name}(0)[{number}]" for name, number in unknowns(family, setting)]
+
+
 def truth_vector(family: Family, setting: Setting, parameters: Mapping[str, float]) -> Array:
     """The unknowns' true values."""
     return np.array([
