@@ -8,7 +8,9 @@ import torch
 
 from torchcal.errors import ConvergenceError
 from torchcal.inference import diagnostics, hmc_step, nuts_step
+from torchcal.inference.arrays import Device, Host
 from torchcal.inference.batched import run_batched
+from torchcal.inference.bends import Bend
 from torchcal.inference.coordinates import Laplace, Whitened, gathered
 from torchcal.priors import Bounds
 
@@ -29,7 +31,7 @@ def run(log_density, size, transform=None, **options):
         "num_samples": 200,
         "num_chains": 32,
         "num_warmup": 60,
-        "seed": 3,
+        "seed": 5,
     }
     return run_batched(log_density, transform or free(size), **{**defaults, **options})
 
@@ -42,8 +44,8 @@ def independent(draws, column):
 
 
 def test_checkpoint_tables_of_the_iterative_tree():
-    tables = nuts_step.Tables.build(4, torch.device("cpu"))
-    closed = [row.nonzero()[:, 0].tolist() for row in tables.check]
+    tables = nuts_step.Tables.build(4, Host(0))
+    closed = [row.nonzero()[0].tolist() for row in tables.check]
     # Leaf 7 = 0b111 closes the subtrees of sizes 2, 4 and 8; leaf 13 = 0b1101 closes one of size 2 only.
     assert closed[7] == [0, 1, 2]
     assert closed[13] == [2]
@@ -55,22 +57,74 @@ def test_checkpoint_tables_of_the_iterative_tree():
 
 def test_leapfrog_conserves_energy_to_second_order():
     def potential(z):
-        return 0.25 * z.pow(4).sum(-1) + 0.5 * z.square().sum(-1), z.pow(3) + z
+        return 0.25 * (z**4).sum(-1) + 0.5 * (z**2).sum(-1), z**3 + z
 
-    tables = nuts_step.Tables.build(10, torch.device("cpu"))
     errors = []
     for step_size in (0.02, 0.01):
-        generator = torch.Generator().manual_seed(0)
-        z = torch.full((64, 2), 1.0, dtype=torch.float64)
-        state = nuts_step.init(z, potential, step_size=step_size, tables=tables, generator=generator)
+        arrays = Host(0)
+        tables = nuts_step.Tables.build(10, arrays)
+        state = nuts_step.init(np.ones((64, 2)), potential, step_size=step_size, tables=tables, arrays=arrays)
         start = state.start_energy
-        state, _ = nuts_step.step(state, potential, step_size=step_size, tables=tables, generator=generator)
+        state, _ = nuts_step.step(state, potential, step_size=step_size, tables=tables, arrays=arrays)
         position, momentum = state.cursor[:, :2], state.cursor[:, -2:]
         # After the first leaf the cursor is at an end of the tree or at a new subtree's start: use the moved ones.
-        energy = potential(position)[0] + 0.5 * momentum.square().sum(-1)
-        errors.append(float((energy - start).abs().max()))
+        energy = potential(position)[0] + 0.5 * (momentum**2).sum(-1)
+        errors.append(float(abs(energy - start).max()))
     # One leapfrog step errs by O(h^3).
     assert errors[0] / errors[1] == pytest.approx(8, rel=0.3)
+
+
+class _Scripted(Device):
+    """PyTorch's namespace with the random numbers of NumPy's."""
+
+    def __init__(self, seed):
+        super().__init__(seed, torch.device("cpu"))
+        self.same = Host(seed)
+
+    def normal(self, like):
+        return torch.from_numpy(self.same.normal(like.numpy()))
+
+    def uniform(self, shape, like):
+        return torch.from_numpy(self.same.uniform(shape, like.numpy()))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@KERNELS
+def test_both_namespaces_take_the_same_steps(kernel, dtype):
+    """Of a density that ends, so that energies are infinite too."""
+    bend = Bend(torch.tensor([[1.0], [0.0], [0.0]], dtype=dtype), torch.tensor([[0.0, 0.3, 0.1]], dtype=dtype))
+    space = Whitened(
+        lambda u: torch.where(u[:, 0] < 1.5, -0.25 * u.pow(4).sum(-1) - u.abs().sum(-1), -torch.inf),
+        *(torch.zeros(3, dtype=dtype), torch.eye(3, dtype=dtype) + 0.2 * torch.ones(3, 3, dtype=dtype).tril(), bend),
+    )
+    begin = torch.zeros(8, 3, dtype=dtype)
+    ends = []
+    for arrays in (Host(0), _Scripted(0)):
+        draws = []
+        if kernel == "nuts":
+            tables = nuts_step.Tables.build(5, arrays)
+            state = nuts_step.init(arrays.take(begin), space.potential, step_size=0.6, tables=tables, arrays=arrays)
+        else:
+            state = hmc_step.init(arrays.take(begin), space.potential)
+        for _ in range(40):
+            if kernel == "nuts":
+                state, out = nuts_step.step(state, space.potential, step_size=0.6, tables=tables, arrays=arrays)
+            else:
+                state, out = hmc_step.step(state, space.potential, step_size=0.6, length=1.6, arrays=arrays)
+            assert out.position.dtype == torch.empty(0, dtype=dtype).numpy().dtype
+            draws.append(np.concatenate([out.position[out.done].ravel(), out.accept[out.done]]))
+        ends.append(np.concatenate(draws))
+    assert len(ends[0]) > 100
+    np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-9 if dtype == torch.float64 else 2e-3)
+
+
+@KERNELS
+def test_the_tensor_namespace_draws_what_the_density_is(kernel, monkeypatch):
+    """That of accelerators, here on the CPU."""
+    monkeypatch.setattr("torchcal.inference.batched.arrays_for", lambda device, seed: Device(seed, device))
+    draws = run(lambda u: -0.5 * (u / torch.tensor([1.0, 3.0])).square().sum(-1), 2, num_samples=300, kernel=kernel)
+    for i, sd in enumerate((1.0, 3.0)):
+        assert stats.kstest(independent(draws.alpha, i), "norm", args=(0.0, sd)).pvalue > 1e-3
 
 
 @KERNELS
@@ -288,9 +342,9 @@ def test_the_trajectory_length_is_that_of_the_density():
         space = Whitened(normal_with_factor(factor), 0 * eye[0], eye)
         generator = torch.Generator().manual_seed(0)
         z = torch.randn(64, len(factor), dtype=torch.float64, generator=generator) @ factor.T
-        state = hmc_step.init(z, space.potential)
+        state = hmc_step.init(z.numpy(), space.potential)
         return hmc_step.tuned_length(
-            state, space.potential, torch.zeros(64, dtype=torch.long), step_size=0.5, generator=generator
+            state, space.potential, torch.zeros(64, dtype=torch.long), step_size=0.5, arrays=Host(0)
         )[0]
 
     white = length(torch.eye(5, dtype=torch.float64))

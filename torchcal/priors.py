@@ -66,15 +66,14 @@ class Bounds(Transform):
     def bound(self, u: Tensor) -> Tensor:
         """α of u."""
         both, only_low, only_high = self._any
-        softplus = torch.nn.functional.softplus
         value = u
         if both:
             low, high = self._low.to(u), self._high.to(u)
             value = torch.where(self._both.to(u.device), low + (high - low) * u.sigmoid(), value)
         if only_low:
-            value = torch.where(self._only_low.to(u.device), self._low.to(u) + softplus(u), value)
+            value = torch.where(self._only_low.to(u.device), self._low.to(u) + _softplus(u), value)
         if only_high:
-            value = torch.where(self._only_high.to(u.device), self._high.to(u) - softplus(-u), value)
+            value = torch.where(self._only_high.to(u.device), self._high.to(u) - _softplus(-u), value)
         return value
 
     def unbound(self, alpha: Tensor) -> Tensor:
@@ -95,7 +94,7 @@ class Bounds(Transform):
         """Σ log ``|dα/du|``, ``(*batch,)``."""
         if self.free:
             return torch.zeros_like(u[..., 0])
-        softened = torch.nn.functional.softplus(u, threshold=40.0) * self._softened.to(u)
+        softened = _softplus(u) * self._softened.to(u)
         return (self._log_width.to(u) + self._along.to(u) * u - softened).sum(-1)
 
     def _call(self, x: Tensor) -> Tensor:
@@ -114,6 +113,10 @@ class Bounds(Transform):
         if self.scale_tril is not None:
             value = value + self.scale_tril.diagonal().log().sum().to(x)
         return value
+
+
+def _softplus(value: Tensor) -> Tensor:
+    return torch.nn.functional.softplus(value, threshold=40.0)  # past which it is the identity to the last bit
 
 
 def _inverse_softplus(value: Tensor) -> Tensor:

@@ -6,13 +6,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchcal.errors import ConvergenceError, ConvergenceWarning
 from torchcal.inference import hmc_step, nuts_step
-from torchcal.inference.coordinates import Laplace, Whitened, gathered, starting_points
+from torchcal.inference.arrays import Arrays, arrays_for
+from torchcal.inference.coordinates import Laplace, Slopes, Whitened, gathered, starting_points
 from torchcal.inference.draws import Draws, most_divergences
 from torchcal.inference.nuts_step import Outcome
 from torchcal.priors import Bounds
@@ -108,25 +110,22 @@ class _Kernel(Protocol):
 class _NUTS:
     """See `nuts_step`. Trees are short at first: a step size that starts far too small must not cost thousands."""
 
-    def __init__(self, max_tree_depth: int, device: torch.device, generator: torch.Generator) -> None:
-        self.generator = generator
-        self.full = nuts_step.Tables.build(max_tree_depth, device)
-        self.tables = nuts_step.Tables.build(min(max_tree_depth, 6), device)
+    def __init__(self, max_tree_depth: int, arrays: Arrays) -> None:
+        self.arrays = arrays
+        self.full = nuts_step.Tables.build(max_tree_depth, arrays)
+        self.tables = nuts_step.Tables.build(min(max_tree_depth, 6), arrays)
 
     def init(self, z: Tensor, space: Whitened, step_size: float) -> nuts_step.State:
-        return nuts_step.init(
-            z, space.potential, step_size=step_size, tables=self.tables, generator=self.generator
-        )
+        start = self.arrays.take(z)
+        return nuts_step.init(start, space.potential, step_size=step_size, tables=self.tables, arrays=self.arrays)
 
     def step(
         self, state: nuts_step.State, space: Whitened, step_size: float
     ) -> tuple[nuts_step.State, Outcome]:
-        return nuts_step.step(
-            state, space.potential, step_size=step_size, tables=self.tables, generator=self.generator
-        )
+        return nuts_step.step(state, space.potential, step_size=step_size, tables=self.tables, arrays=self.arrays)
 
     def positions(self, state: nuts_step.State) -> Tensor:
-        return state.proposal[:, : state.momentum_sum.shape[1]]
+        return torch.as_tensor(state.proposal[:, : state.momentum_sum.shape[1]])
 
     def tune(self, z: Tensor, groups: Tensor, space: Whitened, step_size: float) -> Tensor:
         self.tables = self.full
@@ -136,29 +135,29 @@ class _NUTS:
 class _HMC:
     """See `hmc_step`."""
 
-    def __init__(self, generator: torch.Generator) -> None:
-        self.generator = generator
+    def __init__(self, arrays: Arrays) -> None:
+        self.arrays = arrays
         self.length = hmc_step.QUARTER
 
     def init(self, z: Tensor, space: Whitened, step_size: float) -> hmc_step.State:
-        return hmc_step.init(z, space.potential)
+        return hmc_step.init(self.arrays.take(z), space.potential)
 
     def step(
         self, state: hmc_step.State, space: Whitened, step_size: float
     ) -> tuple[hmc_step.State, Outcome]:
         return hmc_step.step(
-            state, space.potential, step_size=step_size, length=self.length, generator=self.generator
+            state, space.potential, step_size=step_size, length=self.length, arrays=self.arrays
         )
 
     def positions(self, state: hmc_step.State) -> Tensor:
-        return state.position
+        return torch.as_tensor(state.position)
 
     def tune(self, z: Tensor, groups: Tensor, space: Whitened, step_size: float) -> Tensor:
         state = self.init(z, space, step_size)
         self.length, state = hmc_step.tuned_length(
-            state, space.potential, groups, step_size=step_size, generator=self.generator
+            state, space.potential, groups, step_size=step_size, arrays=self.arrays
         )
-        return state.position
+        return self.positions(state)
 
 
 def run_batched(
@@ -166,6 +165,7 @@ def run_batched(
     transform: Bounds,
     *,
     modes: Sequence[Laplace],
+    slopes: Slopes | None = None,
     num_samples: int,
     num_chains: int,
     num_warmup: int,
@@ -182,6 +182,7 @@ def run_batched(
     Args:
         log_density: ``u (C, P) -> (C,)``, the transform's Jacobian included.
         transform: From u to α.
+        slopes: The same density with its gradient, where PyTorch need not find that.
         modes: Normal approximations that chains start from, the best first: its covariance is the first metric.
         num_samples: Draws a chain; the most of them where ``enough`` is given.
         num_chains: Chains.
@@ -203,13 +204,14 @@ def run_batched(
     """
     loc = modes[0].loc
     generator = torch.Generator(device=loc.device).manual_seed(seed)
-    moves: _Kernel = _HMC(generator) if kernel == "hmc" else _NUTS(max_tree_depth, loc.device, generator)
+    arrays = arrays_for(loc.device, seed)
+    moves: _Kernel = _HMC(arrays) if kernel == "hmc" else _NUTS(max_tree_depth, arrays)
     most, cheap = max(4, MOST_ELEMENTS // max(1, cost)), max(_FEW_WARM_UP_CHAINS, _WARM_UP_ELEMENTS // max(1, cost))
     crowd = max(num_chains, min(_WARM_UP_CHAINS, most, cheap))
     bar = tqdm(total=num_warmup + num_samples, desc=kernel.upper(), disable=not progress, leave=False)
-    drawn = collector = _Collector(num_chains, len(loc), loc)
+    drawn = collector = _Collector(num_chains, loc)
     try:
-        space = Whitened(log_density, loc, modes[0].scale_tril)
+        space = Whitened(log_density, loc, modes[0].scale_tril, slopes=slopes)
         z, groups = starting_points(space, modes, crowd, generator)
         lowest = space.height(space.inner(torch.stack([mode.loc for mode in modes])))[groups]
         space, z = gathered(space, z, groups, lowest, generator)
@@ -219,7 +221,7 @@ def run_batched(
         )
         owners, step_size = groups[:num_chains], averaging.settled
         for repeat in range(_REPEATS + 1):
-            collector = _Collector(num_chains, len(loc), loc) if repeat else collector
+            collector = _Collector(num_chains, loc) if repeat else collector
             state = moves.init(z[:num_chains], space, step_size)
             judge = None if enough is None else lambda draws: enough(_alpha(draws, space, transform), owners)
             last = target_accept is not None or repeat == _REPEATS
@@ -253,7 +255,7 @@ def _sample(
     step_size: float,
     collector: "_Collector",
     num_samples: int,
-    enough: Callable[[Tensor], float] | None,
+    enough: Callable[[np.ndarray], float] | None,
     bar: tqdm,
     *,
     whatever: bool,
@@ -281,8 +283,8 @@ def _sample(
         goal = min(num_samples, math.ceil(goal * min(max(_ENOUGH * more, 1.15), 4.0)))
 
 
-def _alpha(z: Tensor, space: Whitened, transform: Bounds) -> Tensor:
-    alpha = transform.bound(space.outer(z)).transpose(0, 1)
+def _alpha(z: np.ndarray, space: Whitened, transform: Bounds) -> Tensor:
+    alpha = transform.bound(space.outer(torch.as_tensor(z, device=space.loc.device))).transpose(0, 1)
     return alpha.detach().to(device="cpu", dtype=torch.float64)
 
 
@@ -337,11 +339,11 @@ def _adapt(
     chains = len(z)
     state = moves.init(z, space, averaging.step_size)
     finished = shown = 0
-    pooled: list[Tensor] = []
-    owners: list[Tensor] = []
-    accepted: list[Tensor] = []
+    pooled: list[np.ndarray] = []
+    owners: list[np.ndarray] = []
+    accepted: list[np.ndarray] = []
     waiting = diverged = counted = 0
-    begun = torch.zeros(chains, dtype=torch.bool, device=z.device)  # whose trajectory has the step size that is judged
+    begun = np.zeros(chains, dtype=bool)  # whose trajectory has the step size that is judged
     while finished < length * chains:
         settled = settle and finished > length * chains // 2
         state, outcome = moves.step(state, space, averaging.settled if settled else averaging.step_size)
@@ -355,19 +357,20 @@ def _adapt(
         # One update for every half of the crowd: a step size is judged by trajectories that used it, not by those
         # still on the way from before, and short ones do not count more than long ones.
         if 2 * waiting >= chains:
-            averaging.update(float(torch.cat(accepted).mean()))
+            averaging.update(float(np.concatenate(accepted).mean()))
             accepted.clear()
             waiting = 0
         if finished > length * chains // 2:
             pooled.append(outcome.position[outcome.done])
-            owners.append(outcome.done.nonzero()[:, 0])
+            owners.append(outcome.done.nonzero()[0])
             diverged += int((outcome.divergent & begun).sum())
             counted += int((outcome.done & begun).sum())
             if settled:
                 begun = begun | outcome.done
         bar.update(finished // chains - shown)
         shown = finished // chains
-    return torch.cat(pooled), torch.cat(owners), moves.positions(state), diverged / max(counted, 1)
+    drawn, whose = (torch.as_tensor(np.concatenate(parts), device=z.device) for parts in (pooled, owners))
+    return drawn, whose, moves.positions(state), diverged / max(counted, 1)
 
 
 class _Collector:
@@ -377,11 +380,10 @@ class _Collector:
     more often be one of a long trajectory.
     """
 
-    def __init__(self, chains: int, size: int, like: Tensor) -> None:
-        self.stored = like.new_empty((64, chains, size))
-        self.filled = torch.zeros(chains, dtype=torch.long, device=like.device)
-        self.rows = torch.arange(chains, device=like.device)
-        self.diverged = torch.zeros((64, chains), dtype=torch.bool, device=like.device)
+    def __init__(self, chains: int, like: Tensor) -> None:
+        self.stored = np.empty((64, chains, len(like)), dtype=like.cpu().numpy().dtype)
+        self.filled = np.zeros(chains, dtype=np.int64)
+        self.diverged = np.zeros((64, chains), dtype=bool)
         self.least = 0
 
     def collect(
@@ -390,12 +392,12 @@ class _Collector:
         """Go on until every chain has ``goal`` draws."""
         while self.least < goal:
             state, outcome = moves.step(state, space, step_size)
-            chosen = self.rows[outcome.done]
+            chosen = outcome.done.nonzero()[0]
             if not len(chosen):
                 continue
             if int(self.filled.max()) == len(self.stored):
-                self.stored = torch.cat([self.stored, torch.empty_like(self.stored)])
-                self.diverged = torch.cat([self.diverged, torch.zeros_like(self.diverged)])
+                self.stored = np.concatenate([self.stored, np.empty_like(self.stored)])
+                self.diverged = np.concatenate([self.diverged, np.zeros_like(self.diverged)])
             self.stored[self.filled[chosen], chosen] = outcome.position[chosen]
             self.diverged[self.filled[chosen], chosen] = outcome.divergent[chosen]
             self.filled[chosen] += 1
@@ -405,7 +407,7 @@ class _Collector:
         return state
 
     @property
-    def draws(self) -> Tensor:
+    def draws(self) -> np.ndarray:
         """Those that every chain has, ``(n, C, P)``."""
         return self.stored[: self.least]
 
@@ -417,4 +419,4 @@ class _Collector:
     @property
     def too_divergent(self) -> bool:
         """Whether these are more than chance makes of a few."""
-        return self.divergences > most_divergences(self.least * len(self.rows))
+        return self.divergences > most_divergences(self.least * len(self.filled))

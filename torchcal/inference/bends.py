@@ -16,6 +16,8 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
+from torchcal.inference.arrays import Array
+
 __all__ = ["LEAST", "Bend", "found_in"]
 
 #: What of the squared volume bends must leave, at most, to be taken in; one driver more of that; drivers at most.
@@ -34,34 +36,28 @@ LARGEST = 60
 class Bend:
     """Shifts by products of drivers.
 
-    Attributes:
+    Attributes, tensors or NumPy's arrays:
         drivers: W, ``(P, K)``.
         shifts: q, one row for each pair k ≤ l, ``(K (K + 1) / 2, P)``, all at right angles to W.
     """
 
-    drivers: Tensor
-    shifts: Tensor
-    _pairs: tuple[Tensor, Tensor] = field(init=False, repr=False)
+    drivers: Array
+    shifts: Array
+    _sides: tuple[Array, Array] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_pairs", _pairs(self.drivers))
+        first, second = _pairs(self.drivers.shape[1])
+        object.__setattr__(self, "_sides", (self.drivers[:, first], self.drivers[:, second]))
 
-    def products(self, z: Tensor) -> Tensor:
-        """Of the drivers, every pair once, ``(C, F)``."""
-        t = z @ self.drivers
-        first, second = self._pairs
-        return t[:, first] * t[:, second]
-
-    def shift(self, z: Tensor) -> Tensor:
+    def shift(self, z: Array) -> Array:
         """What is added to z ``(C, P)``."""
-        return self.products(z) @ self.shifts
+        left, right = self._sides
+        return ((z @ left) * (z @ right)) @ self.shifts
 
-    def pulled_back(self, z: Tensor, slope: Tensor) -> Tensor:
+    def pulled_back(self, z: Array, slope: Array) -> Array:
         """What the shift adds to a gradient ``(C, P)``, given the one in shifted coordinates."""
-        t, along = z @ self.drivers, slope @ self.shifts.T
-        first, second = self._pairs
-        turned = torch.zeros_like(t).index_add(1, first, along * t[:, second]).index_add(1, second, along * t[:, first])
-        return turned @ self.drivers.T
+        (left, right), along = self._sides, slope @ self.shifts.T
+        return (along * (z @ right)) @ left.T + (along * (z @ left)) @ right.T
 
     def seen_from(self, factor: Tensor) -> "Bend":
         """The same in coordinates y with z = factor y (+ shifts)."""
@@ -71,11 +67,15 @@ class Bend:
         """In another dtype."""
         return Bend(self.drivers.to(dtype), self.shifts.to(dtype))
 
+    def on_host(self) -> "Bend":
+        """In NumPy."""
+        return Bend(self.drivers.cpu().numpy(), self.shifts.cpu().numpy())
 
-def _pairs(drivers: Tensor) -> tuple[Tensor, Tensor]:
-    """Numbers k ≤ l of every pair of drivers ``(P, K)``."""
-    first, second = torch.triu_indices(drivers.shape[1], drivers.shape[1], device=drivers.device).unbind(0)
-    return first, second
+
+def _pairs(count: int) -> tuple[list[int], list[int]]:
+    """Numbers k ≤ l of every pair of drivers."""
+    pairs = [(first, second) for first in range(count) for second in range(first, count)]
+    return [first for first, _ in pairs], [second for _, second in pairs]
 
 
 def found_in(z: Tensor, chains: Tensor) -> tuple[Bend, float] | None:
@@ -139,7 +139,7 @@ class _Straight:
 
     def __init__(self, z: Tensor, drivers: Tensor) -> None:
         self.drivers = drivers / (z @ drivers).std(0)
-        self.pairs = _pairs(self.drivers)
+        self.pairs = _pairs(drivers.shape[1])
         first, second = self.pairs
         self.t = z @ self.drivers
         pairs = self.t[:, first] * self.t[:, second]
@@ -164,9 +164,13 @@ class _Straight:
         along[:, second, first] += shifts
         terms = (z[:, :, None] * self.t[:, None, :]).flatten(1)
         terms = terms - self.basis @ (self.basis.T @ terms)
-        terms = terms.unflatten(1, (size, number))
-        slope = torch.einsum("ps,sjl,pkl->jk", white, terms, along)
-        curve = torch.einsum("sjl,smn,pkl,pon->jkmo", terms, terms, along, along).reshape(size * number, -1)
+        # Over draws first, and then over what is moved (p) and the other driver of a product (l, n).
+        sums = (white @ terms).unflatten(1, (size, number)).transpose(0, 1).flatten(1)  # j, p l
+        slope = sums @ along.transpose(0, 1).flatten(1).T
+        inner = (terms.T @ terms).unflatten(1, (size, number)).unflatten(0, (size, number))  # j l m n
+        outer = torch.tensordot(along, along, dims=([0], [0]))  # k l o n
+        curve = torch.tensordot(inner, outer, dims=([1, 3], [1, 3]))  # j m k o
+        curve = curve.transpose(1, 2).reshape(size * number, -1)
         curve = curve + 1e-9 * curve.diagonal().mean() * torch.eye(len(curve)).to(curve)
         return torch.linalg.solve_ex(curve, slope.reshape(-1)).result.reshape(size, number)
 
@@ -193,7 +197,8 @@ def _candidates(rest: Tensor) -> Tensor:
     rest = rest - rest.mean(0)
     factor = _root(rest)
     white = torch.linalg.solve_triangular(factor, rest.T, upper=False).T
-    third = torch.einsum("si,sj,sk->ijk", white, white, white) / count
+    squares = (white[:, :, None] * white[:, None, :]).flatten(1)
+    third = (white.T @ squares).unflatten(1, (size, size)) / count
     # A direction that is skew stands out with itself too, and does not drive itself.
     others = 1 - torch.eye(size).to(white)
     directions = torch.linalg.eigh(third * others[:, :, None] * others[:, None, :]).eigenvectors

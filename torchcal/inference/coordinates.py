@@ -1,22 +1,42 @@
 """White coordinates for samplers, and the points that chains start from."""
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchcal.errors import ConvergenceError
+from torchcal.inference.arrays import Array
 from torchcal.inference.bends import LEAST, Bend, found_in
 
-__all__ = ["Laplace", "Whitened", "dealt_out", "gathered", "group_means", "starting_points"]
+__all__ = ["Laplace", "Slopes", "Whitened", "dealt_out", "gathered", "group_means", "slopes_of", "starting_points"]
 
 #: Times the height that it would have in a normal density above which a starting point is far from its mode; and the
 #: share of such points above which they are gathered first.
 FAR, MANY = 3.0, 0.1
 #: Moves of every point between two looks at their heights, and looks at most.
 MOVES, LOOKS = 20, 20
+
+
+Slopes = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""``u (C, P) -> ((C,), (C, P))``, a log-density and its gradient."""
+
+
+def slopes_of(log_density: Callable[[Tensor], Tensor]) -> Slopes:
+    """A log-density ``u (C, P) -> (C,)`` with PyTorch's gradient."""
+
+    def both(u: Tensor) -> tuple[Tensor, Tensor]:
+        u = u.detach().requires_grad_(True)
+        with torch.enable_grad():
+            value = log_density(u)
+            (slope,) = torch.autograd.grad(value.sum(), u)  # with grad_outputs=, PyTorch would import SymPy first
+        return value.detach(), slope
+
+    return both
 
 
 @dataclass(frozen=True)
@@ -41,26 +61,39 @@ class Laplace:
 class Whitened:
     """A log-density in coordinates z with u = loc + scale_tril (z + shifts), with its gradient for the sampler.
 
-    Shifts are those of a `Bend`, if there is one.
+    Shifts are those of a `Bend`, if there is one. The gradient is PyTorch's where ``slopes`` does not give it.
     """
 
     def __init__(
-        self, log_density: Callable[[Tensor], Tensor], loc: Tensor, scale_tril: Tensor, bend: Bend | None = None
+        self,
+        log_density: Callable[[Tensor], Tensor],
+        loc: Tensor,
+        scale_tril: Tensor,
+        bend: Bend | None = None,
+        *,
+        slopes: Slopes | None = None,
     ) -> None:
         self.log_density, self.loc, self.scale_tril, self.bend = log_density, loc, scale_tril, bend
+        self.slopes = slopes_of(log_density) if slopes is None else slopes
         self._downhill = -scale_tril
 
-    def potential(self, z: Tensor) -> tuple[Tensor, Tensor]:
-        """Negative log-density ``(C,)`` and its gradient ``(C, P)``; +inf and 0 where they are not finite."""
-        u = self.outer(z.detach()).requires_grad_(True)
-        with torch.enable_grad():
-            value = self.log_density(u)
-            (slope,) = torch.autograd.grad(value.sum(), u)  # with grad_outputs=, PyTorch would import SymPy first
-        energy, slope = -value.detach(), slope @ self._downhill
+    def potential(self, z: Array) -> tuple[Array, Array]:
+        """Negative log-density ``(C,)`` and its gradient ``(C, P)``; +inf and 0 where they are not finite.
+
+        Of a tensor or, on the CPU, of a NumPy array, in kind.
+        """
+        if isinstance(z, np.ndarray):
+            return self._on_host.potential(z)
+        value, slope = self.slopes(self.outer(z.detach()))
+        energy, slope = -value, slope @ self._downhill
         if self.bend is not None:
             slope = slope + self.bend.pulled_back(z, slope)
         good = torch.isfinite(energy + slope.sum(-1))  # which is not finite where any of them is not
         return torch.where(good, energy, torch.inf), torch.where(good[:, None], slope, 0.0)
+
+    @functools.cached_property
+    def _on_host(self) -> "_HostPotential":
+        return _HostPotential(self)
 
     def height(self, z: Tensor) -> Tensor:
         """Negative log-density ``(C,)`` alone; +inf where it is not finite."""
@@ -102,7 +135,29 @@ class Whitened:
             bend = found[0].seen_from(inner).to(z.dtype)
             center, factor = middle + whole @ offset, whole @ inner
         center, factor = center.to(z.dtype), factor.to(z.dtype)
-        return Whitened(self.log_density, self.loc + self.scale_tril @ center, self.scale_tril @ factor, bend)
+        loc, scale_tril = self.loc + self.scale_tril @ center, self.scale_tril @ factor
+        return Whitened(self.log_density, loc, scale_tril, bend, slopes=self.slopes)
+
+
+class _HostPotential:
+    """`Whitened.potential` in NumPy, but for the density."""
+
+    def __init__(self, space: Whitened) -> None:
+        self._slopes = space.slopes
+        self._loc, self._upward = space.loc.numpy(), space.scale_tril.T.contiguous().numpy()
+        self._downhill = space._downhill.contiguous().numpy()
+        self._bend = None if space.bend is None else space.bend.on_host()
+
+    def potential(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        bent = z if self._bend is None else z + self._bend.shift(z)
+        value, steepest = self._slopes(torch.from_numpy(self._loc + bent @ self._upward))
+        energy, slope = -value.numpy(), steepest.numpy() @ self._downhill
+        if self._bend is not None:
+            slope += self._bend.pulled_back(z, slope)
+        good = np.isfinite(energy + slope.sum(-1))  # which is not finite where any of them is not
+        if good.all():
+            return energy, slope
+        return np.where(good, energy, np.inf), np.where(good[:, None], slope, 0)
 
 
 def _factor(offset: Tensor, weight: float) -> Tensor:

@@ -11,11 +11,13 @@ Hoffman, Radul & Sountsov (2021), Proc. AISTATS 130, 3907-3915.
 import dataclasses
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from torchcal.inference.arrays import Array, Arrays, Potential
 from torchcal.inference.coordinates import group_means
-from torchcal.inference.nuts_step import DIVERGENCE, Outcome, Potential
+from torchcal.inference.nuts_step import DIVERGENCE, Outcome
 
 __all__ = ["QUARTER", "State", "init", "step", "tuned_length"]
 
@@ -42,55 +44,57 @@ MAX_STEPS = 1024
 class State:
     """Where every chain is: position ``(C, P)``, energy ``(C,)`` and its gradient ``(C, P)``."""
 
-    position: Tensor
-    energy: Tensor
-    slope: Tensor
+    position: Array
+    energy: Array
+    slope: Array
 
 
-def init(position: Tensor, potential: Potential) -> State:
+def init(position: Array, potential: Potential) -> State:
     """Chains at positions ``(C, P)``."""
     return State(position, *potential(position))
 
 
+@np.errstate(all="ignore")  # energies may be infinite, and sums of them undefined
 def step(
-    state: State, potential: Potential, *, step_size: float, length: float, generator: torch.Generator
+    state: State, potential: Potential, *, step_size: float, length: float, arrays: Arrays
 ) -> tuple[State, Outcome]:
     """One transition of every chain: a trajectory of about ``length``, in steps of at most ``step_size``."""
+    xp = arrays.xp
     position, start = state.position, state.energy
-    uniform = torch.rand((1 + len(start),), dtype=start.dtype, device=start.device, generator=generator)
+    uniform = arrays.uniform((1 + len(start),), start)
     time = length * (1 + _JITTER * (2 * float(uniform[0]) - 1))
     count = min(max(1, math.ceil(time / step_size)), MAX_STEPS)
     size = min(time / count, step_size)
-    momentum = torch.randn(position.shape, dtype=position.dtype, device=position.device, generator=generator)
-    kinetic = 0.5 * momentum.square().sum(-1)
+    momentum = arrays.normal(position)
+    kinetic = 0.5 * (momentum * momentum).sum(-1)
     energy, slope = start, state.slope
     momentum = momentum - 0.5 * size * slope
     for number in range(count):
         position = position + size * momentum
         energy, slope = potential(position)
         momentum = momentum - (size if number < count - 1 else 0.5 * size) * slope
-    error = energy + 0.5 * momentum.square().sum(-1) - start - kinetic
-    error = torch.nan_to_num(error, nan=torch.inf)
-    accept = (-error.clamp_min(0)).exp()
+    error = energy + 0.5 * (momentum * momentum).sum(-1) - start - kinetic
+    error = xp.where(error < np.inf, error, np.inf)  # where it is no number too
+    accept = xp.exp(-xp.where(error > 0, error, 0.0))
     take = uniform[1:] < accept
     row = take[:, None]
     moved = State(
-        torch.where(row, position, state.position),
-        torch.where(take, energy, start),
-        torch.where(row, slope, state.slope),
+        xp.where(row, position, state.position),
+        xp.where(take, energy, start),
+        xp.where(row, slope, state.slope),
     )
     outcome = Outcome(
-        done=torch.ones_like(take),
-        position=moved.position,
-        accept=accept,
-        divergent=error > DIVERGENCE,
-        leaves=torch.full_like(start, count),
+        done=np.ones(len(start), dtype=bool),
+        position=arrays.host(moved.position),
+        accept=arrays.host(accept),
+        divergent=arrays.host(error > DIVERGENCE),
+        leaves=np.full(len(start), float(count)),
     )
     return moved, outcome
 
 
 def tuned_length(
-    state: State, potential: Potential, groups: Tensor, *, step_size: float, generator: torch.Generator
+    state: State, potential: Potential, groups: Tensor, *, step_size: float, arrays: Arrays
 ) -> tuple[float, State]:
     """The trajectory length with the most effective draws a gradient, and the chains moved on.
 
@@ -103,12 +107,12 @@ def tuned_length(
     rounds = min(max(8, -(-_PAIRS // len(state.position))), _MOST_ROUNDS)
     for quarters in _LADDER:
         length = quarters * QUARTER
-        draws, work = [state.position], 0.0
+        draws, work = [arrays.host(state.position)], 0.0
         for _ in range(rounds):
-            state, outcome = step(state, potential, step_size=step_size, length=length, generator=generator)
-            draws.append(state.position)
+            state, outcome = step(state, potential, step_size=step_size, length=length, arrays=arrays)
+            draws.append(outcome.position)
             work += float(outcome.leaves[0])
-        rate = _share(torch.stack(draws), groups) * rounds / work
+        rate = _share(torch.from_numpy(np.stack(draws)), groups.cpu()) * rounds / work
         if rate > best_rate:
             best, best_rate, falling = length, rate, 0
         else:

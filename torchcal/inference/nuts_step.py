@@ -1,4 +1,4 @@
-r"""The No-U-Turn transition of many chains as one tensor program.
+r"""The No-U-Turn transition of many chains as one array program.
 
 Every call of `step` is one leapfrog step of every chain. Chains do not wait for each other: one whose trajectory has
 ended starts the next in the same call, so that no gradient is wasted on the longest tree. Trees are built leaf by leaf
@@ -10,15 +10,13 @@ Phan, Pradhan & Jankowiak (2019), arXiv:1912.11554 (the iterative tree).
 """
 
 import dataclasses
-from collections.abc import Callable
+from typing import Any
 
-import torch
-from torch import Tensor
+import numpy as np
+
+from torchcal.inference.arrays import Array, Arrays, Potential
 
 __all__ = ["Outcome", "State", "Tables", "init", "step"]
-
-Potential = Callable[[Tensor], tuple[Tensor, Tensor]]
-"""``z (C, P) -> (U (C,), dU/dz (C, P))``, the negative log-density; +inf with a zero gradient where undefined."""
 
 DIVERGENCE = 1000.0
 """Energy error past which a trajectory counts as divergent, as in Stan."""
@@ -34,12 +32,12 @@ class Tables:
         depth: The largest.
     """
 
-    slot: Tensor
-    check: Tensor
+    slot: Array
+    check: Array
     depth: int
 
     @classmethod
-    def build(cls, max_depth: int, device: torch.device) -> "Tables":
+    def build(cls, max_depth: int, arrays: Arrays) -> "Tables":
         """Tables for trees up to ``max_depth``."""
         leaves = range(2**max_depth)
         last = [bin(leaf >> 1).count("1") for leaf in leaves]
@@ -47,20 +45,21 @@ class Tables:
         first = [high - ones + 1 for high, ones in zip(last, trailing, strict=True)]
         slot = [max_depth if leaf % 2 else last[leaf] for leaf in leaves]
         check = [[leaf % 2 == 1 and first[leaf] <= k <= last[leaf] for k in range(max_depth)] for leaf in leaves]
-        return cls(torch.tensor(slot, device=device), torch.tensor(check, device=device), max_depth)
+        return cls(arrays.table(slot), arrays.table(check), max_depth)
 
 
 @dataclasses.dataclass(frozen=True)
 class State:
     """Where every chain is in its trajectory.
 
-    Few large tensors rather than many small ones, since a step costs by the number of operations. A draw is
+    Few large arrays rather than many small ones, since a step costs by the number of operations. A draw is
     (position, gradient, energy), ``(C, 2P + 1)``; a point is a draw with its momentum behind it, ``(C, 3P + 1)``. A
     checkpoint is (momentum, half sum): the sum of the subtree's momenta up to it, its own counted by half.
 
     Attributes:
         cursor: The point that moves.
-        ends: Of the trajectory, left and right, ``(C, 2, 3P + 1)``.
+        left: End of the trajectory, ``(C, 3P + 1)``.
+        right: Its other end.
         proposal: The draw that the trajectory would end with.
         sub_proposal: The same of the subtree.
         momentum_sum: Over the trajectory, ``(C, P)``.
@@ -75,29 +74,32 @@ class State:
         size: Leaves of the trajectory, and so of the subtree when it is whole.
         accept_sum: Of acceptance probabilities over the trajectory.
         leaves: Number of its leapfrog steps.
+        rows: Numbers of the chains.
     """
 
-    cursor: Tensor
-    ends: Tensor
-    proposal: Tensor
-    sub_proposal: Tensor
-    momentum_sum: Tensor
-    sub_momentum_sum: Tensor
-    checkpoints: Tensor
-    start_energy: Tensor
-    weight: Tensor
-    sub_weight: Tensor
-    rightward: Tensor
-    step_size: Tensor
-    leaf: Tensor
-    size: Tensor
-    accept_sum: Tensor
-    leaves: Tensor
+    cursor: Array
+    left: Array
+    right: Array
+    proposal: Array
+    sub_proposal: Array
+    momentum_sum: Array
+    sub_momentum_sum: Array
+    checkpoints: Array
+    start_energy: Array
+    weight: Array
+    sub_weight: Array
+    rightward: Array
+    step_size: Array
+    leaf: Array
+    size: Array
+    accept_sum: Array
+    leaves: Array
+    rows: Array
 
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What one call of `step` finished.
+    """What one call of `step` finished, brought to the host.
 
     Attributes:
         done: Which chains ended a trajectory, ``(C,)`` bool.
@@ -107,132 +109,126 @@ class Outcome:
         leaves: Their number of leapfrog steps, ``(C,)``.
     """
 
-    done: Tensor
-    position: Tensor
-    accept: Tensor
-    divergent: Tensor
-    leaves: Tensor
+    done: np.ndarray
+    position: np.ndarray
+    accept: np.ndarray
+    divergent: np.ndarray
+    leaves: np.ndarray
 
 
-def init(
-    position: Tensor, potential: Potential, *, step_size: float, tables: Tables, generator: torch.Generator
-) -> State:
+def init(position: Array, potential: Potential, *, step_size: float, tables: Tables, arrays: Arrays) -> State:
     """Chains at the start of their first trajectory, from positions ``(C, P)``."""
+    xp = arrays.xp
     chains, size = position.shape
     energy, slope = potential(position)
-    momentum = _normal(position, generator)
-    draw = torch.cat([position, slope, energy[:, None]], dim=1)
-    point = torch.cat([draw, momentum], dim=1)
-    zero = torch.zeros_like(energy)
-    count = torch.zeros(chains, dtype=torch.long, device=position.device)
+    momentum = arrays.normal(position)
+    draw = xp.concatenate([position, slope, energy[:, None]], 1)
+    point = xp.concatenate([draw, momentum], 1)
+    zero = xp.zeros_like(energy)
+    count = arrays.table([0] * chains)
     return State(
         cursor=point,
-        ends=torch.stack([point, point], dim=1),
+        left=point,
+        right=point,
         proposal=draw,
         sub_proposal=draw,
         momentum_sum=momentum,
-        sub_momentum_sum=torch.zeros_like(momentum),
-        checkpoints=position.new_zeros(chains, tables.depth + 1, 2 * size),
-        start_energy=energy + 0.5 * momentum.square().sum(-1),
+        sub_momentum_sum=xp.zeros_like(momentum),
+        checkpoints=xp.stack([xp.zeros_like(point[:, : 2 * size])] * (tables.depth + 1), 1),
+        start_energy=energy + 0.5 * (momentum * momentum).sum(-1),
         weight=zero,
-        sub_weight=zero - torch.inf,
-        rightward=_coin(energy, generator),
-        step_size=torch.full_like(energy, step_size),
+        sub_weight=zero - np.inf,
+        rightward=arrays.uniform((chains,), energy) >= 0.5,
+        step_size=xp.full_like(energy, step_size),
         leaf=count,
         size=count + 1,
         accept_sum=zero,
         leaves=zero,
+        rows=arrays.table(range(chains)),
     )
 
 
+@np.errstate(all="ignore")  # energies may be infinite, and sums of them undefined
 def step(
-    state: State, potential: Potential, *, step_size: float, tables: Tables, generator: torch.Generator
+    state: State, potential: Potential, *, step_size: float, tables: Tables, arrays: Arrays
 ) -> tuple[State, Outcome]:
     """One leapfrog step of every chain; ``step_size`` holds for trajectories that start in this call."""
-    s = state
-    size = s.momentum_sum.shape[1]
-    position, slope, _, momentum = s.cursor.split([size, size, 1, size], dim=1)
-    move = torch.where(s.rightward, s.step_size, -s.step_size)[:, None]
-    momentum = torch.addcmul(momentum, move, slope, value=-0.5)
-    position = torch.addcmul(position, move, momentum)
+    s, xp = state, arrays.xp
+    chains, size = s.momentum_sum.shape
+    move = xp.where(s.rightward, s.step_size, -s.step_size)[:, None]
+    momentum = s.cursor[:, 2 * size + 1 :] - 0.5 * move * s.cursor[:, size : 2 * size]
+    position = s.cursor[:, :size] + move * momentum
     energy, slope = potential(position)
-    momentum = torch.addcmul(momentum, move, slope, value=-0.5)
-    cursor = torch.cat([position, slope, energy[:, None], momentum], dim=1)
+    momentum = momentum - 0.5 * move * slope
+    draw = xp.concatenate([position, slope, energy[:, None]], 1)
+    cursor = xp.concatenate([draw, momentum], 1)
 
-    gain = s.start_energy - torch.add(energy, momentum.square().sum(-1), alpha=0.5)
-    gain = torch.nan_to_num(gain, nan=-torch.inf, neginf=-torch.inf)
+    gain = s.start_energy - energy - 0.5 * (momentum * momentum).sum(-1)
+    gain = xp.where(gain > -np.inf, gain, -np.inf)  # where it is no number too
     divergent = gain < -DIVERGENCE
-    accept_sum = s.accept_sum + gain.clamp_max(0).exp()
+    accept_sum = s.accept_sum + xp.exp(xp.where(gain < 0, gain, 0.0))
     leaves = s.leaves + 1
-    log_uniform = torch.rand((2, len(gain)), dtype=gain.dtype, device=gain.device, generator=generator).log()
+    log_uniform = xp.log(arrays.uniform((2, chains), gain))
+    coin = arrays.uniform((chains,), gain) >= 0.5
+    fresh = arrays.normal(position)
 
     # The leaf joins the subtree.
-    sub_weight = torch.logaddexp(s.sub_weight, gain)
+    sub_weight = xp.logaddexp(s.sub_weight, gain)
     take = log_uniform[0] < gain - sub_weight
-    sub_proposal = torch.where(take[:, None], cursor[:, : 2 * size + 1], s.sub_proposal)
+    sub_proposal = xp.where(take[:, None], draw, s.sub_proposal)
     sub_sum = s.sub_momentum_sum + momentum
-    half = torch.sub(sub_sum, momentum, alpha=0.5)
-    chains = torch.arange(len(gain), device=gain.device)
-    s.checkpoints[chains, tables.slot[s.leaf]] = torch.cat([momentum, half], dim=1)
+    half = sub_sum - 0.5 * momentum
+    s.checkpoints[s.rows, tables.slot[s.leaf]] = xp.concatenate([momentum, half], 1)
     depth = int(s.leaf.max()).bit_length()  # of the checkpoints in use
-    opened, closed = s.checkpoints[:, :depth].split(size, dim=2)
-    check = tables.check[s.leaf, :depth]
-    turns = _turning(opened, momentum[:, None], half[:, None] - closed)
-    stop = (turns & check).any(-1) | divergent
+    opened, closed = s.checkpoints[:, :depth, :size], s.checkpoints[:, :depth, size:]
+    turns = _turning(xp, opened, momentum[:, None], half[:, None] - closed)
+    stop = (turns & tables.check[s.leaf, :depth]).any(-1) | divergent
 
     # A complete subtree joins the tree.
     leaf = s.leaf + 1
     merge = (leaf == s.size) & ~stop
     take = merge & (log_uniform[1] < sub_weight - s.weight)
-    proposal = torch.where(take[:, None], sub_proposal, s.proposal)
-    weight = torch.where(merge, torch.logaddexp(s.weight, sub_weight), s.weight)
-    total = torch.where(merge[:, None], s.momentum_sum + sub_sum, s.momentum_sum)
-    grown = torch.stack([merge & ~s.rightward, merge & s.rightward], dim=1)
-    ends = torch.where(grown[:, :, None], cursor[:, None], s.ends)
-    count = torch.where(merge, 2 * s.size, s.size)
-    left, right = ends[:, :, 2 * size + 1 :].unbind(1)
-    full = _turning(left, right, torch.sub(total, left + right, alpha=0.5)) | (count >= 2**tables.depth)
+    proposal = xp.where(take[:, None], sub_proposal, s.proposal)
+    weight = xp.where(merge, xp.logaddexp(s.weight, sub_weight), s.weight)
+    total = xp.where(merge[:, None], s.momentum_sum + sub_sum, s.momentum_sum)
+    left = xp.where((merge & ~s.rightward)[:, None], cursor, s.left)
+    right = xp.where((merge & s.rightward)[:, None], cursor, s.right)
+    count = xp.where(merge, 2 * s.size, s.size)
+    first, last = left[:, 2 * size + 1 :], right[:, 2 * size + 1 :]
+    full = _turning(xp, first, last, total - 0.5 * (first + last)) | (count >= 2**tables.depth)
     done = stop | (merge & full)
 
     # Ended trajectories start anew from their proposal; all others go on, some with a new subtree.
-    fresh = _normal(position, generator)
-    start = torch.cat([proposal, fresh], dim=1)
-    ends = torch.where(done[:, None, None], start[:, None], ends)
+    start = xp.concatenate([proposal, fresh], 1)
+    anew = done[:, None]
+    left, right = xp.where(anew, start, left), xp.where(anew, start, right)
     restart = done | merge
-    rightward = torch.where(restart, _coin(gain, generator), s.rightward)
-    end = torch.where(rightward[:, None], ends[:, 1], ends[:, 0])
-    outcome = Outcome(done, proposal[:, :size], accept_sum / leaves, divergent & done, leaves)
+    rightward = xp.where(restart, coin, s.rightward)
+    end = xp.where(rightward[:, None], right, left)
+    outcome = Outcome(*map(arrays.host, (done, proposal[:, :size], accept_sum / leaves, divergent & done, leaves)))
     state = State(
-        cursor=torch.where(restart[:, None], end, cursor),
-        ends=ends,
+        cursor=xp.where(restart[:, None], end, cursor),
+        left=left,
+        right=right,
         proposal=proposal,
         sub_proposal=sub_proposal,
-        momentum_sum=torch.where(done[:, None], fresh, total),
-        sub_momentum_sum=torch.where(restart[:, None], 0.0, sub_sum),
+        momentum_sum=xp.where(anew, fresh, total),
+        sub_momentum_sum=xp.where(restart[:, None], 0.0, sub_sum),
         checkpoints=s.checkpoints,
-        start_energy=torch.where(
-            done, torch.add(proposal[:, 2 * size], fresh.square().sum(-1), alpha=0.5), s.start_energy
-        ),
-        weight=torch.where(done, 0.0, weight),
-        sub_weight=torch.where(restart, -torch.inf, sub_weight),
+        start_energy=xp.where(done, proposal[:, 2 * size] + 0.5 * (fresh * fresh).sum(-1), s.start_energy),
+        weight=xp.where(done, 0.0, weight),
+        sub_weight=xp.where(restart, -np.inf, sub_weight),
         rightward=rightward,
-        step_size=torch.where(done, step_size, s.step_size),
-        leaf=torch.where(restart, 0, leaf),
-        size=torch.where(done, 1, count),
-        accept_sum=torch.where(done, 0.0, accept_sum),
-        leaves=torch.where(done, 0.0, leaves),
+        step_size=xp.where(done, step_size, s.step_size),
+        leaf=xp.where(restart, 0, leaf),
+        size=xp.where(done, 1, count),
+        accept_sum=xp.where(done, 0.0, accept_sum),
+        leaves=xp.where(done, 0.0, leaves),
+        rows=s.rows,
     )
     return state, outcome
 
 
-def _turning(left: Tensor, right: Tensor, middle: Tensor) -> Tensor:
+def _turning(xp: Any, left: Array, right: Array, middle: Array) -> Array:
     """Whether a trajectory with these end momenta, and this sum of momenta with theirs by half, has made a U-turn."""
-    return torch.minimum((left * middle).sum(-1), (right * middle).sum(-1)) <= 0
-
-
-def _normal(like: Tensor, generator: torch.Generator) -> Tensor:
-    return torch.randn(like.shape, dtype=like.dtype, device=like.device, generator=generator)
-
-
-def _coin(like: Tensor, generator: torch.Generator) -> Tensor:
-    return torch.rand(like.shape, dtype=like.dtype, device=like.device, generator=generator) >= 0.5
+    return xp.minimum((left * middle).sum(-1), (right * middle).sum(-1)) <= 0

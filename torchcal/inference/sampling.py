@@ -12,7 +12,8 @@ from torchcal import models
 from torchcal.checks import whole
 from torchcal.errors import ConvergenceWarning, DomainError, ImproperPosteriorError
 from torchcal.inference.batched import MOST_ELEMENTS, run_batched
-from torchcal.inference.coordinates import Laplace, dealt_out
+from torchcal.inference.by_hand import by_hand
+from torchcal.inference.coordinates import Laplace, dealt_out, slopes_of
 from torchcal.inference.diagnostics import Figures, figures
 from torchcal.inference.draws import WORTH_CHAINS, Draws
 from torchcal.inference.estimate import Estimate, modes_of
@@ -137,10 +138,15 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
         draws = _draw_with_pyro(cast, starts[0], model, plan)
     else:
         transform = cast.prior.transform
+
+        def log_density(u: Tensor) -> Tensor:
+            return cast.log_prob(transform.bound(u)) + transform.log_slope(u)
+
         draws = run_batched(
-            lambda u: cast.log_prob(transform.bound(u)) + transform.log_slope(u),
+            log_density,
             transform,
             modes=starts,
+            slopes=by_hand(cast, slopes_of(log_density)),
             num_samples=plan.samples,
             num_chains=plan.chains(cost),
             num_warmup=plan.warmup,

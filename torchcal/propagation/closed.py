@@ -1,0 +1,161 @@
+r"""Moments of outputs and their gradient, written out in NumPy.
+
+PyTorch takes most of its time for a few thousand numbers to record operations and to go back over them. Sums over nodes
+are written out here, and where outputs are polynomials
+:math:`f_i = \sum_m B_{im} \prod_j L_{m_j}(\tilde\lambda_j)`, with :math:`\tilde\lambda` at a node linear in α,
+everything is.
+"""
+
+from abc import ABC, abstractmethod
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    from torchcal.propagation.nisp import NISP
+
+__all__ = ["MomentSlopes", "moment_slopes"]
+
+
+def moment_slopes(propagate: "NISP", observed: Tensor | None) -> "MomentSlopes":
+    """Moments of the wanted outputs, ``observed (n,)`` bool or None for all, in the way that suits the simulator."""
+    return (_Traced if propagate._table is None else _Polynomial)(propagate, observed)
+
+
+class MomentSlopes(ABC):
+    """Mean and variance as of `NISP.moments`, and the way back from slopes along them to slopes along α.
+
+    Attributes:
+        elements: Numbers that the largest array holds for each α.
+    """
+
+    elements: int
+
+    def __init__(self, propagate: "NISP") -> None:
+        projection = propagate._projection
+        self._projection = None if projection is None else projection.T.contiguous().numpy()  # (k, S)
+        self._weights = propagate.weights.numpy()
+        self._psi = propagate._psi if projection is None else propagate._carriers
+
+    def __call__(self, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and variance ``(C, n)`` at α ``(C, P)``, which `pulled_back` refers to from then on."""
+        outputs = self._outputs(alpha)
+        if self._projection is not None:
+            mean, self._offset = outputs[:, 0], outputs[:, 1:]
+            return self._turned(mean), self._turned((self._offset * self._offset).sum(1))
+        mean = self._weights @ outputs
+        self._offset = outputs - mean[:, None]
+        return self._turned(mean), self._turned(self._weights @ (self._offset * self._offset))
+
+    def pulled_back(self, mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
+        """Slopes along α ``(C, P)`` from those along mean and variance ``(C, n)``."""
+        first, second = self._turned(mean)[:, None], 2 * self._turned(variance)[:, None] * self._offset
+        if self._projection is not None:
+            return self._back(np.concatenate([first, second], 1))
+        return self._back(self._weights[:, None] * (first + second))
+
+    @abstractmethod
+    def _outputs(self, alpha: np.ndarray) -> np.ndarray:
+        """Outputs at nodes, or their projection, second axis; the others are what `_turned` makes of ``(C, n)``."""
+
+    @abstractmethod
+    def _back(self, slope: np.ndarray) -> np.ndarray:
+        """Slopes along α ``(C, P)`` from those along `_outputs`."""
+
+    @staticmethod
+    @abstractmethod
+    def _turned(values: np.ndarray) -> np.ndarray:
+        """Between ``(C, n)`` and the order of axes of the outputs."""
+
+    def _projected(self, values: np.ndarray) -> np.ndarray:
+        return values if self._projection is None else self._projection @ values
+
+    def _projected_back(self, slope: np.ndarray) -> np.ndarray:
+        return slope if self._projection is None else self._projection.T @ slope
+
+
+class _Traced(MomentSlopes):
+    """Of any simulator, whose own gradient is PyTorch's."""
+
+    def __init__(self, propagate: "NISP", observed: Tensor | None) -> None:
+        super().__init__(propagate)
+        self._propagate = propagate
+        self._observed = None if observed is None else observed.numpy()
+        self.elements = len(self._psi) * propagate._n
+
+    def _outputs(self, alpha: np.ndarray) -> np.ndarray:
+        with torch.enable_grad():
+            self._leaf = torch.from_numpy(alpha).requires_grad_(True)
+            self._traced = self._propagate._outputs(self._leaf, self._psi)
+        outputs = self._traced.detach().numpy()
+        return self._projected(outputs if self._observed is None else outputs[..., self._observed])
+
+    def _back(self, slope: np.ndarray) -> np.ndarray:
+        slope = self._projected_back(slope)
+        if self._observed is not None:
+            whole = np.zeros(self._traced.shape, slope.dtype)
+            whole[..., self._observed] = slope
+            slope = whole
+        (along,) = torch.autograd.grad(self._traced, self._leaf, torch.from_numpy(slope))
+        return along.numpy()
+
+    @staticmethod
+    def _turned(values: np.ndarray) -> np.ndarray:
+        return values
+
+
+class _Polynomial(MomentSlopes):
+    """Of outputs with known coefficients. Chains are the last axis, so that degrees are picked as whole blocks."""
+
+    def __init__(self, propagate: "NISP", observed: Tensor | None) -> None:
+        super().__init__(propagate)
+        terms, table, pattern = propagate._polynomial, propagate._table, propagate.pattern
+        if terms is None or table is None:
+            raise ValueError("Expected outputs that are polynomials of known coefficients. Got others.")
+        self._degrees = terms.T.cpu().numpy()  # (d, M)
+        self._table = (table if observed is None else table[:, observed]).T.contiguous().numpy()  # (n, M)
+        matrix = pattern.matrix(torch.eye(propagate.num_alpha, dtype=table.dtype))
+        place = torch.einsum("pdk,sk->dsp", matrix, self._psi)
+        self._shape = place.shape[:2]  # (d, S)
+        self._place = place.flatten(0, 1).contiguous().numpy()  # (d S, P)
+        self.elements = len(self._psi) * max(propagate._n, len(terms))
+
+    def _outputs(self, alpha: np.ndarray) -> np.ndarray:
+        at_nodes = (self._place @ alpha.T).reshape(*self._shape, len(alpha))
+        values, self._slopes = _legendre(at_nodes, int(self._degrees.max()))
+        self._factors = [values[degree, j] for j, degree in enumerate(self._degrees)]  # (M, S, C) each
+        features = self._factors[0]
+        for factor in self._factors[1:]:
+            features = features * factor
+        features = self._projected(features)
+        return (self._table @ features.reshape(len(features), -1)).reshape(-1, *features.shape[1:])
+
+    def _back(self, slope: np.ndarray) -> np.ndarray:
+        slope = (self._table.T @ slope.reshape(len(slope), -1)).reshape(-1, *slope.shape[1:])
+        slope = self._projected_back(slope)
+        along = []
+        for j, degree in enumerate(self._degrees):
+            part = slope * self._slopes[degree, j]
+            for i, factor in enumerate(self._factors):
+                if i != j:
+                    part *= factor
+            along.append(part.sum(0))
+        return np.stack(along).reshape(len(self._place), -1).T @ self._place
+
+    @staticmethod
+    def _turned(values: np.ndarray) -> np.ndarray:
+        return values.T
+
+
+def _legendre(x: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """Legendre polynomials of degree 0 to ``order``, first axis, and their slopes, by their recurrences."""
+    values, slopes = np.empty((order + 1, *x.shape), x.dtype), np.zeros((order + 1, *x.shape), x.dtype)
+    values[0] = 1
+    if order > 0:
+        values[1], slopes[1] = x, 1
+    for k in range(1, order):
+        values[k + 1] = ((2 * k + 1) * x * values[k] - k * values[k - 1]) / (k + 1)
+        slopes[k + 1] = slopes[k - 1] + (2 * k + 1) * values[k]
+    return values, slopes
