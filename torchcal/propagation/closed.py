@@ -118,44 +118,77 @@ class _Polynomial(MomentSlopes):
         self._table = (table if observed is None else table[:, observed]).T.contiguous().numpy()  # (n, M)
         matrix = pattern.matrix(torch.eye(propagate.num_alpha, dtype=table.dtype))
         place = torch.einsum("pdk,sk->dsp", matrix, self._psi)
-        self._shape = place.shape[:2]  # (d, S)
+        self._shape = (place.shape[0], place.shape[1])  # (d, S)
         self._place = place.flatten(0, 1).contiguous().numpy()  # (d S, P)
         self.elements = len(self._psi) * max(propagate._n, len(terms))
+        self._room: _Room | None = None
 
     def _outputs(self, alpha: np.ndarray) -> np.ndarray:
-        at_nodes = (self._place @ alpha.T).reshape(*self._shape, len(alpha))
-        values, self._slopes = _legendre(at_nodes, int(self._degrees.max()))
-        self._factors = [values[degree, j] for j, degree in enumerate(self._degrees)]  # (M, S, C) each
-        features = self._factors[0]
-        for factor in self._factors[1:]:
-            features = features * factor
-        features = self._projected(features)
-        return (self._table @ features.reshape(len(features), -1)).reshape(-1, *features.shape[1:])
+        if self._room is None or self._room.chains != len(alpha):
+            self._room = _Room(self._shape, self._degrees, len(alpha), alpha.dtype)
+        room = self._room
+        np.matmul(self._place, alpha.T, out=room.at_nodes.reshape(len(self._place), -1))
+        _legendre(room)
+        for j, degree in enumerate(self._degrees):
+            np.take(room.values[j], degree, axis=0, out=room.factors[j], mode="clip")  # any other mode copies
+        features = room.features
+        np.copyto(features, room.factors[0])
+        for factor in room.factors[1:]:
+            features *= factor
+        projected = self._projected(features.reshape(len(features), -1, len(alpha)))
+        return (self._table @ projected.reshape(len(projected), -1)).reshape(-1, *projected.shape[1:])
 
     def _back(self, slope: np.ndarray) -> np.ndarray:
+        room = self._room
+        if room is None:
+            raise ValueError("Expected the moments before their slopes. Got slopes first.")
         slope = (self._table.T @ slope.reshape(len(slope), -1)).reshape(-1, *slope.shape[1:])
-        slope = self._projected_back(slope)
-        along = []
+        slope = self._projected_back(slope).reshape(room.features.shape)
         for j, degree in enumerate(self._degrees):
-            part = slope * self._slopes[degree, j]
-            for i, factor in enumerate(self._factors):
+            part = np.take(room.slopes[j], degree, axis=0, out=room.features, mode="clip")
+            part *= slope
+            for i, factor in enumerate(room.factors):
                 if i != j:
                     part *= factor
-            along.append(part.sum(0))
-        return np.stack(along).reshape(len(self._place), -1).T @ self._place
+            np.sum(part, axis=0, out=room.along[j])
+        return room.along.reshape(len(self._place), -1).T @ self._place
 
     @staticmethod
     def _turned(values: np.ndarray) -> np.ndarray:
         return values.T
 
 
-def _legendre(x: np.ndarray, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Legendre polynomials of degree 0 to ``order``, first axis, and their slopes, by their recurrences."""
-    values, slopes = np.empty((order + 1, *x.shape), x.dtype), np.zeros((order + 1, *x.shape), x.dtype)
-    values[0] = 1
-    if order > 0:
-        values[1], slopes[1] = x, 1
-    for k in range(1, order):
-        values[k + 1] = ((2 * k + 1) * x * values[k] - k * values[k - 1]) / (k + 1)
-        slopes[k + 1] = slopes[k - 1] + (2 * k + 1) * values[k]
-    return values, slopes
+class _Room:
+    """Arrays for one number of chains, used again and again: to ask the system for them takes longer than to fill them.
+
+    Attributes:
+        at_nodes: Scaled parameters ``(d, S C)``.
+        values: Legendre polynomials of them ``(d, order + 1, S C)``.
+        slopes: Their derivatives.
+        factors: Those of every term, ``(d, M, S C)``.
+        features: Products of these ``(M, S C)``.
+        along: Slopes along the scaled parameters ``(d, S C)``.
+    """
+
+    def __init__(self, shape: tuple[int, int], degrees: np.ndarray, chains: int, dtype: np.dtype) -> None:
+        (size, nodes), terms, orders = shape, degrees.shape[1], int(degrees.max()) + 1
+        self.chains = chains
+        self.at_nodes, self.along = np.empty((2, size, nodes * chains), dtype)
+        self.values, self.slopes = np.zeros((2, size, orders, nodes * chains), dtype)
+        self.values[:, 0] = 1
+        self.slopes[:, 1:2] = 1
+        self.factors = np.empty((size, terms, nodes * chains), dtype)
+        self.features = np.empty((terms, nodes * chains), dtype)
+
+
+def _legendre(room: _Room) -> None:
+    """Legendre polynomials and their slopes by their recurrences, degree by degree."""
+    x, values, slopes, rest = room.at_nodes, room.values, room.slopes, room.along
+    values[:, 1:2] = x[:, None]
+    for k in range(1, values.shape[1] - 1):
+        np.multiply(x, values[:, k], out=values[:, k + 1])
+        values[:, k + 1] *= (2 * k + 1) / (k + 1)
+        np.multiply(values[:, k - 1], k / (k + 1), out=rest)
+        values[:, k + 1] -= rest
+        np.multiply(values[:, k], 2 * k + 1, out=slopes[:, k + 1])
+        slopes[:, k + 1] += slopes[:, k - 1]
