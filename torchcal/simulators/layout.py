@@ -1,7 +1,7 @@
 """What each number is that the trajectories of a recording depend on: parameters, each run's own, initial states."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -98,23 +98,26 @@ class Layout:
         return found
 
     def derivatives(
-        self, result: Tensor, begin: Tensor, leaves: dict[str, Tensor], run_of: Tensor, columns: Sequence[int]
+        self,
+        result: Tensor,
+        begin: Tensor,
+        leaves: dict[str, Tensor],
+        run_of: Tensor,
+        columns: Sequence[int],
+        *,
+        copied: bool = False,
     ) -> tuple[Tensor, Tensor]:
         """Derivatives of pointwise results ``(H, M, O)`` by states ``(H, M, O, S)`` and columns ``(H, M, O, C)``.
 
         Every point depends on its own state and parameters alone, so that one backward pass for each component of the
-        result gives the derivatives at all points.
+        result gives the derivatives at all points. Where everything is ``copied``, ``(O H, M)``, as many times as the
+        result has components, each copy takes one of them, and a single pass gives all.
         """
         names = [name for name, leaf in leaves.items() if leaf.requires_grad]
-        inputs = [begin, *(leaves[name] for name in names)]
         by_state, by_column = [], []
-        for k in range(result.shape[-1]):
-            part = result[..., k]
-            grads: Sequence[Tensor | None] = [None] * len(inputs)
-            if part.requires_grad:
-                keep = k + 1 < result.shape[-1]
-                grads = torch.autograd.grad(part.sum(), inputs, retain_graph=keep, allow_unused=True)
-            by_state.append(torch.zeros_like(begin) if grads[0] is None else grads[0])
+        inputs = [begin, *(leaves[name] for name in names)]
+        for part, grads in (_from_copies if copied else _one_by_one)(result, inputs):
+            by_state.append(begin.new_zeros(*part.shape, begin.shape[-1]) if grads[0] is None else grads[0])
             own = dict(zip(names, grads[1:], strict=True))
             rows = []
             for column in columns:
@@ -163,6 +166,31 @@ class Layout:
                 grad = torch.autograd.grad(part.sum(), leaf, retain_graph=True)[0] if part.requires_grad else None
                 rows.append(torch.zeros_like(leaf) if grad is None else grad)
         return torch.stack(rows, dim=1).unflatten(1, start.shape[1:])
+
+
+_Component = tuple[Tensor, Sequence[Tensor | None]]
+"""Of a result, ``(H, M)``, and its slopes along some inputs, None where it does not depend on one."""
+
+
+def _one_by_one(result: Tensor, inputs: Sequence[Tensor]) -> Iterator[_Component]:
+    """Components of a result ``(H, M, O)``, a backward pass for each."""
+    count = result.shape[-1]
+    for k, part in enumerate(result.unbind(-1)):
+        grads: Sequence[Tensor | None] = [None] * len(inputs)
+        if part.requires_grad:
+            grads = torch.autograd.grad(part.sum(), inputs, retain_graph=k + 1 < count, allow_unused=True)
+        yield part, grads
+
+
+def _from_copies(result: Tensor, inputs: Sequence[Tensor]) -> Iterator[_Component]:
+    """The same of O copies ``(O H, M, O)``, in one pass."""
+    count = result.shape[-1]
+    parts = result.unflatten(0, (count, -1)).diagonal(dim1=0, dim2=-1)  # (H, M, O)
+    grads: Sequence[Tensor | None] = [None] * len(inputs)
+    if parts.requires_grad:
+        grads = torch.autograd.grad(parts.sum(), inputs, allow_unused=True)
+    for k, part in enumerate(parts.unbind(-1)):
+        yield part, [None if grad is None else grad.unflatten(0, (count, -1))[k] for grad in grads]
 
 
 def _first_seen(run: Run, output: str) -> float | None:

@@ -15,30 +15,27 @@ def recur(flow: Tensor, forcing: Tensor) -> Tensor:
         flow: ``(H, R, K, S, S)``.
         forcing: ``(H, R, K, S, C)``.
     """
-    steps = flow.shape[2]
+    hyper, runs, steps, size, columns = forcing.shape
     block = max(1, math.ceil(math.sqrt(steps)))
     count = math.ceil(steps / block)
+    # Columns of the identity ride along: they carry what enters a block to every step of it.
+    both = torch.cat([flow, torch.zeros_like(flow), forcing], dim=-1).flatten(0, 1)
     pad = count * block - steps
     if pad:
-        eye = torch.eye(flow.shape[-1], dtype=flow.dtype).expand(*flow.shape[:2], pad, -1, -1)
-        flow = torch.cat([flow, eye], dim=2)
-        forcing = torch.cat([forcing, forcing.new_zeros(*forcing.shape[:2], pad, *forcing.shape[3:])], dim=2)
-    # Columns of the identity ride along: they carry what enters a block to every step of it.
-    flow = flow.unflatten(2, (count, block))
-    forcing = forcing.unflatten(2, (count, block))
-    size = flow.shape[-1]
-    carried = torch.cat([torch.zeros_like(flow[:, :, :, 0]), forcing.new_zeros(*forcing[:, :, :, 0].shape)], dim=-1)
-    carried[..., :size] += torch.eye(size, dtype=flow.dtype)
+        still = torch.cat([torch.eye(size, dtype=flow.dtype), flow.new_zeros(size, size + columns)], dim=-1)
+        both = torch.cat([both, still.expand(hyper * runs, pad, -1, -1)], dim=1)
+    both = both.unflatten(1, (count, block)).movedim(2, 0).flatten(1, 2).contiguous()  # (block, H R count, S, 2 S + C)
+    carried = torch.eye(size, size + columns, dtype=flow.dtype).expand(both.shape[1], -1, -1)
     inside = []
-    zeros = torch.zeros_like(carried[..., :size])
-    for k in range(block):
-        carried = flow[:, :, :, k] @ carried + torch.cat([zeros, forcing[:, :, :, k]], dim=-1)
+    for step, push in zip(both[..., :size].unbind(0), both[..., size:].unbind(0), strict=True):
+        carried = torch.baddbmm(push, step, carried)
         inside.append(carried)
-    within = torch.stack(inside, dim=3)  # (H, R, count, block, S, S + C)
-    entering = [forcing.new_zeros(*forcing.shape[:2], size, forcing.shape[-1])]
-    for j in range(count - 1):
-        end = within[:, :, j, -1]
-        entering.append(end[..., :size] @ entering[-1] + end[..., size:])
-    enters = torch.stack(entering, dim=2).unsqueeze(3)
+    within = torch.stack(inside)  # (block, H R count, S, S + C)
+    ends = carried.unflatten(0, (hyper * runs, count)).movedim(1, 0)
+    entering = [forcing.new_zeros(hyper * runs, size, columns)]
+    for step, push in zip(ends[:-1, :, :, :size].unbind(0), ends[:-1, :, :, size:].unbind(0), strict=True):
+        entering.append(torch.baddbmm(push, step, entering[-1]))
+    enters = torch.stack(entering, dim=1).flatten(0, 1)  # (H R count, S, C)
     found = within[..., :size] @ enters + within[..., size:]
-    return found.flatten(2, 3)[:, :, :steps]
+    found = found.unflatten(1, (hyper * runs, count)).movedim(0, 2).flatten(1, 2)[:, :steps]
+    return found.unflatten(0, (hyper, runs))

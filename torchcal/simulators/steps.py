@@ -32,6 +32,8 @@ SMALLEST, SMALLEST_ANEW = 1e-8, 1e-12
 MAX_PASSES = 8
 #: Points whose derivatives are computed at once: about what a processor's cache holds.
 POINTS = 2**15
+#: Numbers up to which an operation costs its call: so many copies of all points cost no more than the points alone.
+COPIED = 2**14
 #: Steps of the first span that is tried where there is no guess.
 SPAN = 64
 #: Trajectories times the derivatives that a pass needs of each, above which a step costs less than its share of passes.
@@ -102,13 +104,15 @@ class Steps:
         steps = self.grid.num_steps
         run_of = self.grid.step_run
         t, h, u = self.grid.flat
+        copies = size if hyper * runs * steps * size <= COPIED else 1
         with torch.enable_grad():
-            begin = states[:, :, :-1].reshape(hyper, runs * steps, size).detach().requires_grad_(True)
-            leaves = self.layout.leaves(values, run_of, columns)
+            begin = states[:, :, :-1].reshape(hyper, runs * steps, size).detach()
+            begin = begin.repeat(copies, 1, 1).requires_grad_(True)
+            leaves = self.layout.leaves(values.repeat(copies, 1), run_of, columns)
             ends = self.step(begin, t, h, leaves, u)
-            flow, forcing = self.layout.derivatives(ends, begin, leaves, run_of, columns)
+            flow, forcing = self.layout.derivatives(ends, begin, leaves, run_of, columns, copied=copies > 1)
         shape = (hyper, runs, steps, size)
-        return ends.detach().reshape(shape), flow.reshape(*shape, size), forcing.reshape(*shape, len(columns))
+        return ends[:hyper].detach().reshape(shape), flow.reshape(*shape, size), forcing.reshape(*shape, len(columns))
 
     def difference(self, values: Tensor) -> float:
         """Largest difference between the first steps taken one after another and all at once, relative to the states'.
