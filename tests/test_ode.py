@@ -11,7 +11,8 @@ from torch import Tensor
 
 import torchcal as tc
 from torchcal.errors import DomainError, RecordingError, SimulatorError
-from torchcal.simulators import Trajectories
+from torchcal.simulators import Trajectories, steps
+from torchcal.simulators.recurrence import recur
 from torchcal.simulators.steps import Steps
 from torchcal.terms import extend
 
@@ -329,8 +330,12 @@ def differences(bound: Trajectories, values: Tensor, step: float = 1e-6) -> Tens
         return ((evaluate(values + shift) - evaluate(values - shift)) / (2 * step)).T
 
 
+@pytest.mark.parametrize("copied", [0, 10**9])
 @pytest.mark.parametrize("subdivide", [1, 3])
-def test_sensitivities_of_everything_agree_with_differences(subdivide: int) -> None:
+def test_sensitivities_of_everything_agree_with_differences(
+    subdivide: int, copied: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(steps, "COPIED", copied)  # a backward pass for each state, or one for all
     bound = per_run_model().bind(two_runs()).refined(subdivide)
     values = tensor(1.0, 2.0, 0.8, 0.5, 0.3)
     found = bound.linearise(bound.x, torch.stack([values, 1.1 * values]))
@@ -339,6 +344,18 @@ def test_sensitivities_of_everything_agree_with_differences(subdivide: int) -> N
         torch.testing.assert_close(found.jacobian[row], expected, rtol=1e-6, atol=1e-8)
         torch.testing.assert_close(found.y[row], bound.at(bound.x)(point), rtol=1e-13, atol=1e-14)
     assert bool((found.jacobian[0].abs().amax(0) > 1e-3).all())  # no column is trivial
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 16])
+def test_a_recurrence_in_blocks_is_that_step_by_step(count: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    flow = torch.randn(2, 3, count, 4, 4, dtype=F64, generator=generator)
+    forcing = torch.randn(2, 3, count, 4, 2, dtype=F64, generator=generator)
+    x, expected = torch.zeros(2, 3, 4, 2, dtype=F64), []
+    for k in range(count):
+        x = flow[:, :, k] @ x + forcing[:, :, k]
+        expected.append(x)
+    torch.testing.assert_close(recur(flow, forcing), torch.stack(expected, dim=2), rtol=1e-10, atol=1e-10)
 
 
 def test_chosen_columns_and_outputs_are_parts_of_the_whole() -> None:
