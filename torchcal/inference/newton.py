@@ -47,7 +47,10 @@ class Minima:
 
 
 def gradient(objective: Objective, points: Tensor, *, piece: int | None = None) -> tuple[Tensor, Tensor]:
-    """Values ``(B,)`` and gradients ``(B, P)``, ``piece`` points at once; what is not finite becomes +inf and 0."""
+    """Values ``(*batch,)`` and gradients ``(*batch, P)``; what is not finite becomes +inf and 0.
+
+    Of points ``(B, P)`` a ``piece`` is taken at once.
+    """
     if piece is not None and len(points) > piece:
         parts = [gradient(objective, block) for block in points.split(piece)]
         return torch.cat([part[0] for part in parts]), torch.cat([part[1] for part in parts])
@@ -57,18 +60,22 @@ def gradient(objective: Objective, points: Tensor, *, piece: int | None = None) 
         (slope,) = torch.autograd.grad(values.sum(), leaf)
     values = torch.nan_to_num(values.detach(), nan=torch.inf)
     good = torch.isfinite(values) & torch.isfinite(slope).all(-1)
-    return torch.where(good, values, torch.inf), torch.where(good[:, None], slope, 0.0)
+    return torch.where(good, values, torch.inf), torch.where(good[..., None], slope, 0.0)
 
 
 def hessian(objective: Objective, points: Tensor, *, step: float = _STEP, piece: int | None = None) -> Tensor:
-    """Hessians ``(B, P, P)`` by central differences of the gradient, all of them in one batch or piece by piece."""
-    batch, size = points.shape
+    """Hessians ``(B, P, P)`` by central differences of the gradient.
+
+    The objective gets all points in one batch ``(2, P, B, P)``, or ``(B, P)`` piece by piece.
+    """
     length = step * points.abs().clamp_min(1.0)  # coordinates that are not scaled yet may be large
-    shift = torch.diag_embed(length)
-    both = torch.stack([points[:, None] + shift, points[:, None] - shift])  # (2, B, P, P)
-    _, slopes = gradient(objective, both.reshape(-1, size), piece=piece)
-    slopes = slopes.reshape(2, batch, size, size)
-    result = (slopes[0] - slopes[1]) / (2 * length[..., None])
+    shift = torch.diag_embed(length).transpose(0, 1)
+    both = torch.stack([points + shift, points - shift])
+    if piece is None:
+        slopes = gradient(objective, both)[1]
+    else:
+        slopes = gradient(objective, both.flatten(0, 2), piece=piece)[1].reshape(both.shape)
+    result = ((slopes[0] - slopes[1]) / (2 * length.T[..., None])).transpose(0, 1)
     return 0.5 * (result + result.transpose(-1, -2))
 
 

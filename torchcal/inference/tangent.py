@@ -1,12 +1,11 @@
 """Minimisation where the model is dear: first on its tangents or with few quadrature nodes, then with all of it."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchcal.inference.newton import Minima, directions, finite_values, join, minimise
+from torchcal.inference.newton import Minima, directions, finite_values, gradient, hessian, join, minimise
 from torchcal.propagation import NISP
 from torchcal.simulators import Conditions, ExternalSimulator, Simulator, Trajectories
 
@@ -16,9 +15,6 @@ Objective = Callable[[NISP, Tensor], Tensor]
 
 _INNER = 8
 """Newton steps on the tangents for one linearisation: the objective is far from quadratic where spreads vanish."""
-
-_STEP = 1e-5
-"""Central-difference step of the Hessian, as in `torchcal.inference.newton`."""
 
 _SAME = 1e-5
 """Relative difference of objectives on the tangent plane from which on two starts are followed apart."""
@@ -345,8 +341,7 @@ def _descend(objective: Callable[[Tensor], Tensor], here: Tensor, radius: Tensor
         value = torch.nan_to_num(objective(at), nan=torch.inf, posinf=torch.inf)
     total = torch.zeros_like(value)
     for _ in range(_INNER):
-        slope = _gradient(objective, at)
-        tries = at[:, None] + directions(slope, _hessian(objective, at))
+        tries = at[:, None] + directions(gradient(objective, at)[1], hessian(objective, at))
         offset = tries - here[:, None]
         length = offset.norm(dim=-1, keepdim=True).clamp_min(1e-300)
         tries = here[:, None] + offset * (radius[:, None, None] / length).clamp_max(1.0)
@@ -372,21 +367,3 @@ def _told_apart(values: Tensor, means: Tensor) -> Tensor:
         if bool(same.any()):
             group[i] = group[same.nonzero()[0, 0]]
     return group.unique(return_inverse=True)[1]
-
-
-def _gradient(objective: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
-    leaf = points.detach().requires_grad_(True)
-    with torch.enable_grad():
-        values: Any = objective(leaf)
-        (slope,) = torch.autograd.grad(values.sum(), leaf)
-    good = torch.isfinite(values) & torch.isfinite(slope).all(-1)
-    return torch.where(good[..., None], slope, 0.0)
-
-
-def _hessian(objective: Callable[[Tensor], Tensor], points: Tensor) -> Tensor:
-    """``(B, P, P)`` at points ``(B, P)``, by central differences of the gradient."""
-    length = _STEP * points.abs().clamp_min(1.0)
-    shift = torch.diag_embed(length).transpose(0, 1)  # (P, B, P)
-    up, down = _gradient(objective, torch.stack([points + shift, points - shift]))
-    result = ((up - down) / (2 * length.T[..., None])).transpose(0, 1)
-    return 0.5 * (result + result.transpose(-1, -2))
