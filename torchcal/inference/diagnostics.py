@@ -6,6 +6,7 @@ Source: Vehtari, Gelman, Simpson, Carpenter & Bürkner (2021), Bayesian Analysis
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from pyro.ops.stats import split_gelman_rubin
 from torch import Tensor
@@ -49,10 +50,11 @@ def figures(draws: Tensor) -> Figures:
     if count < FEWEST:
         nothing = torch.full(rest, torch.nan, dtype=torch.float64)
         return Figures(nothing, nothing, nothing)
-    ordered, order = values.flatten(1).sort(dim=1)
-    scores = _normal_scores(ordered, order).reshape(values.shape)
+    quantiles = _by_double_rank(chains * count)
+    ordered, scores = _normal_scores(values.flatten(1), quantiles)
     middle = ordered[:, (chains * count - 1) // 2, None, None]
-    folded = _normal_scores(*(values - middle).abs().flatten(1).sort(dim=1)).reshape(values.shape)
+    _, folded = _normal_scores((values - middle).abs().flatten(1), quantiles)
+    scores, folded = scores.reshape(values.shape), folded.reshape(values.shape)
     spread = torch.maximum(_split_r_hat(scores), _split_r_hat(folded))
     ends = [_quantile(ordered, q) for q in (0.05, 0.95)]
     tail = torch.minimum(*(_ess((values <= end[:, None, None]).to(torch.float64)) for end in ends))
@@ -84,8 +86,8 @@ def _effective(chains: Tensor) -> Tensor:
     count, n = chains.shape
     total = float(count * n)
     offset = chains - chains.mean(1, keepdim=True)
-    power = torch.fft.rfft(offset, 2 * n).abs().square()
-    covariance = torch.fft.irfft(power, 2 * n)[:, :n].mean(0) / n
+    power = torch.view_as_real(torch.fft.rfft(offset, 2 * n)).square().sum(-1).mean(0)
+    covariance = torch.fft.irfft(power, 2 * n)[:n] / n
     within = covariance[0] * n / (n - 1)
     across = chains.mean(1).var() if count > 1 else torch.zeros_like(within)
     correlation = 1 - (within - covariance * n / (n - 1)) / (covariance[0] + across)
@@ -97,19 +99,23 @@ def _effective(chains: Tensor) -> Tensor:
     return total / torch.nan_to_num(time, nan=1.0).clamp_min(1 / math.log10(max(total, 11.0)))
 
 
-def _normal_scores(ordered: Tensor, order: Tensor) -> Tensor:
-    """Normal quantiles of the ranks, from sorted draws and their order ``(Q, S)``; draws that tie share their rank."""
-    count = order.shape[1]
-    places = torch.arange(1, count + 1, dtype=torch.float64).expand(order.shape)
-    new = torch.ones_like(order, dtype=torch.bool)
-    new[:, 1:] = ordered[:, 1:] != ordered[:, :-1]
-    if not bool(new.all()):
-        group = new.to(torch.long).cumsum(1) - 1
-        total = torch.zeros_like(places).scatter_add(1, group, places)
-        size = torch.zeros_like(places).scatter_add(1, group, torch.ones_like(places))
-        places = (total / size.clamp_min(1)).gather(1, group)
-    score = torch.special.ndtri((places - 0.375) / (count + 0.25))
-    return torch.empty(order.shape, dtype=torch.float64).scatter_(1, order, score)
+def _by_double_rank(count: int) -> np.ndarray:
+    """Normal quantiles of the ranks 1, 3/2, 2 … ``count``: draws that tie share the mean of their ranks."""
+    ranks = torch.arange(2, 2 * count + 1, dtype=torch.float64) / 2
+    return torch.special.ndtri((ranks - 0.375) / (count + 0.25)).numpy()
+
+
+def _normal_scores(values: Tensor, quantiles: np.ndarray) -> tuple[Tensor, Tensor]:
+    """Sorted values ``(Q, S)``, and of each value the normal quantile of its rank. NumPy sorts faster than PyTorch."""
+    every = values.cpu().numpy()
+    ordered, scores = np.empty_like(every), np.empty_like(every)
+    for row, sorted_row, score in zip(every, ordered, scores, strict=True):
+        order = row.argsort()
+        sorted_row[:] = row[order]
+        first = np.flatnonzero(np.concatenate([[True], sorted_row[1:] != sorted_row[:-1]]))
+        last = np.concatenate([first[1:], [len(row)]]) - 1
+        score[order] = np.repeat(quantiles[first + last], last - first + 1)
+    return torch.from_numpy(ordered), torch.from_numpy(scores)
 
 
 def _quantile(ordered: Tensor, q: float) -> Tensor:

@@ -131,8 +131,12 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
     def folded(alpha: Tensor) -> Tensor:
         return pattern.flip(alpha, estimate.alpha.to(alpha)) if problem.prior.symmetric else alpha
 
+    seen: list[tuple[Tensor, Figures]] = []  # the last look
+
     def enough(alpha: Tensor, groups: Tensor) -> float:
-        return _more(folded(alpha), groups.cpu(), plan.target_ess or 0.0)
+        alpha = folded(alpha)
+        seen[:] = [(alpha, figures(alpha))]
+        return _more(*seen[0], groups.cpu(), plan.target_ess or 0.0)
 
     if plan.sampler == "pyro":
         draws = _draw_with_pyro(cast, starts[0], model, plan)
@@ -158,7 +162,7 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
             progress=plan.progress,
         )
     alpha = folded(draws.alpha)
-    found = figures(alpha)
+    found = seen[0][1] if seen and torch.equal(seen[0][0], alpha) else figures(alpha)
     if plan.target_ess is not None and _missing(found, plan.target_ess) > 1:
         warnings.warn(
             f"Wanted an effective sample size of {plan.target_ess:g} and R-hat below {R_HAT_THRESHOLD}. Got "
@@ -178,7 +182,7 @@ def _mode(problem: Problem, mode: Laplace, started: bool) -> Mode:
     return Mode(tuple(alpha.cpu().tolist()), objective, mode.weight, started)
 
 
-def _more(alpha: Tensor, groups: Tensor, target: float) -> float:
+def _more(alpha: Tensor, found: Figures, groups: Tensor, target: float) -> float:
     """By which factor draws ``(C, n, P)`` must grow to reach a sample size and an R-hat; at most 1 if they do.
 
     Where all chains together do not, each group ``(C,)`` of them, those that began at one mode, is judged by itself and
@@ -187,7 +191,7 @@ def _more(alpha: Tensor, groups: Tensor, target: float) -> float:
     """
     if alpha.shape[1] < 4:
         return 2.0
-    whole = _missing(figures(alpha), target)
+    whole = _missing(found, target)
     if whole <= 1 or len(groups.unique()) == 1:
         return whole
     shares = [(alpha[groups == group], float((groups == group).double().mean())) for group in groups.unique()]
