@@ -118,6 +118,28 @@ def test_both_namespaces_take_the_same_steps(kernel, dtype):
     np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-9 if dtype == torch.float64 else 2e-3)
 
 
+@pytest.mark.parametrize("arrays", [Host(0), Device(0, torch.device("cpu"))], ids=["NumPy", "PyTorch"])
+@KERNELS
+def test_a_chain_that_starts_where_the_density_is_nothing_leaves(kernel, arrays):
+    def potential(z):
+        xp, inside = arrays.xp, z[:, 0] < 0
+        return xp.where(inside, 0.5 * (z * z).sum(-1), math.inf), xp.where(inside[:, None], z, 0.0)
+
+    start = arrays.take(torch.full((4, 2), 0.01, dtype=torch.float64))
+    tables = nuts_step.Tables.build(6, arrays)
+    if kernel == "nuts":
+        state = nuts_step.init(start, potential, step_size=0.3, tables=tables, arrays=arrays)
+    else:
+        state = hmc_step.init(start, potential)
+    for _ in range(200):
+        if kernel == "nuts":
+            state, _ = nuts_step.step(state, potential, step_size=0.3, tables=tables, arrays=arrays)
+        else:
+            state, _ = hmc_step.step(state, potential, step_size=0.3, length=1.5, arrays=arrays)
+    (ends,) = arrays.host(state.proposal[:, :2] if kernel == "nuts" else state.position)
+    assert (ends[:, 0] < 0).all()
+
+
 @KERNELS
 def test_the_tensor_namespace_draws_what_the_density_is(kernel, monkeypatch):
     """That of accelerators, here on the CPU."""
@@ -255,8 +277,9 @@ def test_r_hat_sees_separate_modes(kernel):
     def two(u):
         return torch.logaddexp(-0.5 * (u - 12).square(), -0.5 * (u + 12).square()).sum(-1)
 
-    wide = 12 * torch.eye(1, dtype=torch.float64)
-    draws = run(two, 1, scale_tril=wide, num_samples=100, num_chains=8, kernel=kernel).alpha
+    one = torch.eye(1, dtype=torch.float64)
+    modes = [Laplace(12 * one[0], one, 0.5), Laplace(-12 * one[0], one, 0.5)]
+    draws = run(two, 1, modes=modes, num_samples=100, num_chains=8, kernel=kernel).alpha
     assert float(diagnostics.figures(draws).r_hat[0]) > 1.5
 
 

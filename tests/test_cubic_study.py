@@ -257,11 +257,10 @@ def test_the_cubic_model_is_exact_and_its_sd_zero(n: int, gamma: float) -> None:
 
 def test_epsilon_scales_the_posterior_and_not_the_map() -> None:
     wide, narrow = (cubic.posterior("linear", 11, epsilon=e, num_samples=400, num_chains=32) for e in (0.1, 0.05))
-    # The likelihood is not quite quadratic over its width: of the last α the ratio is 0.481 (120,000 effective draws).
-    # Its sd is known to 2 % each, as its tails are heavy.
-    torch.testing.assert_close(
-        alpha_sd(narrow) / alpha_sd(wide), torch.full((5,), 0.5, dtype=torch.float64), rtol=0.12, atol=0
-    )
+    # The likelihood is not quite quadratic over its width: these are ratios of 120,000 effective draws. Five sds of
+    # 1.5 % each, as the tails of the last one are heavy.
+    expected = torch.tensor([0.498, 0.493, 0.500, 0.496, 0.481], dtype=torch.float64)
+    torch.testing.assert_close(alpha_sd(narrow) / alpha_sd(wide), expected, rtol=0.1, atol=0)
     for model, n in CASES[:2]:
         first = map_of(model, n, epsilon=0.1)
         for epsilon in (0.05, 0.01, 0.001):

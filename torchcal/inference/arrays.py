@@ -35,8 +35,8 @@ class Arrays(ABC):
         """A tensor as an array."""
 
     @abstractmethod
-    def host(self, array: Array) -> np.ndarray:
-        """An array in NumPy."""
+    def host(self, *arrays: Array) -> tuple[np.ndarray, ...]:
+        """Arrays of as many rows each in NumPy."""
 
     @abstractmethod
     def table(self, values: Sequence[Any]) -> Array:
@@ -63,9 +63,9 @@ class Host(Arrays):
         """The same memory."""
         return tensor.detach().numpy()
 
-    def host(self, array: np.ndarray) -> np.ndarray:
-        """Itself."""
-        return array
+    def host(self, *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Themselves."""
+        return arrays
 
     def table(self, values: Sequence[Any]) -> np.ndarray:
         """An array."""
@@ -87,15 +87,19 @@ class Device(Arrays):
 
     def __init__(self, seed: int, device: torch.device) -> None:
         self._device = device
-        self._generator = torch.Generator(device=device).manual_seed(seed)
+        # Other numbers than those that starting points are made of with the same seed.
+        self._generator = torch.Generator(device=device).manual_seed(seed + 2**32)
 
     def take(self, tensor: Tensor) -> Tensor:
         """On the device."""
         return tensor.detach().to(self._device)
 
-    def host(self, array: Tensor) -> np.ndarray:
-        """Brought from the device."""
-        return array.cpu().numpy()
+    def host(self, *arrays: Tensor) -> tuple[np.ndarray, ...]:
+        """Brought from the device in one copy, since each one waits for all that is under way."""
+        kind = next((array.dtype for array in arrays if array.is_floating_point()), torch.float64)
+        packed = torch.cat([array.reshape(len(array), -1).to(kind) for array in arrays], dim=1).cpu()
+        parts = packed.split([array[0].numel() for array in arrays], dim=1)
+        return tuple(part.reshape(a.shape).to(a.dtype).numpy() for part, a in zip(parts, arrays, strict=True))
 
     def table(self, values: Sequence[Any]) -> Tensor:
         """On the device."""

@@ -15,11 +15,11 @@ from torchcal.inference.coordinates import Slopes
 from torchcal.likelihoods import ABC, SMOOTHING
 from torchcal.models import Problem
 from torchcal.priors import Bounds
-from torchcal.propagation import moment_slopes
+from torchcal.propagation.closed import QUIET, moment_slopes
 
-__all__ = ["MOST_ELEMENTS", "ByHand", "by_hand"]
+__all__ = ["MOST_BY_HAND", "ByHand", "by_hand"]
 
-MOST_ELEMENTS = 2**19
+MOST_BY_HAND = 2**19
 """Numbers in one array from which on PyTorch, whose operations use all cores, is as fast."""
 
 _CONSTANT = (priors.Flat, priors.Uniform)
@@ -32,8 +32,9 @@ def by_hand(problem: Problem, otherwise: Slopes) -> Slopes:
         return otherwise
     if problem.y.device.type != "cpu" or problem.propagate.sd_floor is None or problem.likelihood.epsilon is None:
         return otherwise
-    found = ByHand(problem, problem.likelihood.epsilon, problem.propagate.sd_floor)
-    return lambda u: (found if len(u) * found.elements <= MOST_ELEMENTS else otherwise)(u)
+    found = ByHand(problem, problem.likelihood.epsilon, problem.likelihood.gamma, problem.propagate.sd_floor)
+    most = min(MOST_BY_HAND, problem.propagate.max_elements)
+    return lambda u: (found if len(u) * found.elements <= most else otherwise)(u)
 
 
 class ByHand:
@@ -42,11 +43,14 @@ class ByHand:
     Args:
         problem: On the CPU, with the `ABC` likelihood and a prior that is constant within its bounds.
         epsilon: The likelihood's tolerance.
+        gamma: The likelihood's ratio.
         floor: Of the sd, δ.
     """
 
-    def __init__(self, problem: Problem, epsilon: float | Tensor, floor: float) -> None:
-        observed, likelihood, bounds = problem.observed, problem.likelihood, problem.prior.transform
+    def __init__(
+        self, problem: Problem, epsilon: float | Tensor, gamma: float | Tensor, floor: float
+    ) -> None:
+        observed, bounds = problem.observed, problem.prior.transform
 
         def pick(values: Tensor) -> np.ndarray:
             return (values if observed is None else values[observed]).numpy()
@@ -55,16 +59,17 @@ class ByHand:
         self.elements = self._moments.elements
         self._y = pick(problem.y)
         self._noise = None if problem.noise is None else pick(problem.noise) ** 2
-        tolerance = torch.as_tensor(epsilon, dtype=problem.y.dtype).expand(self._y.shape).numpy()
-        self._smallest, self._precision = (SMOOTHING * tolerance) ** 2, tolerance**-2.0
-        self._gamma, self._floor = getattr(likelihood, "gamma", 1.0), floor**2
+        tolerance, self._gamma = (
+            torch.as_tensor(value, dtype=problem.y.dtype).detach().expand(self._y.shape).numpy()
+            for value in (epsilon, gamma)
+        )
+        self._smallest, self._precision, self._floor = (SMOOTHING * tolerance) ** 2, tolerance**-2.0, floor**2
         self._coordinates = None if bounds.free else _Coordinates(bounds)
         self._prior = float(problem.prior.log_prob(bounds.bound(torch.zeros_like(bounds.low))))
 
     def __call__(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """Log-density ``(C,)`` and its gradient ``(C, P)`` at u ``(C, P)``."""
-        with np.errstate(all="ignore"):  # where it is not finite there is none
-            value, slope = self._both(u.detach().numpy())
+        value, slope = self._both(u.detach().numpy())
         return torch.from_numpy(value), torch.from_numpy(slope)
 
     def _both(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -75,6 +80,7 @@ class ByHand:
         value, *slopes = self._matched(*self._moments(alpha))
         return value + jacobian + self._prior, self._moments.pulled_back(*slopes) * scale + steeper
 
+    @QUIET
     def _matched(self, mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """`likelihoods.abc_log_prob` ``(C,)`` and its slopes along mean and variance ``(C, n)``."""
         offset = mean - self._y
@@ -104,14 +110,15 @@ class _Coordinates:
         self._log_width = np.log(self._width).sum()
         self._sides = self._low.astype(low.dtype) + self._high
 
+    @QUIET
     def __call__(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Of u ``(C, P)``: α and its slope ``(C, P)``, the summed log of that ``(C,)``, and its slope ``(C, P)``."""
         share = 1 / (1 + np.exp(-u))
         softened = np.logaddexp(0, u)  # softplus
-        alpha = np.where(self._high, self._to + u - softened, u)
+        alpha = np.where(self._high, self._to - np.logaddexp(0, -u), u)
         alpha = np.where(self._low, self._from + softened, alpha)
         alpha = np.where(self._both, self._from + self._width * share, alpha)
-        scale = np.where(self._high, 1 - share, 1)
+        scale = np.where(self._high, 1 / (1 + np.exp(u)), 1)
         scale = np.where(self._low, share, scale)
         scale = np.where(self._both, self._width * share * (1 - share), scale)
         jacobian = self._log_width + (self._low * u - self._sides * softened).sum(-1)

@@ -149,12 +149,15 @@ class _HostPotential:
         self._bend = None if space.bend is None else space.bend.on_host()
 
     def potential(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        bent = z if self._bend is None else z + self._bend.shift(z)
-        value, steepest = self._slopes(torch.from_numpy(self._loc + bent @ self._upward))
-        energy, slope = -value.numpy(), steepest.numpy() @ self._downhill
-        if self._bend is not None:
-            slope += self._bend.pulled_back(z, slope)
-        good = np.isfinite(energy + slope.sum(-1))  # which is not finite where any of them is not
+        with np.errstate(all="ignore"):  # what is not finite is told by the result; the density keeps its own warnings
+            bent = z if self._bend is None else z + self._bend.shift(z)
+            u = self._loc + bent @ self._upward
+        value, steepest = self._slopes(torch.from_numpy(u))
+        with np.errstate(all="ignore"):
+            energy, slope = -value.numpy(), steepest.numpy() @ self._downhill
+            if self._bend is not None:
+                slope += self._bend.pulled_back(z, slope)
+            good = np.isfinite(energy + slope.sum(-1))  # which is not finite where any of them is not
         if good.all():
             return energy, slope
         return np.where(good, energy, np.inf), np.where(good[:, None], slope, 0)

@@ -54,7 +54,6 @@ def init(position: Array, potential: Potential) -> State:
     return State(position, *potential(position))
 
 
-@np.errstate(all="ignore")  # energies may be infinite, and sums of them undefined
 def step(
     state: State, potential: Potential, *, step_size: float, length: float, arrays: Arrays
 ) -> tuple[State, Outcome]:
@@ -68,14 +67,16 @@ def step(
     momentum = arrays.normal(position)
     kinetic = 0.5 * (momentum * momentum).sum(-1)
     energy, slope = start, state.slope
-    momentum = momentum - 0.5 * size * slope
     for number in range(count):
-        position = position + size * momentum
+        with np.errstate(all="ignore"):  # where a trajectory diverges; the potential keeps its own warnings
+            momentum = momentum - (size if number else 0.5 * size) * slope
+            position = position + size * momentum
         energy, slope = potential(position)
-        momentum = momentum - (size if number < count - 1 else 0.5 * size) * slope
-    error = energy + 0.5 * (momentum * momentum).sum(-1) - start - kinetic
-    error = xp.where(error < np.inf, error, np.inf)  # where it is no number too
-    accept = xp.exp(-xp.where(error > 0, error, 0.0))
+    with np.errstate(all="ignore"):
+        momentum = momentum - 0.5 * size * slope
+        error = energy + 0.5 * (momentum * momentum).sum(-1) - start - kinetic
+        error = xp.where(error < np.inf, error, np.inf)  # where it is no number too
+        accept = xp.exp(-xp.where(error > 0, error, 0.0))
     take = uniform[1:] < accept
     row = take[:, None]
     moved = State(
@@ -83,14 +84,9 @@ def step(
         xp.where(take, energy, start),
         xp.where(row, slope, state.slope),
     )
-    outcome = Outcome(
-        done=np.ones(len(start), dtype=bool),
-        position=arrays.host(moved.position),
-        accept=arrays.host(accept),
-        divergent=arrays.host(error > DIVERGENCE),
-        leaves=np.full(len(start), float(count)),
-    )
-    return moved, outcome
+    drawn, accepted, divergent = arrays.host(moved.position, accept, error > DIVERGENCE)
+    everyone, steps = np.ones(len(start), dtype=bool), np.full(len(start), float(count))
+    return moved, Outcome(everyone, drawn, accepted, divergent, steps)
 
 
 def tuned_length(
@@ -107,7 +103,7 @@ def tuned_length(
     rounds = min(max(8, -(-_PAIRS // len(state.position))), _MOST_ROUNDS)
     for quarters in _LADDER:
         length = quarters * QUARTER
-        draws, work = [arrays.host(state.position)], 0.0
+        draws, work = [*arrays.host(state.position)], 0.0
         for _ in range(rounds):
             state, outcome = step(state, potential, step_size=step_size, length=length, arrays=arrays)
             draws.append(outcome.position)

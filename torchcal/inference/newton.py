@@ -9,6 +9,7 @@ from torch import Tensor
 __all__ = ["Minima", "directions", "finite_values", "gradient", "hessian", "join", "minimise"]
 
 Objective = Callable[[Tensor], Tensor]
+"""``(*batch, P) -> (*batch,)``."""
 
 _STEP = 1e-5
 """Central-difference step of the Hessian in scaled coordinates: gradients are good to 1e-12, so the
@@ -105,7 +106,7 @@ def minimise(
     directions of a negative curvature (a germ's column leaves zero spread along one), and keeps the best.
 
     Args:
-        objective: ``(B, P) -> (B,)``, differentiable.
+        objective: ``(*batch, P) -> (*batch,)``, differentiable.
         starts: ``(S, P)``.
         max_iterations: Most iterations.
         tolerance: A start is done when three iterations in a row gain less than this, relative to the objective plus

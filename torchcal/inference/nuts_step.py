@@ -18,6 +18,9 @@ from torchcal.inference.arrays import Array, Arrays, Potential
 
 __all__ = ["Outcome", "State", "Tables", "init", "step"]
 
+_QUIET = np.errstate(all="ignore")
+"""Energies may be infinite, and sums of them undefined; the potential keeps its own warnings."""
+
 DIVERGENCE = 1000.0
 """Energy error past which a trajectory counts as divergent, as in Stan."""
 
@@ -148,23 +151,45 @@ def init(position: Array, potential: Potential, *, step_size: float, tables: Tab
     )
 
 
-@np.errstate(all="ignore")  # energies may be infinite, and sums of them undefined
 def step(
     state: State, potential: Potential, *, step_size: float, tables: Tables, arrays: Arrays
 ) -> tuple[State, Outcome]:
     """One leapfrog step of every chain; ``step_size`` holds for trajectories that start in this call."""
-    s, xp = state, arrays.xp
-    chains, size = s.momentum_sum.shape
-    move = xp.where(s.rightward, s.step_size, -s.step_size)[:, None]
+    position, momentum, move = _half_way(state, arrays)
+    draw = (position, *potential(position))
+    return _joined(state, draw, momentum, move, step_size=step_size, tables=tables, arrays=arrays)
+
+
+@_QUIET
+def _half_way(s: State, arrays: Arrays) -> tuple[Array, Array, Array]:
+    """Positions after a leapfrog step, momenta half a step before, and the signed step ``(C, 1)``."""
+    size = s.momentum_sum.shape[1]
+    move = arrays.xp.where(s.rightward, s.step_size, -s.step_size)[:, None]
     momentum = s.cursor[:, 2 * size + 1 :] - 0.5 * move * s.cursor[:, size : 2 * size]
-    position = s.cursor[:, :size] + move * momentum
-    energy, slope = potential(position)
+    return s.cursor[:, :size] + move * momentum, momentum, move
+
+
+@_QUIET
+def _joined(
+    s: State,
+    point: tuple[Array, Array, Array],
+    momentum: Array,
+    move: Array,
+    *,
+    step_size: float,
+    tables: Tables,
+    arrays: Arrays,
+) -> tuple[State, Outcome]:
+    """Trees with one leaf more: position, energy and gradient of each."""
+    xp = arrays.xp
+    chains, size = s.momentum_sum.shape
+    position, energy, slope = point
     momentum = momentum - 0.5 * move * slope
     draw = xp.concatenate([position, slope, energy[:, None]], 1)
     cursor = xp.concatenate([draw, momentum], 1)
 
     gain = s.start_energy - energy - 0.5 * (momentum * momentum).sum(-1)
-    gain = xp.where(gain > -np.inf, gain, -np.inf)  # where it is no number too
+    gain = xp.nan_to_num(gain, nan=-np.inf, neginf=-np.inf)  # finite above, so that a chain leaves where it is none
     divergent = gain < -DIVERGENCE
     accept_sum = s.accept_sum + xp.exp(xp.where(gain < 0, gain, 0.0))
     leaves = s.leaves + 1
@@ -205,7 +230,7 @@ def step(
     restart = done | merge
     rightward = xp.where(restart, coin, s.rightward)
     end = xp.where(rightward[:, None], right, left)
-    outcome = Outcome(*map(arrays.host, (done, proposal[:, :size], accept_sum / leaves, divergent & done, leaves)))
+    outcome = Outcome(*arrays.host(done, proposal[:, :size], accept_sum / leaves, divergent & done, leaves))
     state = State(
         cursor=xp.where(restart[:, None], end, cursor),
         left=left,

@@ -16,7 +16,10 @@ from torch import Tensor
 if TYPE_CHECKING:
     from torchcal.propagation.nisp import NISP
 
-__all__ = ["MomentSlopes", "moment_slopes"]
+__all__ = ["QUIET", "MomentSlopes", "moment_slopes"]
+
+QUIET = np.errstate(all="ignore")
+"""What is not finite is told by the result. Simulators keep their own warnings."""
 
 
 def moment_slopes(propagate: "NISP", observed: Tensor | None) -> "MomentSlopes":
@@ -31,17 +34,19 @@ class MomentSlopes(ABC):
         elements: Numbers that the largest array holds for each α.
     """
 
-    elements: int
-
     def __init__(self, propagate: "NISP") -> None:
         projection = propagate._projection
         self._projection = None if projection is None else projection.T.contiguous().numpy()  # (k, S)
         self._weights = propagate.weights.numpy()
         self._psi = propagate._psi if projection is None else propagate._carriers
+        self.elements = len(self._psi) * propagate._width
 
     def __call__(self, alpha: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean and variance ``(C, n)`` at α ``(C, P)``, which `pulled_back` refers to from then on."""
-        outputs = self._outputs(alpha)
+        return self._summed(self._outputs(alpha))
+
+    @QUIET
+    def _summed(self, outputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if self._projection is not None:
             mean, self._offset = outputs[:, 0], outputs[:, 1:]
             return self._turned(mean), self._turned((self._offset * self._offset).sum(1))
@@ -49,6 +54,7 @@ class MomentSlopes(ABC):
         self._offset = outputs - mean[:, None]
         return self._turned(mean), self._turned(self._weights @ (self._offset * self._offset))
 
+    @QUIET
     def pulled_back(self, mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
         """Slopes along α ``(C, P)`` from those along mean and variance ``(C, n)``."""
         first, second = self._turned(mean)[:, None], 2 * self._turned(variance)[:, None] * self._offset
@@ -83,7 +89,6 @@ class _Traced(MomentSlopes):
         super().__init__(propagate)
         self._propagate = propagate
         self._observed = None if observed is None else observed.numpy()
-        self.elements = len(self._psi) * propagate._n
 
     def _outputs(self, alpha: np.ndarray) -> np.ndarray:
         with torch.enable_grad():
@@ -98,8 +103,8 @@ class _Traced(MomentSlopes):
             whole = np.zeros(self._traced.shape, slope.dtype)
             whole[..., self._observed] = slope
             slope = whole
-        (along,) = torch.autograd.grad(self._traced, self._leaf, torch.from_numpy(slope))
-        return along.numpy()
+        target = (self._traced * torch.from_numpy(slope)).sum()  # with grad_outputs=, PyTorch would import SymPy first
+        return torch.autograd.grad(target, self._leaf)[0].numpy()
 
     @staticmethod
     def _turned(values: np.ndarray) -> np.ndarray:
@@ -120,9 +125,9 @@ class _Polynomial(MomentSlopes):
         place = torch.einsum("pdk,sk->dsp", matrix, self._psi)
         self._shape = (place.shape[0], place.shape[1])  # (d, S)
         self._place = place.flatten(0, 1).contiguous().numpy()  # (d S, P)
-        self.elements = len(self._psi) * max(propagate._n, len(terms))
         self._room: _Room | None = None
 
+    @QUIET
     def _outputs(self, alpha: np.ndarray) -> np.ndarray:
         if self._room is None or self._room.chains != len(alpha):
             self._room = _Room(self._shape, self._degrees, len(alpha), alpha.dtype)

@@ -32,8 +32,9 @@ SMALLEST, SMALLEST_ANEW = 1e-8, 1e-12
 MAX_PASSES = 8
 #: Points whose derivatives are computed at once: about what a processor's cache holds.
 POINTS = 2**15
-#: Numbers up to which an operation costs its call: so many copies of all points cost no more than the points alone.
-COPIED = 2**14
+#: Numbers up to which an operation costs its call and little more: copies of all points, one for each state, up to this
+#: take less time than a backward pass for each.
+COPIED = 2**13
 #: Steps of the first span that is tried where there is no guess.
 SPAN = 64
 #: Trajectories times the derivatives that a pass needs of each, above which a step costs less than its share of passes.
