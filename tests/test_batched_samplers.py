@@ -140,6 +140,12 @@ def test_a_chain_that_starts_where_the_density_is_nothing_leaves(kernel, arrays)
     assert (ends[:, 0] < 0).all()
 
 
+def test_momenta_are_not_the_starting_points_again():
+    like = torch.zeros(8, 3, dtype=torch.float64)
+    begin = torch.randn(8, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    assert not torch.equal(Device(4, torch.device("cpu")).normal(like), begin)
+
+
 @KERNELS
 def test_the_tensor_namespace_draws_what_the_density_is(kernel, monkeypatch):
     """That of accelerators, here on the CPU."""

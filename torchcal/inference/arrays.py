@@ -87,8 +87,8 @@ class Device(Arrays):
 
     def __init__(self, seed: int, device: torch.device) -> None:
         self._device = device
-        # Other numbers than those that starting points are made of with the same seed.
-        self._generator = torch.Generator(device=device).manual_seed(seed + 2**32)
+        # Other numbers than those of starting points with the same seed, of which some generators take 32 bits alone.
+        self._generator = torch.Generator(device=device).manual_seed(seed ^ 2**31)
 
     def take(self, tensor: Tensor) -> Tensor:
         """On the device."""
