@@ -216,6 +216,21 @@ def test_gate_and_hidden_states():
     np.testing.assert_allclose(seen, exact, atol=1e-8)
 
 
+def test_two_factors_on_one_constant_are_their_product():
+    batch = FAMILIES["batch reactor"]
+    sizes = {"product inhibition": 0.5, "reverse reaction": 0.1, "deactivation": 0.2}
+    for order in (list(sizes), list(sizes)[::-1]):
+        planted = [Planted(batch.effect(name), sizes[name]) for name in order]
+        setting = Setting((RunSetting(np.array([0.0, 2.0]), {}, {"A": 1.3, "B": 0.7}, ("A", "B")),), observed=("A",))
+        (trace,) = simulate(batch, setting, np.array([0.5, 0.2]), planted)
+        state = {name: values[-1] for name, values in trace.states.items()}
+        rate = trace.base["A"][-1] + sum(part["A"][-1] for part in trace.added)
+        k = 0.5 * np.exp(-0.2 * 2.0) / (1 + 0.5 * state["B"])
+        np.testing.assert_allclose(rate, -k * state["A"] + 0.1 * state["B"], rtol=1e-12)
+        first = trace.base["A"][0] + sum(part["A"][0] for part in trace.added)
+        np.testing.assert_allclose(first, -0.5 / (1 + 0.5 * 0.7) * 1.3 + 0.1 * 0.7, rtol=1e-12)
+
+
 def test_recalibration_by_hand():
     """For y = m x + a x² at x = 1, 2, 3 the best slope is m + a Σx³/Σx² = m + 18/7 a."""
     family = line()

@@ -39,6 +39,8 @@ class Effect:
         name: As the candidate list spells it; out-of-library effects have names that no list holds.
         rates: What it adds to the rate of each equation, ``f(t, s, p, u, c)``; ``c["a"]`` is the amplitude.
         outputs: What it makes of an output, ``f(t, s, p, u, y, c)``.
+        factors: Where its rates are those of a base parameter times a factor ``f(t, s, p, u, c)``, that factor: other
+            effects see the parameter so.
         hidden: States of its own and where they start: a number or the name of a visible state.
         shapes: Shape parameters: ``(low, high, driver)``, drawn log-uniformly, in units of the driver's largest
             absolute value on the base's trajectory (``None``: as they are).
@@ -54,6 +56,7 @@ class Effect:
     name: str
     rates: Mapping[str, Function] = field(default_factory=dict)
     outputs: Mapping[str, Function] = field(default_factory=dict)
+    factors: Mapping[str, Function] = field(default_factory=dict)
     hidden: Mapping[str, float | str] = field(default_factory=dict)
     shapes: Mapping[str, tuple[float, float, str | None]] = field(default_factory=dict)
     sign: int = 1
@@ -260,13 +263,17 @@ def _total(
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:  # fmt: skip
     assert family.rates is not None
     base = family.rates(t, s, p, u)
-    added = []
-    for item, c in zip(planted, numbers, strict=True):
+    added: list[dict[str, Any]] = [{} for _ in planted]
+    for i in sorted(range(len(planted)), key=lambda i: not planted[i].effect.factors):
+        item, c = planted[i], numbers[i]
         gate = 1.0 if item.gate is None else item.gate(t, s, u)
-        added.append({
+        added[i] = {
             state: rate(t, s, p, u, c) * (gate if state in family.states else 1.0)
             for state, rate in item.effect.rates.items()
-        })  # fmt: skip
+        }
+        moved = {name: p[name] * (1 + gate * (factor(t, s, p, u, c) - 1))
+                 for name, factor in item.effect.factors.items()}  # fmt: skip
+        p = {**p, **moved}
     return base, added
 
 

@@ -38,19 +38,26 @@ batch = Family(
         Effect(
             "reaction order",
             _moved(lambda t, s, p, u, c: p["k1"] * s["A"] * (np.maximum(s["A"], 1e-6) ** c["a"] - 1)),
+            factors={"k1": lambda t, s, p, u, c: np.maximum(s["A"], 1e-6) ** c["a"]},
             sign=0, guess=0.3,
         ),
         Effect(
             "saturation",
             _moved(lambda t, s, p, u, c: -p["k1"] * s["A"] * (c["a"] * s["A"] / (1 + c["a"] * s["A"]))), guess=0.3,
+            factors={"k1": lambda t, s, p, u, c: 1 / (1 + c["a"] * s["A"])},
         ),
         Effect("autocatalysis", _moved(lambda t, s, p, u, c: c["a"] * s["A"] * s["B"]), drivers=("t",)),
         Effect("second branch", {"A": lambda t, s, p, u, c: -c["a"] * s["A"]}),
         Effect(
             "product inhibition",
             _moved(lambda t, s, p, u, c: -p["k1"] * s["A"] * (c["a"] * s["B"] / (1 + c["a"] * s["B"]))), guess=0.3,
+            factors={"k1": lambda t, s, p, u, c: 1 / (1 + c["a"] * s["B"])},
         ),
-        Effect("deactivation", _moved(lambda t, s, p, u, c: p["k1"] * s["A"] * np.expm1(-c["a"] * t)), guess=0.05),
+        Effect(
+            "deactivation",
+            _moved(lambda t, s, p, u, c: p["k1"] * s["A"] * np.expm1(-c["a"] * t)), guess=0.05,
+            factors={"k1": lambda t, s, p, u, c: np.exp(-c["a"] * t)},
+        ),
         *sensors("B", only=("offset", "gain error", "drift", "lag")),
         Effect(
             "poisoned catalyst",
@@ -119,12 +126,14 @@ stirred = Family(
         Effect(
             "reaction order",
             _both(lambda t, s, p, u, c: _arrhenius(s, p) * (np.maximum(s["C"], 1e-6) ** c["a"] - 1)),
+            factors={"k": lambda t, s, p, u, c: np.maximum(s["C"], 1e-6) ** c["a"]},
             sign=0, guess=0.3,
         ),
         Effect("second-order decay", {"C": lambda t, s, p, u, c: -c["a"] * s["C"] ** 2}, drivers=("t",)),
         Effect(
             "saturation",
             _both(lambda t, s, p, u, c: -_arrhenius(s, p) * (c["a"] * s["C"] / (1 + c["a"] * s["C"]))), guess=0.3,
+            factors={"k": lambda t, s, p, u, c: 1 / (1 + c["a"] * s["C"])},
         ),
         Effect("second branch", {"C": lambda t, s, p, u, c: -c["a"] * s["C"]}, drivers=("t", "T")),
         Effect("radiation", {

@@ -105,11 +105,13 @@ resonant = Family(
         Effect(
             "non-linear capacitance",
             {"v": lambda t, s, p, u, c: s["i"] / p["C"] * (1 / (1 + np.maximum(c["a"] * s["v"], -0.95)) - 1)},
+            factors={"C": lambda t, s, p, u, c: 1 + np.maximum(c["a"] * s["v"], -0.95)},
             sign=0, guess=0.05, most=0.3,
         ),
         Effect(
             "saturation of the inductance",
             {"i": lambda t, s, p, u, c: c["a"] * s["i"] ** 2 * (u["e"] - p["R"] * s["i"] - s["v"]) / p["L"]},
+            factors={"L": lambda t, s, p, u, c: 1 / (1 + c["a"] * s["i"] ** 2)},
             guess=0.1,
         ),
         Effect("cubic resistor", {"i": lambda t, s, p, u, c: -c["a"] * s["i"] ** 3 / p["L"]}, drivers=("t",)),

@@ -71,6 +71,7 @@ tank = Family(
         Effect(
             "clogging",
             {"h": lambda t, s, p, u, c: p["a"] * _root(s["h"]) * -np.expm1(-c["a"] * t)},
+            factors={"a": lambda t, s, p, u, c: np.exp(-c["a"] * t)},
             guess=0.01,
         ),
         *sensors("h", only=("offset", "gain error", "drift", "lag")),
