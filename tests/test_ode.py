@@ -11,9 +11,8 @@ from torch import Tensor
 
 import torchcal as tc
 from torchcal.errors import DomainError, RecordingError, SimulatorError
-from torchcal.simulators import Trajectories, steps
+from torchcal.simulators import Solution, Trajectories, steps
 from torchcal.simulators.recurrence import recur
-from torchcal.simulators.steps import Steps
 from torchcal.terms import extend
 
 F64 = torch.float64
@@ -224,7 +223,7 @@ def test_a_solution_that_blows_up_is_infinite_and_raises_nothing() -> None:
     (slope,) = torch.autograd.grad(bound.at(bound.x)(leaf)[:, 1].sum(), leaf)
     assert bool(torch.isfinite(slope[0]).all())  # the good trajectory keeps its derivative
     warm = bound.solve(values)
-    assert torch.equal(bound.solve(values, warm), warm)
+    assert torch.equal(bound.steps.solve(values, warm)[0], warm)
 
 
 # --- observation -----------------------------------------------------------------------------------------
@@ -414,9 +413,32 @@ def test_a_warm_start_gives_the_stepwise_solution(monkeypatch: pytest.MonkeyPatc
     warm, right = bound.steps._march(near), bound.steps._march(there)
     cold = bound.linearise(bound.x, there)
     monkeypatch.setattr(type(bound.steps), "_march", lambda self, values: pytest.fail("Newton's method did not settle"))
-    hot = bound.linearise(bound.x, there, warm=warm)
-    torch.testing.assert_close(hot.warm, right, rtol=1e-8, atol=1e-8)
+    hot = bound.linearise(bound.x, there, warm=Solution(warm))
+    torch.testing.assert_close(hot.warm.states, right, rtol=1e-8, atol=1e-8)
     torch.testing.assert_close(hot.jacobian, cold.jacobian, rtol=1e-6, atol=1e-7)
+
+
+def test_a_solution_predicts_its_neighbours_to_first_order() -> None:
+    bound = oscillator().bind(tc.Recording(runs=[run_of(np.linspace(0, 10, 80), {"x": 1.0})]))
+    point, way = tensor(4.0, 0.2, 0.1)[None], tensor(1.0, -0.1, 0.3)[None]
+    for columns in (None, [2, 0, 1]):
+        warm = bound.linearise(bound.x, point, columns=columns).warm
+        off = [float((warm.near(point + h * way) - bound.solve(point + h * way)).abs().max()) for h in (0.04, 0.02)]
+        assert off[0] / off[1] == pytest.approx(4, rel=0.1)
+    there = point + 0.04 * way
+    torch.testing.assert_close(bound.linearise(bound.x, there, columns=[0], warm=warm).y, bound.at(bound.x)(there))
+
+
+def test_solutions_are_parted_and_joined() -> None:
+    bound = oscillator().bind(tc.Recording(runs=[run_of(np.linspace(0, 10, 80), {"x": 1.0})]))
+    points = tensor(4.0, 0.2, 0.1) * torch.linspace(0.9, 1.1, 3, dtype=F64)[:, None]
+    warm = bound.linearise(bound.x, points).warm
+    swapped = warm.updated(torch.tensor([True, False, True]), warm.rows(torch.tensor([2, 0])))
+    expected = bound.linearise(bound.x, points[[2, 1, 0]]).warm
+    for name in ("values", "states", "tangents"):
+        assert torch.equal(getattr(swapped, name), getattr(expected, name))
+    assert torch.equal(warm.rows(torch.tensor([1])).repeated(2).near(points[[1, 1]]), warm.states[[1, 1]])
+    assert warm.guess(2, 5) is None  # of another number of states
 
 
 @pytest.mark.parametrize("guess", [1e3, math.nan, math.inf])
@@ -427,9 +449,9 @@ def test_newton_from_a_bad_guess_falls_back_to_steps(guess: float) -> None:
     generator = torch.Generator().manual_seed(0)
     bad = guess * torch.randn(right.shape, generator=generator, dtype=F64)
     for warm in (bad, bad[:, :, :-1].expand(2, -1, -1, -1)):  # the second is of another batch, and not looked at
-        torch.testing.assert_close(bound.solve(point, warm), right, rtol=1e-8, atol=1e-8)
-    found = bound.linearise(bound.x, torch.cat([point, point]), warm=torch.cat([right, bad]))
-    torch.testing.assert_close(found.warm, torch.cat([right, right]), rtol=1e-8, atol=1e-8)
+        torch.testing.assert_close(bound.steps.solve(point, warm)[0], right, rtol=1e-8, atol=1e-8)
+    found = bound.linearise(bound.x, torch.cat([point, point]), warm=Solution(torch.cat([right, bad])))
+    torch.testing.assert_close(found.warm.states, torch.cat([right, right]), rtol=1e-8, atol=1e-8)
 
 
 def swinging(t, s, p, u):
@@ -472,8 +494,10 @@ def test_spans_give_what_single_steps_give(rates, initial, values, monkeypatch: 
     bound = simulator.bind(tc.Recording(runs=[run_of(np.linspace(0, 40, 200), initial), short]))
     point = tensor(*values)
     passes = []
-    newton = Steps._newton
-    monkeypatch.setattr(Steps, "_newton", lambda *args: passes.append(args[0].grid.num_steps) or newton(*args))
+    newton = steps.close_gaps
+    monkeypatch.setattr(
+        steps, "close_gaps", lambda *args, **kwargs: passes.append(args[0].grid.num_steps) or newton(*args, **kwargs)
+    )
     found = bound.solve(point)
     single = bound.steps._one_by_one(point, bound.layout.start(point))
     right = torch.where(torch.isfinite(single), single, torch.full_like(single, math.inf))
@@ -490,9 +514,9 @@ def test_without_steps_what_newton_does_not_reach_is_infinite() -> None:
     point = tensor(4.0, 0.2, 0.1).expand(2, -1)
     warm = bound.steps._march(point)
     warm[1] = math.nan
-    found = bound.linearise(bound.x, point, warm=warm, march=False)
+    found = bound.linearise(bound.x, point, warm=Solution(warm), march=False)
     assert bool(torch.isfinite(found.y[0]).all())
-    assert bool((found.warm[1] == math.inf).all())
+    assert bool((found.warm.states[1] == math.inf).all())
 
 
 # --- errors ----------------------------------------------------------------------------------------------

@@ -185,9 +185,9 @@ def _sharpen(found: Fitted) -> Fitted:
             return found
         if number == 7:
             break
-        if isinstance(found.warm, Tensor):
-            excess = 2.0 * float((error / allowed).max())
-            finer = simulator.focused(found.values, found.warm, excess) if math.isfinite(excess) else finer
+        excess = 2.0 * float((error / allowed).max())
+        if math.isfinite(excess):
+            finer = simulator.focused(found.values, simulator.solve(found.values[None], found.warm), excess)
         problem = dataclasses.replace(found.problem, simulator=finer)
         whitening = found.whitening
         again = fit(problem, whitening, found.values[None], found.free)

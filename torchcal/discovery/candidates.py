@@ -12,7 +12,7 @@ from torch import Tensor
 from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.problem import Problem
 from torchcal.errors import DomainError, SimulatorError
-from torchcal.simulators import Parameter, Trajectories, free_parameters
+from torchcal.simulators import Parameter, free_parameters
 from torchcal.terms import Term, extend
 from torchcal.terms.term import neutral_of
 
@@ -221,11 +221,7 @@ def prepare(
     free = sorted(set(held) | set(own))
 
     def linear(rows: Tensor, columns: list[int]) -> tuple[Tensor, Tensor]:
-        warm = None
-        if isinstance(problem.simulator, Trajectories) and isinstance(found.warm, Tensor):
-            same = len(problem.simulator.ode.states) == found.warm.shape[-1]
-            warm = found.warm.expand(len(rows), *found.warm.shape[1:]) if same else None
-        y, jacobian, _ = problem.evaluate(rows, columns, warm)
+        y, jacobian, _ = problem.evaluate(rows, columns, problem.guess(found.warm, len(rows)))
         return y, jacobian
 
     y, jacobian = linear(begin[None], own)

@@ -80,9 +80,8 @@ def responses(problem: Problem, found: Fitted, forcing: Tensor) -> tuple[Tensor,
     bound = problem.simulator
     if not isinstance(bound, Trajectories):
         raise TypeError("responses need a simulator in time")
-    values, states = found.values[None], found.warm
-    if states is None:
-        states = bound.solve(values)
+    values = found.values[None]
+    states = bound.solve(values, found.warm)
     flow = bound.flow(values, states)[0]  # (R, K, S, S)
     size = flow.shape[-1]
     rows = bound.observation_slopes(values, states, problem.recording.outputs)[problem.index]  # (n, S)
@@ -177,7 +176,7 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
     bound = problem.simulator
     names = [q.name for q in problem.parameters]
     if isinstance(bound, Trajectories):
-        states = found.warm if found.warm is not None else bound.solve(found.values[None])
+        states = bound.solve(found.values[None], found.warm)
         own = [i for i in found.free if names[i] not in bound.initial_names and not is_window(names[i])]
         size = len(bound.ode.states)
         _, _, by_parameter = bound.steps.derivatives(found.values[None], states, own)
@@ -202,7 +201,7 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
                 changes = zip(bound.ode.states, rates[:, :, m - size].unbind(-1), strict=True)
                 moved = {name: rate for name, rate in changes if name not in given and bool((rate != 0).any())}
             list_.append(Channel(kind, target, unit, drivers, time, response[:, :, m], moved))
-        at_data = problem.drivers_at_data(found.values[None], states)
+        at_data = problem.drivers_at_data(found.values[None], found.warm)
         at_data = _by_run(problem, at_data, bound.grid.run_of[problem.condition_of])
     else:
         at_data = problem.drivers_at_data(found.values[None], None)

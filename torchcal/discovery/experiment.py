@@ -1,6 +1,7 @@
 """Which new condition would tell tied hypotheses apart: where their predictions differ most after refitting."""
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -27,6 +28,8 @@ LEAST = 2.0
 
 #: How much larger the distance must be for a less simple experiment.
 WORTH = 1.01
+#: Below which no temperature goes, by unit.
+ABSOLUTE_ZERO = {"degC": -273.15, "°C": -273.15, "degF": -459.67, "°F": -459.67}
 #: Solver error, in noise sd, up to which a model bears an experiment.
 SETTLED = 0.1
 
@@ -203,7 +206,7 @@ def _in_time(model: Fitted) -> list[Option]:
     if not isinstance(bound, Trajectories) or recording.runs is None:
         return found
     first = recording.runs[0]
-    states = bound.solve(model.values[None]) if model.warm is None else model.warm
+    states = bound.solve(model.values[None], model.warm)
     known = {
         name: float(states[0, 0, 0, i]) for i, name in enumerate(bound.ode.states) if name not in bound.ode.initial
     }
@@ -251,7 +254,8 @@ def _static(recording: Recording) -> list[Option]:
         width = high - low
         spans = [(f"above the recorded range, to {high + 0.5 * width:.4g}", high, high + 0.5 * width)]
         below = low / 3 if 0 < low < 0.5 * width else low - 0.5 * width
-        if below >= 0 or low < 0:
+        below = max(below, ABSOLUTE_ZERO.get(recording.units.get(name, ""), -math.inf))
+        if (below >= 0 or low < 0) and below < low:
             spans.append((f"below the recorded range, to {below:.4g}", below, low))
         cuts = values.quantile(torch.tensor([0.0, 1 / 3, 2 / 3, 1.0], dtype=values.dtype)).tolist()
         spans += [(f"between {a:.4g} and {b:.4g}", a, b) for a, b in itertools.pairwise(cuts) if b > a]

@@ -2,13 +2,12 @@
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchcal.discovery.problem import Problem, Whitening
-from torchcal.simulators import Trajectories
+from torchcal.simulators import Solution, Trajectories
 
 __all__ = ["Fitted", "fit", "follow_slopes", "refit", "starts", "weighed"]
 
@@ -53,7 +52,7 @@ class Fitted:
     jacobian: Tensor
     chi2: float
     at_bound: Tensor
-    warm: Any
+    warm: Solution | None
     agreeing: float = 1.0
     ends: Tensor | None = None
     ends_chi2: Tensor | None = None
@@ -185,7 +184,7 @@ def fit(
     begin: Tensor,
     free: list[int],
     *,
-    warm: Any = None,
+    warm: Solution | None = None,
     data: Tensor | None = None,
     max_steps: int = MAX_STEPS,
     finish: int = FINISH,
@@ -205,8 +204,8 @@ def fit(
     values[:, free] = values[:, free].clamp(low, high)
 
     def evaluate(
-        points: Tensor, target: Tensor, warm: Any, march: bool = True
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Any]:
+        points: Tensor, target: Tensor, warm: Solution | None, march: bool = True
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Solution | None]:
         y, jacobian, warm = problem.evaluate(points, free, warm, march=march)
         residual = target - whitening.vector(y)
         chi2 = residual.square().sum(-1)
@@ -219,7 +218,7 @@ def fit(
         return None
     if not bool(alive.all()):  # infinite trajectories would poison the batch
         values, y, jacobian, residual, chi2 = (t[alive] for t in (values, y, jacobian, residual, chi2))
-        warm = warm[alive] if isinstance(warm, Tensor) else None
+        warm = None if warm is None else warm.rows(alive)
         if data is not None:
             target, data = target[alive], data[alive]
     damping = torch.full_like(chi2, 1e-3)
@@ -265,7 +264,7 @@ def fit(
         predicted = 2 * (step * gradient).sum(-1) - reach.square().sum(-1)
         # A step from which the trajectory cannot be mended at once is too long; only if that goes on is it marched.
         rows = (~done).nonzero()[:, 0]  # the others are not evaluated again
-        part = warm[rows] if isinstance(warm, Tensor) else warm
+        part = None if warm is None else warm.rows(rows)
         *found, warm_part = evaluate(
             trial[rows], target[rows] if target.ndim == 2 else target, part, bool((lost[rows] >= 3).any())
         )
@@ -285,11 +284,8 @@ def fit(
             (chi2, chi2_new),
         ):
             old[better] = new[better]
-        if isinstance(warm, Tensor) and isinstance(warm_part, Tensor):
-            warm = warm.clone()
-            warm[better] = warm_part[better[rows]]
-        else:
-            warm = warm_part if bool(better.all()) else warm
+        if warm is not None and warm_part is not None:
+            warm = warm.updated(better, warm_part.rows(better[rows]))
         # A step that had to be taken back teaches caution: along a bent valley the damping would swing otherwise.
         eager = torch.where(better, (eager * 0.9).clamp_min(0.2), (eager * 2.0).clamp_max(0.8))
         ease = torch.where(
@@ -312,7 +308,7 @@ def fit(
             whitening,
             values[best : best + 1],
             free,
-            warm=warm[best : best + 1] if isinstance(warm, Tensor) else warm,
+            warm=None if warm is None else warm.rows(torch.tensor([best])),
             data=None if data is None else data[best : best + 1],
             max_steps=finish,
             finish=0,
@@ -343,7 +339,7 @@ def fit(
         jacobian=jacobian[best],
         chi2=float(chi2[best]),
         at_bound=at_bound,
-        warm=warm[best : best + 1] if isinstance(warm, Tensor) else None,
+        warm=None if warm is None else warm.rows(torch.tensor([best])),
         ends=values,
         ends_chi2=chi2,
         agreeing=agreeing,

@@ -4,14 +4,13 @@ import dataclasses
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchcal.data import Recording
 from torchcal.errors import SimulatorError
-from torchcal.simulators import Parameter, Simulator, Trajectories
+from torchcal.simulators import Parameter, Simulator, Solution, Trajectories
 
 __all__ = ["Problem", "Whitening"]
 
@@ -176,8 +175,8 @@ class Problem:
         return torch.tensor(low, dtype=torch.float64), torch.tensor(high, dtype=torch.float64)
 
     def evaluate(
-        self, values: Tensor, columns: list[int], warm: Any = None, *, march: bool = True
-    ) -> tuple[Tensor, Tensor, Any]:
+        self, values: Tensor, columns: list[int], warm: Solution | None = None, *, march: bool = True
+    ) -> tuple[Tensor, Tensor, Solution | None]:
         """Outputs at the used data ``(H, n)``, their derivatives ``(H, n, columns)``, and a warm start."""
         found = self.simulator.linearise(self.recording.x, values, self.recording.outputs, columns, warm, march=march)
         if found.y.shape[-1] != len(self.recording.y):
@@ -186,7 +185,14 @@ class Problem:
             )
         return found.y[:, self.index], found.jacobian[:, self.index], found.warm
 
-    def drivers(self, values: Tensor, warm: Any) -> dict[str, Tensor]:
+    def guess(self, found: Solution | None, count: int) -> Solution | None:
+        """Another problem's only solution as a warm start of this one, so many times; None where it is none."""
+        bound = self.simulator
+        if found is None or not isinstance(bound, Trajectories):
+            return None
+        return found.guess(count, len(bound.ode.states))
+
+    def drivers(self, values: Tensor, warm: Solution | None) -> dict[str, Tensor]:
         """What a change may vary with at every datum, ``(n_total conditions,)`` each: conditions, or time, states and
         inputs."""
         if not self.in_time:
@@ -195,10 +201,10 @@ class Problem:
         bound = self.simulator
         if not isinstance(bound, Trajectories):
             return {"t": self.recording.x["time"]}  # type: ignore[index]
-        found = bound.along(values, warm)
+        found = bound.along(values, bound.solve(values, warm))
         return {name: table[bound.grid.run_of, bound.grid.node_of] for name, table in found.items()}
 
-    def drivers_at_data(self, values: Tensor, warm: Any) -> dict[str, Tensor]:
+    def drivers_at_data(self, values: Tensor, warm: Solution | None) -> dict[str, Tensor]:
         """The same at the data in use, ``(n,)`` each."""
         return {name: along[self.condition_of] for name, along in self.drivers(values, warm).items()}
 

@@ -5,7 +5,6 @@ import pickle
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,6 +12,7 @@ from torch import Tensor
 from torchcal.discovery.fitting import Fitted, fit
 from torchcal.discovery.problem import Problem, Whitening
 from torchcal.errors import DomainError, MissingDependencyError, SimulatorError, TorchcalError
+from torchcal.simulators import Solution
 from torchcal.simulators.executor import TaskError, check_executor, run_tasks
 
 __all__ = ["Refit", "refit_all"]
@@ -36,7 +36,7 @@ class Refit:
     begin: Tensor
     free: list[int]
     shape: list[int]
-    warm: Any
+    warm: Solution | None
 
     def run(self) -> Fitted | None:
         """The fit; None where no start gives one."""
@@ -46,9 +46,8 @@ class Refit:
             first = fit(self.problem, self.whitening, begin, free, warm=warm, max_steps=12, finish=0)
             if first is None or first.ends is None or first.ends_chi2 is None:
                 return None
-            begin, warm = first.ends[first.ends_chi2.argsort()[:2]], None
-            if isinstance(first.warm, Tensor):
-                warm = first.warm.expand(len(begin), *first.warm.shape[1:])
+            begin = first.ends[first.ends_chi2.argsort()[:2]]
+            warm = None if first.warm is None else first.warm.repeated(len(begin))
         return fit(self.problem, self.whitening, begin, self.free, warm=warm)
 
 

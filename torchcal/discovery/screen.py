@@ -133,6 +133,7 @@ def contributions(
     """
     found = residual.found
     bound = found.problem.simulator
+    states = bound.solve(found.values[None], found.warm) if isinstance(bound, Trajectories) else None
     chosen, parts = [], []
     for i, candidate in enumerate(candidates):
         column = screening.acting[i]
@@ -142,13 +143,13 @@ def contributions(
         values[candidate.own] = candidate.shapes[int(screening.shape[column])]
         place = candidate.amplitudes[int(screening.amplitude[column])]
         extended = candidate.problem.simulator
-        if not isinstance(extended, Trajectories):
+        if states is None or not isinstance(extended, Trajectories):
             chosen.append(i)
             parts.append(candidate.tangents[int(screening.shape[column]), :, int(screening.amplitude[column])])
-        elif not any(term.outputs for term in candidate.terms) and found.warm is not None:
+        elif not any(term.outputs for term in candidate.terms):
             chosen.append(i)
             with torch.no_grad():
-                parts.append(extended.steps.derivatives(values[None], found.warm, [place])[2][0])
+                parts.append(extended.steps.derivatives(values[None], states, [place])[2][0])
     if not chosen:
         return {}, {}
     if isinstance(bound, Trajectories):

@@ -23,7 +23,6 @@ from torchcal.discovery.screen import Screening, Window, screen, windows
 from torchcal.discovery.stop import Stop
 from torchcal.discovery.structure import Residual, Structure, analyse
 from torchcal.discovery.verify import HeldOut, held_out_fit
-from torchcal.simulators import Trajectories
 from torchcal.terms import Term
 
 __all__ = ["Search"]
@@ -334,10 +333,7 @@ class Search:
         jobs = []
         for one in wanted:
             candidate, begin = one.candidate, one.begin
-            warm = None
-            if isinstance(self.base.warm, Tensor) and isinstance(candidate.problem.simulator, Trajectories):
-                if len(candidate.problem.simulator.ode.states) == self.base.warm.shape[-1]:
-                    warm = self.base.warm.expand(len(begin), *self.base.warm.shape[1:])
+            warm = candidate.problem.guess(self.base.warm, len(begin))
             shape = [i for i in candidate.own if i not in candidate.amplitudes]
             whitening = self.noise.whitening(candidate.problem)
             jobs.append(Refit(candidate.problem, whitening, begin, candidate.free, shape, warm))

@@ -6,6 +6,7 @@ from torchcal.simulators.external import ExternalSimulator
 from torchcal.simulators.held_out import HeldOutError
 from torchcal.simulators.ode import ODESimulator
 from torchcal.simulators.parameter import Parameter, Scaling, free_parameters
+from torchcal.simulators.solution import Solution
 from torchcal.simulators.static import Conditions, Linearisation, Simulator, check_parameters
 from torchcal.simulators.surrogate import PolynomialSurrogate
 from torchcal.simulators.trajectories import Trajectories
@@ -21,6 +22,7 @@ __all__ = [
     "PolynomialSurrogate",
     "Scaling",
     "Simulator",
+    "Solution",
     "Trajectories",
     "build_surrogate",
     "check_parameters",

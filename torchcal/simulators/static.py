@@ -15,6 +15,7 @@ from torchcal.data import Recording
 from torchcal.errors import DomainError, ShapeError, SimulatorError
 from torchcal.simulators.dual import Still, still
 from torchcal.simulators.parameter import Parameter
+from torchcal.simulators.solution import Solution
 
 __all__ = ["Conditions", "Linearisation", "Simulator", "check_parameters"]
 
@@ -31,12 +32,12 @@ class Linearisation:
     Attributes:
         y: Outputs, ``(H, n)``.
         jacobian: ∂y/∂λ in physical units, ``(H, n, columns)``.
-        warm: What makes a call at nearby values cheaper; hand it back to `Simulator.linearise`.
+        warm: Of simulators in time, what makes a call at nearby values cheaper; hand it back to `Simulator.linearise`.
     """
 
     y: Tensor
     jacobian: Tensor
-    warm: Any = None
+    warm: Solution | None = None
 
 
 def check_values(values: Tensor, names: Sequence[str]) -> None:
@@ -151,7 +152,7 @@ class Simulator:
         values: Tensor,
         outputs: Sequence[str] | None = None,
         columns: Sequence[int] | None = None,
-        warm: Any = None,
+        warm: Solution | None = None,
         *,
         march: bool = True,
     ) -> Linearisation:

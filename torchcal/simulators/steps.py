@@ -1,7 +1,7 @@
 """Runge–Kutta steps on a grid of times, and the trajectories that they make up.
 
-All steps of a span are taken at once from a guessed trajectory; Newton's method on the whole span removes the gaps
-between them. What it does not reach is solved step by step.
+All steps of a span are taken at once from a guessed trajectory (`close_gaps`). What that does not reach is solved step
+by step.
 """
 
 import math
@@ -16,20 +16,13 @@ from torchcal.errors import SimulatorError
 from torchcal.simulators.grid import Grid
 from torchcal.simulators.layout import Layout
 from torchcal.simulators.recurrence import recur
+from torchcal.simulators.shooting import begun, close_gaps
 
 if TYPE_CHECKING:
     from torchcal.simulators.ode import ODESimulator
 
 __all__ = ["POINTS", "Steps"]
 
-#: Corrections, relative to the state where they are made, after which nothing is left to check: the next would be
-#: their square. A larger one may cross a kink, such as a clamp at zero.
-SMALL = 1e-5
-#: Share of a state's largest value below which it counts as that large, by rounding; and the same where a trajectory
-#: is found from its beginning, in which what has decayed may grow again.
-SMALLEST, SMALLEST_ANEW = 1e-8, 1e-12
-#: Newton passes before the trajectory is solved step by step instead.
-MAX_PASSES = 8
 #: Points whose derivatives are computed at once: about what a processor's cache holds.
 POINTS = 2**15
 #: Numbers up to which an operation costs its call and little more: copies of all points, one for each state, up to this
@@ -96,6 +89,14 @@ class Steps:
         k4 = self.rates(t + h, s + full * k3, p, last)
         return s + (full / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
 
+    def ends(self, values: Tensor, states: Tensor) -> Tensor:
+        """Ends ``(H, R, K, S)`` of all steps begun at ``states``."""
+        hyper, runs, _, size = states.shape
+        t, h, u = self.grid.flat
+        begin = states[:, :, :-1].reshape(hyper, -1, size)
+        found = self.step(begin, t, h, self.layout.by_name(values, self.grid.step_run), u)
+        return found.reshape(hyper, runs, -1, size)
+
     def derivatives(self, values: Tensor, states: Tensor, columns: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Ends of all steps begun at ``states``, and their derivatives by the states and by some parameters.
 
@@ -126,21 +127,53 @@ class Steps:
         size = states.abs().amax(dim=(0, 1, 2)).clamp_min(1e-300)
         return float(((ends - states[:, :, 1:]).abs() / size).max())
 
-    def solve(self, values: Tensor, warm: Tensor | None = None, *, march: bool = True) -> Tensor:
-        """States at the ends of all steps, ``(H, R, K + 1, states)``; infinite from where one of a run's blows up.
+    def solve(
+        self, values: Tensor, guess: Tensor | None = None, columns: Sequence[int] = (), *, march: bool = True
+    ) -> tuple[Tensor, Tensor]:
+        """States at the ends of all steps and their derivatives by some parameters.
 
-        ``warm`` is a guess. Where Newton's method does not settle from there, the trajectory is solved from its
-        beginning; without ``march`` it is infinite instead.
+        Where Newton's method does not settle from the guess, the trajectory is solved from its beginning; without
+        ``march`` it is infinite instead. Where it settles, its last pass gives the derivatives too, at states that are
+        nearly the solved ones.
+
+        Args:
+            values: Parameter values, ``(H, P)``.
+            guess: Of the states.
+            columns: Places of the parameters to derive by.
+            march: Whether to solve from the beginning at all.
+
+        Returns:
+            States ``(H, R, K + 1, S)``, infinite from where one of a run's blows up, and derivatives
+            ``(H, R, K + 1, S, len(columns))``.
         """
-        if warm is None or warm.shape[0] != values.shape[0]:
-            return self._march(values)
-        start = self.layout.start(values)
-        states, settled = self._newton(values, torch.cat([start.unsqueeze(2), warm[:, :, 1:]], dim=2))
-        if march and not bool(settled.all()):
-            states[~settled] = self._march(values[~settled])
-        elif not march:
+        size = max(1, POINTS // self.grid.nodes.numel())
+        if guess is None or guess.shape[0] != values.shape[0]:
+            states = self._march(values)
+            pieces = zip(values.split(size), states.split(size), strict=True)
+            return states, torch.cat([self.sensitivities(v, s, columns) for v, s in pieces])
+        begin = torch.cat([self.layout.start(values).unsqueeze(2), guess[:, :, 1:]], dim=2)
+        pieces = zip(values.split(size), begin.split(size), strict=True)
+        found = [close_gaps(self, v, s, columns) for v, s in pieces]
+        states, settled, tangents = (torch.cat(parts) for parts in zip(*found, strict=True))
+        if not march:
             states[~settled] = math.inf
-        return states
+        elif not bool(settled.all()):
+            states[~settled], tangents[~settled] = self.solve(values[~settled], None, columns)
+        return states, tangents
+
+    def sensitivities(self, values: Tensor, states: Tensor, columns: Sequence[int]) -> Tensor:
+        """∂ states / ∂ parameters of solved states, ``(H, R, K + 1, S, len(columns))``."""
+        if not columns:
+            return states.new_zeros(*states.shape, 0)
+        _, flow, forcing = self.derivatives(values, states, columns)
+        begin = self.first_slopes(values, columns)
+        return torch.cat([begin.unsqueeze(2), recur(flow, begun(flow, forcing, begin))], dim=2)
+
+    def first_slopes(self, values: Tensor, columns: Sequence[int]) -> Tensor:
+        """Derivatives of the first states by some parameters, ``(H, R, S, len(columns))``."""
+        if not columns:
+            return values.new_zeros(len(values), self.grid.h.shape[0], len(self.ode.states), 0)
+        return self.layout.start_slopes(values)[..., list(columns)]
 
     def _march(self, values: Tensor) -> Tensor:
         """From the beginning, span by span, in spans as long as Newton's method allows from states that stand still."""
@@ -155,7 +188,7 @@ class Steps:
         while first < self.grid.num_steps:
             part = replace(self, grid=self.grid.part(first, first + span))
             still = begin.unsqueeze(2).expand(-1, -1, part.grid.num_steps + 1, -1)
-            states, settled = part._newton(values, still, largest)
+            states, settled, _ = close_gaps(part, values, still, largest=largest)
             if bool(settled.all()):
                 longest = min(longest + longest // 8, most)  # what has failed is tried again after a while
                 span, on_foot = min(2 * span, longest), SPAN // 2
@@ -183,40 +216,6 @@ class Steps:
             u = {name: table[:, :, k] for name, table in self.grid.u.items()}
             found.append(self.step(found[-1], self.grid.t[:, k], self.grid.h[:, k], p, u))
         return torch.stack(found, dim=-2)
-
-    def _newton(self, values: Tensor, guess: Tensor, largest: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Newton's method on whole trajectories from their first states on, and which rows ``(H,)`` settled.
-
-        ``largest`` holds the largest values of each state before the trajectory, ``(H, 1, 1, S)``, where it goes on.
-        """
-        states = guess.clone()
-        settled = torch.zeros(len(values), dtype=torch.bool)
-        active = torch.isfinite(states).flatten(1).all(-1)
-        last = torch.full((len(values),), math.inf, dtype=torch.float64)
-        before = states.new_full((len(values), 1, 1, 1), 1e-300) if largest is None else largest.clamp_min(1e-300)
-        for number in range(MAX_PASSES):
-            rows = active.nonzero()[:, 0]
-            if len(rows) == 0:
-                break
-            now = states[rows]
-            ends, flow, _ = self.derivatives(values[rows], now, ())
-            gap = ends - now[:, :, 1:]
-            size = torch.maximum(now.abs().amax(dim=(1, 2), keepdim=True), before[rows])
-            if number == 0:  # a guess may be zero where the trajectory is not
-                size = torch.maximum(size, ends.abs().amax(dim=(1, 2), keepdim=True))
-            worst = (gap.abs() / size).flatten(1).amax(-1)
-            good = torch.isfinite(worst) & (worst < 4.0 * last[rows])
-            last[rows] = worst
-            change = recur(flow, torch.nan_to_num(gap).unsqueeze(-1))[..., 0]
-            moved = torch.cat([now[:, :, :1], now[:, :, 1:] + change], dim=2)
-            good &= torch.isfinite(moved).flatten(1).all(-1)
-            states[rows] = torch.where(good[:, None, None, None], moved, now)
-            near = torch.maximum(moved[:, :, :-1].abs(), moved[:, :, 1:].abs())
-            floor = size * (SMALLEST if largest is None else SMALLEST_ANEW)
-            last_one = (change.abs() / torch.maximum(near, floor)).flatten(1).amax(-1) < SMALL
-            settled[rows] = good & last_one
-            active[rows] = good & ~last_one
-        return states, settled
 
 
 def _ended(states: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from torchcal.data import Recording
 from torchcal.errors import DomainError, RecordingError, SimulatorError
 from torchcal.simulators.grid import Grid
 from torchcal.simulators.layout import Layout
-from torchcal.simulators.recurrence import recur
+from torchcal.simulators.solution import Solution
 from torchcal.simulators.static import Conditions, Linearisation, Simulator
 from torchcal.simulators.steps import POINTS, Steps
 
@@ -256,11 +256,11 @@ class Trajectories(Simulator):
         values: Tensor,
         outputs: Sequence[str] | None = None,
         columns: Sequence[int] | None = None,
-        warm: Any = None,
+        warm: Solution | None = None,
         *,
         march: bool = True,
     ) -> Linearisation:
-        """Outputs and their derivatives; ``warm`` is the trajectory of an earlier, nearby call.
+        """Outputs and their derivatives; ``warm`` is the solution of an earlier, nearby call.
 
         Where Newton's method does not settle from there, the trajectory is solved step by step; without ``march`` it is
         infinite instead. The conditions must be the recording's.
@@ -271,17 +271,26 @@ class Trajectories(Simulator):
         columns = list(range(values.shape[-1])) if columns is None else list(columns)
         found = []
         with torch.no_grad():
-            states = self.steps.solve(values, warm, march=march)
-            size = max(1, POINTS // self.grid.nodes.numel())
-            for v, s in zip(values.split(size), states.split(size), strict=True):
-                tangents = self._sensitivities(v, s, columns) if columns else None
-                found.append(self._observe(v, s, wanted, columns, tangents))
-        return Linearisation(torch.cat([y for y, _ in found]), torch.cat([j for _, j in found]), states)
+            guess = warm.near(values) if warm is not None and len(warm.states) == len(values) else None
+            nodes = self.grid.nodes.numel()
+            few = len(values) * nodes * len(self._states) * len(columns) <= NUMBERS
+            states, tangents = self.steps.solve(values, guess, columns if few else (), march=march)
+            size = max(1, POINTS // nodes)
+            for k, (v, s) in enumerate(zip(values.split(size), states.split(size), strict=True)):
+                slopes = tangents[k * size : (k + 1) * size] if few else self.steps.sensitivities(v, s, columns)
+                found.append(self._observe(v, s, wanted, columns, slopes))
+        warm = Solution(states, values, columns, tangents) if few else Solution(states)
+        return Linearisation(torch.cat([y for y, _ in found]), torch.cat([j for _, j in found]), warm)
 
-    def solve(self, values: Tensor, warm: Any = None) -> Tensor:
-        """States at the ends of all steps, ``(H, R, K + 1, states)``; infinite where the solution blows up."""
+    def solve(self, values: Tensor, known: Solution | None = None) -> Tensor:
+        """States at the ends of all steps, ``(H, R, K + 1, states)``; infinite where the solution blows up.
+
+        Those that are ``known`` already, of the same values, are not solved again.
+        """
+        if known is not None:
+            return known.states
         with torch.no_grad():
-            return self.steps.solve(values.detach(), warm)
+            return self.steps.solve(values.detach())[0]
 
     def outputs_of(self, values: Tensor, states: Tensor, outputs: Sequence[str] | None = None) -> Tensor:
         """Outputs ``(H, n_total)`` of solved states."""
@@ -307,14 +316,6 @@ class Trajectories(Simulator):
             rates = self.steps.rates(t, begin, leaves, {name: table[0] for name, table in u.items()})
             _, found = self.layout.derivatives(rates, begin, leaves, run_of, columns)
         return found.reshape(hyper, runs, self.num_steps, size, len(columns))
-
-    def _sensitivities(self, values: Tensor, states: Tensor, columns: Sequence[int]) -> Tensor:
-        """∂ states / ∂ parameters at the ends of all steps, ``(H, R, K + 1, S, len(columns))``."""
-        _, flow, forcing = self.steps.derivatives(values, states, columns)
-        begin = self.layout.start_slopes(values)[..., list(columns)]
-        forcing = forcing.clone()
-        forcing[:, :, 0] += flow[:, :, 0] @ begin
-        return torch.cat([begin.unsqueeze(2), recur(flow, forcing)], dim=2)
 
     def flow(self, values: Tensor, states: Tensor) -> Tensor:
         """Derivative of the end of every step by its beginning, ``(H, R, K, S, S)``."""

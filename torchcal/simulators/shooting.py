@@ -1,0 +1,130 @@
+"""Multiple shooting: Newton's method closes the gaps between steps that were all taken at once from guessed states."""
+
+import math
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchcal.simulators.recurrence import recur
+
+if TYPE_CHECKING:
+    from torchcal.simulators.steps import Steps
+
+__all__ = ["Closed", "begun", "close_gaps"]
+
+#: Corrections, relative to the state where they are made, after which nothing is left to check: the next would be
+#: their square. A larger one may cross a kink, such as a clamp at zero.
+SMALL = 1e-5
+#: Share of a state's largest value below which it counts as that large, by rounding; and the same where a trajectory
+#: is found from its beginning, in which what has decayed may grow again.
+SMALLEST, SMALLEST_ANEW = 1e-8, 1e-12
+#: Newton passes before the trajectory is solved step by step instead.
+MAX_PASSES = 8
+#: Corrections with the derivatives of an earlier pass (chords) do not square, but each is at most this share of the one
+#: before; so small a one is the last; of so many.
+SHRINK, SMALL_CHORD, CHORDS = 0.2, 1e-7, 4
+#: Newton corrections, relative to the largest states, up to which chords follow, and up to which the derivatives before
+#: count as those of the trajectory found.
+CLOSE, NEAR = 0.1, 1e-3
+
+
+class Closed(NamedTuple):
+    """What Newton's method came to.
+
+    Attributes:
+        states: ``(H, R, K + 1, S)``.
+        settled: Whether that is a trajectory, ``(H,)``.
+        tangents: ∂ states / ∂ some parameters where it is, ``(H, R, K + 1, S, C)``.
+    """
+
+    states: Tensor
+    settled: Tensor
+    tangents: Tensor
+
+
+def close_gaps(
+    steps: "Steps", values: Tensor, guess: Tensor, columns: Sequence[int] = (), largest: Tensor | None = None
+) -> Closed:
+    """Trajectories from their first states on, and their derivatives by some parameters.
+
+    A pass takes all steps and their derivatives from the states at hand; the linear recurrence of the gaps gives the
+    correction. Where it was small, more of them with the same derivatives follow, which cost the steps alone.
+
+    Args:
+        steps: The steps.
+        values: Parameter values, ``(H, P)``.
+        guess: States, ``(H, R, K + 1, S)``, of which the first are right.
+        columns: Places of the parameters to derive by.
+        largest: Where the trajectory goes on from an earlier one, its largest states, ``(H, 1, 1, S)``.
+    """
+    states = guess.clone()
+    tangents = states.new_full((*states.shape, len(columns)), math.inf)
+    begin = steps.first_slopes(values, columns)
+    settled = torch.zeros(len(values), dtype=torch.bool)
+    active = torch.isfinite(states).flatten(1).all(-1)
+    last = torch.full((len(values),), math.inf, dtype=torch.float64)
+    before = states.new_full((len(values), 1, 1, 1), 1e-300) if largest is None else largest.clamp_min(1e-300)
+    for number in range(MAX_PASSES):
+        rows = active.nonzero()[:, 0]
+        if len(rows) == 0:
+            break
+        now = states[rows]
+        ends, flow, forcing = steps.derivatives(values[rows], now, columns)
+        gap = ends - now[:, :, 1:]
+        size = torch.maximum(now.abs().amax(dim=(1, 2), keepdim=True), before[rows])
+        if number == 0:  # a guess may be zero where the trajectory is not
+            size = torch.maximum(size, ends.abs().amax(dim=(1, 2), keepdim=True))
+        worst = (gap.abs() / size).flatten(1).amax(-1)
+        good = torch.isfinite(worst) & (worst < 4.0 * last[rows])
+        last[rows] = worst
+        push = torch.cat([torch.nan_to_num(gap).unsqueeze(-1), begun(flow, forcing, begin[rows])], dim=-1)
+        found = recur(flow, push)
+        change = found[..., 0]
+        moved = torch.cat([now[:, :, :1], now[:, :, 1:] + change], dim=2)
+        good &= torch.isfinite(moved).flatten(1).all(-1)
+        floor = size * (SMALLEST if largest is None else SMALLEST_ANEW)
+        share = _share(change, moved, floor)
+        ended = share < SMALL
+        if largest is None:  # what goes on from here would carry on what chords leave
+            far = (change.abs() / size).flatten(1).amax(-1)
+            at = (good & ~ended & (far < CLOSE)).nonzero()[:, 0]
+            if len(at):
+                moved[at], small = _chords(steps, values[rows[at]], moved[at], flow[at], floor[at], share[at])
+                ended[at] = small & (far[at] < NEAR) if columns else small
+        states[rows] = torch.where(good[:, None, None, None], moved, now)
+        settled[rows] = good & ended
+        active[rows] = good & ~ended
+        done = (good & ended).nonzero()[:, 0]
+        tangents[rows[done]] = torch.cat([begin[rows[done]].unsqueeze(2), found[done][..., 1:]], dim=2)
+    return Closed(states, settled, tangents)
+
+
+def begun(flow: Tensor, forcing: Tensor, begin: Tensor) -> Tensor:
+    """The forcing of derivatives by parameters, with what those of the first states ``(H, R, S, C)`` add to it."""
+    first = forcing[:, :, :1] + (flow[:, :, 0] @ begin).unsqueeze(2)
+    return torch.cat([first, forcing[:, :, 1:]], dim=2)
+
+
+def _chords(
+    steps: "Steps", values: Tensor, states: Tensor, flow: Tensor, floor: Tensor, share: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Corrections with the derivatives of an earlier pass, and in which rows they became small."""
+    for _ in range(CHORDS):
+        gap = steps.ends(values, states) - states[:, :, 1:]
+        change = recur(flow, torch.nan_to_num(gap).unsqueeze(-1))[..., 0]
+        moved = torch.cat([states[:, :, :1], states[:, :, 1:] + change], dim=2)
+        now = _share(change, moved, floor)
+        better = now < SHRINK * share
+        states = torch.where(better[:, None, None, None], moved, states)
+        share = torch.where(better, now, share)
+        if bool(((share < SMALL_CHORD) | ~better).all()):
+            break
+    return states, share < SMALL_CHORD
+
+
+def _share(change: Tensor, moved: Tensor, floor: Tensor) -> Tensor:
+    """Largest correction ``(H,)`` of states, relative to these where it is made."""
+    near = torch.maximum(moved[:, :, :-1].abs(), moved[:, :, 1:].abs())
+    return (change.abs() / torch.maximum(near, floor)).flatten(1).amax(-1)
