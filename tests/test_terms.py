@@ -194,6 +194,28 @@ def test_terms_add_up_in_any_order_and_one_after_another() -> None:
     close(one, outputs(extend(extend(body(), [drag]), [softening]), **values))
 
 
+def test_factors_on_one_parameter_multiply_and_rates_see_them() -> None:
+    fading = tc.Term("fading", shifts={"k": lambda t, s, p, u: p["k"] * torch.expm1(-p["r"] * t)},
+                     parameters=[tc.Parameter("r")])  # fmt: skip
+    crowded = tc.Term("crowded", shifts={"k": lambda t, s, p, u: p["k"] * (1 / (1 + p["K"] * s["x"]) - 1)},
+                      parameters=[tc.Parameter("K")])  # fmt: skip
+    fed = tc.Term("fed", equation="x", rate=lambda t, s, p, u: p["k"] * p["b"], parameters=[tc.Parameter("b")])
+    plain = tc.ODESimulator(lambda t, s, p, u: {"x": -p["k"] * s["x"]}, ["x"], [tc.Parameter("k")])
+
+    def by_hand(t, s, p, u):
+        k = p["k"] * torch.exp(-p["r"] * t) / (1 + p["K"] * s["x"])
+        return {"x": k * (p["b"] - s["x"])}
+
+    whole = tc.ODESimulator(by_hand, ["x"], [tc.Parameter(name) for name in ("k", "r", "K", "b")])
+    t = np.linspace(0, 3, 7)
+    data = tc.Recording(runs=[tc.Run(time=t, outputs={"x": t}, initial={"x": 2.0})])
+    right = whole.bind(data).at(data.x)(tensor(0.8, 0.4, 0.5, 0.3))
+    values = {"k": 0.8, "fading.r": 0.4, "crowded.K": 0.5, "fed.b": 0.3}
+    for terms in ([fading, crowded, fed], [fed, crowded, fading]):
+        bound = extend(plain, terms).bind(data)
+        close(bound.at(data.x)(tensor(*(values[name] for name in bound.names))), right)
+
+
 def test_two_sensors_on_one_output_act_one_after_the_other() -> None:
     gain = tc.Term("gain", outputs={"x": lambda t, s, p, u, y: y * (1 + p["g"])}, parameters=[tc.Parameter("g")])
     offset = tc.Term("offset", outputs={"x": lambda t, s, p, u, y: y + p["o"]}, parameters=[tc.Parameter("o")])
@@ -263,6 +285,15 @@ def test_a_static_shift_makes_a_parameter_depend_on_a_condition() -> None:
     close(found.at(X)(leaf)[2, 3], found.at(X)(leaf[2, 3]))
 
 
+def test_static_factors_on_one_parameter_multiply() -> None:
+    first = tc.Term("first", shifts={"m": lambda x, p: p["m"] * (x["h"] ** p["e"] - 1)}, parameters=[tc.Parameter("e")])
+    other = tc.Term("other", shifts={"m": lambda x, p: p["m"] * p["g"] * x["t"]}, parameters=[tc.Parameter("g")])
+    slope = 2.0 * X["h"] ** 0.3 * (1 + 0.2 * X["t"])
+    for terms, values in (([first, other], (0.3, 0.2)), ([other, first], (0.2, 0.3))):
+        found = extend(line(), terms).at(X, ["q"])(tensor(2.0, 1.5, *values))
+        close(found, slope * X["t"] ** 2)
+
+
 def test_a_static_sensor_and_a_static_freed_parameter() -> None:
     sensor = tc.Term("saturation", outputs={"q": lambda x, p, y: y / (1 + p["s"] * y)}, parameters=[tc.Parameter("s")])
     freed = tc.Term("intercept", frees="d")
@@ -312,6 +343,7 @@ A = [tc.Parameter("a")]
         ({"name": "n", "rates": {"v": 3.0}, "parameters": A}, "Expected functions"),
         ({"name": "n", "outputs": {"x": None}, "parameters": A}, "Expected functions"),
         ({"name": "n", "equation": "v", "rate": RATE}, r"Expected parameters=\[Parameter"),
+        ({"name": "n", "equation": "v", "rate": RATE, "parameters": A[0]}, "list of parameters"),
         ({"name": "n", "equation": "v", "rate": RATE, "parameters": A + A}, "named once"),
         ({"name": "n", "equation": "v", "rate": RATE, "parameters": A, "states": {"y": None}}, "hidden state 'y'"),
         ({"name": "n", "equation": "v", "rate": RATE, "parameters": A, "scales": {"w": "v"}}, "scales of parameters"),

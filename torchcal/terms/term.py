@@ -47,6 +47,7 @@ class Term:
         outputs: By output ``f(t, s, p, u, y)`` in place of the simulated output y; ``f(x, p, y)`` for a static
             simulator.
         shifts: By parameter of the simulator ``f(t, s, p, u)``, added to it; ``f(x, p)`` for a static simulator.
+            Parameters in ``p`` are as the terms before have shifted them; in ``rates`` and ``outputs`` as all have.
         frees: Dormant parameters of the simulator that it frees.
         parameters: Its own parameters.
         formula: One line, as a scientist writes it.
@@ -108,6 +109,11 @@ class Term:
             )
         if not all(callable(part) for part in parts):
             raise DomainError(f"Expected functions in the term {name!r}. Got something that cannot be called.")
+        if isinstance(parameters, Parameter):
+            raise DomainError(
+                f"Expected a list of parameters of the term {name!r}. Got one, {parameters!r} (write "
+                "parameters=[Parameter(...)])."
+            )
         if parts and not parameters:
             raise DomainError(
                 f"Expected parameters=[Parameter(...)] for the term {name!r}. Got none, so that nothing could be "
@@ -181,6 +187,9 @@ class Term:
 def extend(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
     """The simulator with terms added, their parameters free behind its own; a new object.
 
+    Shifts come one after another, each on what those before have made of the parameters: two factors on a rate
+    constant are their product. Rates and outputs see the shifted parameters.
+
     Raises:
         DomainError: If a term names an equation, output or parameter that the simulator does not have.
     """
@@ -242,13 +251,14 @@ def _extend_ode(simulator: ODESimulator, terms: Sequence[Term]) -> ODESimulator:
             return p
         moved = dict(p)
         for term in shifting:
-            own = term.own(p)
+            own = term.own(dict(moved))
             for name, function in term.shifts.items():
                 moved[name] = moved[name] + term.call(function, t, s, own, u)
         return moved
 
     def rates(t: Any, s: dict[str, Tensor], p: dict[str, Tensor], u: dict[str, Tensor]) -> dict[str, Any]:
-        found = dict(simulator.rates(t, s, shifted(t, s, p, u), u))
+        p = shifted(t, s, p, u)
+        found = dict(simulator.rates(t, s, p, u))
         for term in terms:
             own = term.own(p)
             for state, function in term.rates.items():
@@ -277,7 +287,8 @@ def _initial_of(term: Term, value: Any) -> Any:
 
 def _sensed(name: str, function: Function, sensors: Sequence[Term], shifted: Function) -> Function:
     def observe(t: Any, s: dict[str, Tensor], p: dict[str, Tensor], u: dict[str, Tensor]) -> Any:
-        y = function(t, s, shifted(t, s, p, u), u)
+        p = shifted(t, s, p, u)
+        y = function(t, s, p, u)
         for term in sensors:
             y = term.call(term.outputs[name], t, s, term.own(p), u, y)
         return y
@@ -300,12 +311,12 @@ def _extend_static(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
     plain = simulator.names
 
     def function(x: Any, p: dict[str, Tensor]) -> Any:
-        moved = {name: p[name] for name in plain}
+        moved = dict(p)
         for term in terms:
-            own = term.own(p)
+            own = term.own(dict(moved))
             for name, shift in term.shifts.items():
                 moved[name] = moved[name] + term.call(shift, x, own)
-        result = simulator.function(x, moved)
+        result = simulator.function(x, {name: moved[name] for name in plain})
         if not any(term.outputs for term in terms):
             return result
         found = dict(result) if isinstance(result, Mapping) else {"y": result}
@@ -316,7 +327,7 @@ def _extend_static(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
                     raise SimulatorError(
                         f"Expected the term {term.name!r} on an output of {list(found)}. Got {name!r}."
                     )
-                found[place] = term.call(sensor, x, term.own(p), found[place])
+                found[place] = term.call(sensor, x, term.own(moved), found[place])
         return found if isinstance(result, Mapping) else found["y"]
 
     return Simulator(function, parameters)
