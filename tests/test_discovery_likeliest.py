@@ -51,7 +51,7 @@ def test_log_likelihood_is_the_normal_one_but_for_a_constant():
     # Both coefficients integrated out.
     q = np.linalg.qr(found.jacobian.numpy())[0]
     expected -= 0.5 * np.linalg.slogdet(q.T @ np.linalg.solve(covariance, q))[1]
-    expected += 30 * math.log(2 * math.pi) - rho
+    expected += 30 * math.log(2 * math.pi) - rho + 20 / 60 / math.log(rho)  # and the prior
     assert log_likelihood(found, noise, tangents) == pytest.approx(expected, abs=1e-8)
 
 

@@ -68,6 +68,28 @@ def test_size_and_correlation_of_the_noise(phi, tolerance, misfit):
     assert math.isfinite(found[0].freedom)
 
 
+@pytest.mark.parametrize("n", [40, 44])
+def test_a_smooth_misfit_of_few_data_in_white_noise_is_no_slow_noise(n):
+    # Just enough data for noise of unknown size to be correlated: a parabola is still likelier than that.
+    x = np.linspace(1.0, 10.0, n)
+    hidden = 0
+    for seed in range(6):
+        y = 2 + 3 * x + 0.25 * (x - 5.5) ** 2 + np.asarray(draw(n, 0.5, seed))
+        d = tc.diagnose(LINE, tc.Recording(x=x, y=y), [], progress=False)
+        hidden += d.verdict == "consistent"
+    assert hidden <= most(6, 0.05)
+
+
+def test_the_noise_that_hides_a_misfit_is_the_one_that_is_told():
+    x = np.linspace(1.0, 10.0, 60)
+    y = 2 + 3 * x + np.asarray(draw(60, 1.0, 5, phi=0.9))
+    d = tc.diagnose(LINE, tc.Recording(x=x, y=y), [], progress=False)
+    assert d.verdict == "consistent"
+    assert d.noise.correlation["y"] > 0.6
+    if d.p_detect < 0.01:
+        assert "Slow noise" in str(d)
+
+
 def test_a_smooth_misfit_changes_the_noise_little():
     x = torch.linspace(0, 1, 100, dtype=F64)
     for seed in range(5):

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from torchcal.discovery.channels import channels
 from torchcal.discovery.fitting import Fitted, refit, weighed
-from torchcal.discovery.noise import GRID, LEAST, SHRINK, Noise, estimate, least, mine, orthonormal
-from torchcal.discovery.problem import Whitening
+from torchcal.discovery.noise import GRID, LEAST, Noise, estimate, least, log_prior, mine, orthonormal
+from torchcal.discovery.problem import Problem, Whitening
 from torchcal.discovery.structure import Residual, evidences, responses_of
 
 __all__ = ["Tangents", "alone", "log_likelihood", "log_normal", "settled", "with_unknown"]
@@ -63,6 +63,11 @@ class Tangents:
         return cls(slope, torch.stack(grams, 1), torch.stack(logs, 1))
 
 
+def _counts(problem: Problem) -> Tensor:
+    """Used data of every output, ``(outputs,)``."""
+    return torch.bincount(problem.output_of, minlength=len(problem.recording.outputs)).double()
+
+
 def _unit(noise: Noise) -> Tensor:
     return noise.unit if noise.open else noise.sd
 
@@ -73,11 +78,11 @@ def log_likelihood(found: Fitted, noise: Noise, tangents: Tangents) -> float:
     The log prior of the correlation is included.
     """
     w = noise.whitening(found.problem)
-    return _log_density(w, w.vector(found.residual), noise, tangents)
+    return _log_density(w, w.vector(found.residual), noise, tangents, found.problem)
 
 
-def _log_density(w: Whitening, e: Tensor, noise: Noise, tangents: Tangents) -> float:
-    found = log_normal(w, e) - SHRINK * float(noise.correlation.sum())
+def _log_density(w: Whitening, e: Tensor, noise: Noise, tangents: Tangents, problem: Problem) -> float:
+    found = log_normal(w, e) + float(log_prior(noise.correlation, _counts(problem)).sum())
     if tangents.directions.shape[1]:
         found -= float(torch.linalg.qr(w(tangents.directions)).R.diagonal().abs().log().sum())
     return found
@@ -105,7 +110,7 @@ def alone(found: Fitted, noise: Noise, tangents: Tangents) -> tuple[Noise, float
         problem.whitening(unit, torch.full_like(noise.correlation, float(rho))).vector(found.residual).square()
         for rho in GRID
     ])  # fmt: skip
-    count = torch.bincount(problem.output_of, minlength=outputs).double()
+    count = _counts(problem)
     freedom = (count * (1 - len(found.free) / problem.n)).clamp_min(1.0)
     square = torch.stack([squares[:, problem.output_of == k].sum(1) for k in range(outputs)])  # (outputs, grid)
     sizes = (square / freedom[:, None]).clamp_min(1e-300) if noise.open else torch.ones_like(square)
@@ -118,7 +123,8 @@ def alone(found: Fitted, noise: Noise, tangents: Tangents) -> tuple[Noise, float
         others = torch.zeros_like(blocks[0, 0])
         for j in range(outputs):
             others = others + blocks[j, best[j]] if j != k else others
-        like = -tangents.logs[k] - 0.5 * count[k] * sizes[k].log() - 0.5 * square[k] / sizes[k] - SHRINK * GRID
+        like = log_prior(GRID, count[k]) - tangents.logs[k]
+        like = like - 0.5 * count[k] * sizes[k].log() - 0.5 * square[k] / sizes[k]
         like = like - 0.5 * torch.linalg.slogdet(others + blocks[k])[1]
         if count[k] < LEAST or not problem.follows:
             like[1:] = -math.inf
@@ -166,7 +172,7 @@ def with_unknown(
             residual = Residual(weighed(model, tried.whitening(problem)), tried, draws=0)
             seen = evidences(residual, looks)
             gain = max(seen) - math.log(len(seen)) if seen else -math.inf
-            found[at] = tried, _log_density(residual.found.whitening, residual.e, tried, tangents) + gain
+            found[at] = tried, _log_density(residual.found.whitening, residual.e, tried, tangents, problem) + gain
         return found[at][1]
 
     factors = range(len(SMALLER) if noise.open and problem.order is None else 1)

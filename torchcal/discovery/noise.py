@@ -16,15 +16,15 @@ from torchcal.discovery.records import NoiseModel
 from torchcal.errors import DomainError
 
 __all__ = [
-    "GRID", "LEAST", "SHRINK", "Noise", "estimate", "growth", "least", "mine", "orthonormal", "smooth_columns",
+    "GRID", "LEAST", "Noise", "estimate", "growth", "least", "log_prior", "mine", "orthonormal", "smooth_columns",
 ]  # fmt: skip
 
 #: AR(1) coefficients that are tried.
 GRID = torch.linspace(0.0, 0.95, 39, dtype=torch.float64)
 #: Share of a sequence's degrees of freedom that smooth curves may take.
 SMOOTH_SHARE = 1.0 / 6.0
-#: Weight against correlation: log prior density of φ is −SHRINK·φ.
-SHRINK = 1.0
+#: Weights against correlation, in log prior density: of φ, and of the share of a recording that it lasts.
+SHRINK, SLOW = 1.0, 20.0
 #: Fewest data of an output whose noise may be correlated.
 LEAST = 40
 #: Quantile of its posterior at which a clear correlation is taken.
@@ -91,6 +91,14 @@ class Noise:
             outliers=int((problem.recording.observed & ~problem.keep).sum()),
             quantisation=self.step,
         )
+
+
+def log_prior(rho: Tensor, n: Tensor | float) -> Tensor:
+    """Of AR(1) coefficients of n data, up to a constant.
+
+    Noise that is correlated over 1/ln(1/φ) data, a good part of them, looks like physics, and is the less likely.
+    """
+    return -SHRINK * rho + SLOW / rho.clamp_min(1e-9).log() / torch.as_tensor(n).clamp_min(1)
 
 
 def smooth_columns(problem: Problem, places: Tensor, *, ends: bool = False) -> Tensor:
@@ -197,7 +205,7 @@ def estimate(
                 count += len(places) - b.shape[1]
             sizes.append(square / count)
             size = 0.5 * count * math.log(max(square, 1e-300)) if given is None else 0.5 * square
-            logs.append(-size - log_det - SHRINK * float(rho))
+            logs.append(-size - log_det + float(log_prior(rho, n)))
         likelihood = torch.tensor(logs, dtype=torch.float64)
         weight = (likelihood - likelihood.max()).exp()
         posterior[output, : len(weight)] = weight / weight.sum()
