@@ -215,6 +215,48 @@ def test_a_step_of_a_static_recording_is_found_between_its_data():
         assert found[end].sd < 0.05
 
 
+def test_what_begins_somewhere_and_is_in_no_list_is_not_named_by_a_window():
+    """Butler and Volmer's law with a limiting current that no candidate has."""
+    drop = torch.linspace(-0.2, 0.2, 61, dtype=torch.float64)
+
+    def current(x, p):
+        i0, a = p["i0"], p["a"]
+        return i0 * (torch.exp(a * x / 0.0257) - torch.exp(-(1 - a) * x / 0.0257))
+
+    free = current(drop, {"i0": 1.0, "a": 0.5})
+    y = torch.where(free > 0, free / (1 + free / 80), free)
+    base = tc.Simulator(current, [tc.Parameter("i0", low=0.0, initial=1.0), tc.Parameter("a", low=0.1, high=0.9)])
+    candidates = [
+        tc.Term("symmetry", shifts={"a": lambda x, p: p["m"] * x}, parameters=[tc.Parameter("m")]),
+        tc.Term("leak", outputs={"y": lambda x, p, y: y + p["g"] * x}, parameters=[tc.Parameter("g", low=0.0)]),
+        tc.Term("offset", outputs={"y": lambda x, p, y: y + p["c"]}, parameters=[tc.Parameter("c")]),
+    ]
+    for seed in (0, 1):
+        generator = torch.Generator().manual_seed(seed)
+        noisy = y + 0.8 * torch.randn(61, generator=generator, dtype=torch.float64)
+        d = diagnose(base, tc.Recording(x=drop, y=noisy, noise=0.8), candidates)
+        assert d.verdict in ("ambiguous", "unexplained")
+        assert d.verdict == "unexplained" or ["none of these"] in d.tied
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_what_the_base_has_everywhere_acts_where_there_are_fewer_data(side):
+    """A slope that changes at 0.3 is as well another slope below as above: of the two sides the smaller is told."""
+    generator = torch.Generator().manual_seed(1)
+    x, z = (2 * torch.rand(2, 90, generator=generator, dtype=torch.float64) - 1).unbind(0)
+    there = side * x > 0.3
+    y = 1 + (2 + 1.5 * there) * z + 0.1 * torch.randn(90, generator=generator, dtype=torch.float64)
+    base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x["z"], [tc.Parameter("a"), tc.Parameter("b")])
+    candidates = [
+        tc.Term("another slope", shifts={"b": lambda x, p: p["c"]}, parameters=[tc.Parameter("c")]),
+        tc.Term("bend", outputs={"y": lambda x, p, y: y + p["q"] * x["z"] ** 2}, parameters=[tc.Parameter("q")]),
+    ]
+    d = diagnose(base, tc.Recording(x={"x": x, "z": z}, y=y, noise=0.1), candidates)
+    assert (d.verdict, d.terms) == ("named", ["another slope"])
+    assert d.ranking[0].region.startswith("x > 0." if side > 0 else "x < -0.")
+    assert next(e.value for e in d.final.estimates if e.name == "another slope.c") == pytest.approx(1.5, abs=0.2)
+
+
 def test_the_sd_of_a_steps_place_says_how_far_it_may_be_off():
     """One step in noise as large as a third of it: over seeds the errors are a few sd, not ten."""
     z = []

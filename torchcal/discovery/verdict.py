@@ -32,6 +32,9 @@ WHITE = 0.005
 #: Structure left with at least this probability is none; and the share of its log evidence by which a linear estimate
 #: of something unknown, which is not refitted, may be too large.
 PLAINLY_WHITE, LINEAR = 0.05, 0.02
+#: χ² that a term in a window must remove for its shape to be as telling as that of one that acts everywhere; and the
+#: same along the only condition of a static recording, where nothing else of the term is seen than a piece of a curve.
+TELLING, TELLING_ALONE = 500.0, 3000.0
 #: By how much more than the sd that is given a named model may miss the data, beyond chance: such sd are seldom exact.
 LARGER, CHANCE = 1.25, 3.0
 #: Noise variances a datum by which held-out predictions may be worse whatever the standard error: 1 % of the RMSE of a
@@ -110,8 +113,22 @@ def _none_evidence(search: Search, ranked: list[Model], here: float) -> float:
         found -= LINEAR * max(found, 0.0)  # refitted and white: its rival is linear, and as wrong as that
     for model in ranked[:4]:
         left = _unknown(search, search.examine(model), calibrated=True)  # of the search's noise, as this evidence
-        found = max(found, model.in_use + model.log_prior + left + prior)
+        found = max(found, model.in_use + model.log_prior + left + prior + _by_chance(model))
     return found
+
+
+def _by_chance(model: Model) -> float:
+    """Log factor by which something unknown is likelier beside a term in a window than beside one that acts everywhere.
+
+    What is unknown may begin somewhere too, and some term in some window comes near it. That one number of its shape
+    agrees with the term's so well that noise hides the rest has a probability as the root of noise over misfit.
+    """
+    if model.window is None:
+        return 0.0
+    problem = model.found.problem
+    telling = TELLING if problem.in_time or problem.order is None else TELLING_ALONE
+    removed = 2.0 * (model.log_evidence - model.price)
+    return max(0.5 * math.log(telling / max(removed, 1.0)), 0.0)
 
 
 def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
@@ -401,5 +418,5 @@ def _prove(search: Search, decision: Decision, mask: Tensor | None) -> None:
             f"{' and '.join(decision.best.names)} explained the fitted data but predicted held-out data worse than the "
             f"base (by {-gain:.2g} ± {error:.1g} noise variances a datum), so the name is withdrawn."
         )
-        decision.verdict, decision.best = "unexplained", None
-        decision.tied, decision.tied_models = [], []
+        decision.tied, decision.tied_models = [list(decision.best.names), list(NONE)], [decision.best]
+        decision.verdict, decision.best = "ambiguous", None

@@ -31,6 +31,8 @@ ROUNDS = 2
 CLOSE = 10.0
 #: Share of a window within another one along the same driver from which on they are one start.
 ALIKE = 0.7
+#: Log odds up to which the two sides of an edge are as good.
+AS_GOOD = 0.5
 #: Relative difference of χ² up to which two windows of one term and driver are one.
 SAME = 1e-4
 #: How far ends are moved for other starts, as a share of the driver's range: where they are sought, and sharpened.
@@ -77,6 +79,27 @@ def refit_local(search: Search) -> None:
     if _rivals(search, prior):
         search.reweigh()
     _refine_edges(search, prior)
+    _turn(search, prior)
+
+
+def _turn(search: Search, prior: float) -> None:
+    """What the base has everywhere does the same on one side of an edge as on the other with the other sign.
+
+    Of the two the leader gets the one with fewer data.
+    """
+    lead = search.physical_leader
+    if lead is None or lead.window is None or search.screening.best[lead.numbers[0]] >= 0:
+        return
+    w, driver = lead.window, search.drivers()[lead.window.driver]
+    inside = ((driver >= w.low) & (driver <= w.high)).double().mean()
+    if math.isfinite(w.low) == math.isfinite(w.high) or float(inside) <= 0.5:
+        return
+    low, high = (-math.inf, w.low) if math.isfinite(w.low) else (w.high, math.inf)
+    other = dataclasses.replace(w, low=low, high=high, amplitude=-_amplitude(search, lead)[2])
+    turned = refit_window(search, other, prior, edge=True, span=w.span)
+    if turned is not None and turned.physical and turned.weight > lead.weight - AS_GOOD:
+        search.models.remove(lead)
+        search.models.append(turned)
 
 
 def _rivals(search: Search, prior: float) -> bool:
@@ -195,9 +218,10 @@ def _around(search: Search, model: Model) -> list[Window]:
             everywhere[i] = beyond(found.problem.parameters[i])
     residual = Residual(found, search.noise, seed=search.seed, draws=10, without=own)
     if isinstance(bound, Trajectories):
+        states = bound.solve(found.values[None], found.warm)
         with torch.no_grad():
             forcing, present = (
-                bound.steps.derivatives(values[None], found.warm, [place])[2][0]
+                bound.steps.derivatives(values[None], states, [place])[2][0]
                 for values in (everywhere, found.values)
             )
         response, drivers, _ = responses(found.problem, found, torch.cat([forcing, present], dim=-1))
