@@ -671,7 +671,8 @@ def test_a_name_that_predicts_worse_is_withdrawn(monkeypatch):
     monkeypatch.setattr(verify, "compare", lambda *args: (-2.0, 0.5))
     body, motion, library = pushed(0.08)
     d = quiet(body, motion, library[-1:])
-    assert d.verdict == "unexplained"
+    assert d.verdict == "ambiguous"
+    assert d.tied == [["bias force"], ["none of these"]]
     assert d.terms == []
     assert "withdrawn" in d.settings["withdrawn"]
     assert "bias force" in d.settings["withdrawn"]
@@ -989,11 +990,18 @@ def costly(allowed=0, **parameters):
         ({"holdout": torch.ones(20, dtype=torch.bool)}, "hold out less"),
         ({"holdout": torch.zeros(20, dtype=torch.bool)}, "hold out at least one"),
         ({"fixed": {"a": 0.0, "b": 1.0}}, "fixed or dormant"),
+        ({"holdout": 0.9}, "at least 4 data for each of 2 parameters"),
     ],
 )
 def test_bad_options(options, message):
     with pytest.raises(tc.errors.DomainError, match=message):
         quiet(costly(), DATA, [BEND], **options)
+
+
+def test_a_candidate_that_frees_what_is_held_is_refused():
+    base = tc.Simulator(lambda x, p: p["a"] * x + p["c"], [tc.Parameter("a"), tc.Parameter("c", neutral=0.0)])
+    with pytest.raises(tc.errors.DomainError, match="leave one of the two out"):
+        quiet(base, DATA, [tc.Term("offset", frees="c")], fixed={"c": 0.3})
 
 
 @pytest.mark.parametrize(

@@ -19,8 +19,10 @@ from torchcal.discovery.candidates import base_columns, check_repeats
 from torchcal.discovery.embedded import embed_each, model_error_sd
 from torchcal.discovery.experiment import propose
 from torchcal.discovery.fitting import Fitted, starts
+from torchcal.discovery.likeliest import settled
 from torchcal.discovery.limits import limits
 from torchcal.discovery.model import Model
+from torchcal.discovery.noise import Noise
 from torchcal.discovery.own_noise import beside, explains
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.ranking import ranking
@@ -114,6 +116,11 @@ def diagnose(
             f"Expected more data than parameters to calibrate. Got {problem.n} data and {len(free)} free parameters."
         )
     for term in terms:
+        if stuck := [name for name in term.frees if name in (fixed or {})]:
+            raise DomainError(
+                f"Expected fixed= without the parameters that candidates free. Got {stuck[0]!r}, which the term "
+                f"{term.name!r} frees (leave one of the two out)."
+            )
         unknown = [name for name in term.outputs if name not in (*recording.outputs, "y")]  # what has no name is y
         if unknown and not isinstance(simulator, ODESimulator):  # which knows its outputs' names itself
             raise DomainError(f"Expected the term {term.name!r} on outputs of {recording.outputs}. Got {unknown}.")
@@ -301,7 +308,7 @@ def _result(
         after=after,
         improved=improved,
         symptoms=explain.symptoms(search, best),
-        noise=(search.noise if best is None else beside(search, best)).record(search.problem),
+        noise=_told_noise(search, decision).record(search.problem),
         base=base,
         final=final,
         embedded=Table(
@@ -312,7 +319,8 @@ def _result(
         missing=explain.missing_rate(search) if decision.verdict != "consistent" else None,
         experiment=propose(decision.tied_models, search.noise) if decision.tied_models else None,
         equations=explain.formulas(best) if best else [],
-        identifiability=explain.identifiability(search) + ([] if best is None else explain.other_minima(search, best)),
+        identifiability=explain.identifiability(search, best)
+        + ([] if best is None else explain.other_minima(search, best)),
         recording=recording,
         simulator=simulator,
         held_out=mask,
@@ -333,6 +341,15 @@ def _result(
         seconds=time.perf_counter() - begun,
         drivers=search.drivers(),
     )
+
+
+def _told_noise(search: Search, decision: Decision) -> Noise:
+    """The noise that the verdict rests on."""
+    if decision.best is not None:
+        return beside(search, decision.best)
+    if decision.verdict == "consistent" and search.noise.open and search.p_detect < PLAINLY_WHITE:
+        return settled(search.base, search.noise, search.tangents)[0]
+    return search.noise
 
 
 def _in_order(search: Search, best: Model) -> list[str]:

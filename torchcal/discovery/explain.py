@@ -34,7 +34,8 @@ OUTPUT_SHARE = 0.9
 GAPS = 200
 #: Share of the largest part of a direction that the data do not see from which on a parameter belongs to it.
 MIXED = 0.02
-
+#: Smallest squared effect of a direction of unit size, each parameter's effect being 1, that is one.
+UNSEEN = 1e-6
 #: Log evidence between two candidates that are told apart.
 APART = 5.0
 
@@ -50,7 +51,8 @@ BENT = 3.0
 def estimates(found: Fitted, places: Sequence[int], window: Window | None = None) -> tuple[Estimate, ...]:
     """Estimates of some parameters. Without noise the misfit takes its place.
 
-    Where the edge of a static window is a step, its end is known by the gaps between data that it may lie in.
+    An sd beyond what the bounds allow, or far beyond the estimate, says that the data do not determine it. Where the
+    edge of a static window is a step, its end is known by the gaps between data that it may lie in.
     """
     sd = found.sd()
     if isinstance(found.problem.recording.noise, str):
@@ -63,7 +65,8 @@ def estimates(found: Fitted, places: Sequence[int], window: Window | None = None
         spread = float(sd[i])
         if window is not None and not found.problem.in_time and q.name.endswith(tuple(ENDS.values())):
             spread = _stepped_sd(found, i, window.driver, spread)
-        if spread > 1e5 * max(abs(value), 1e-300):
+        allowed = math.inf if q.low is None or q.high is None else q.high - q.low
+        if spread > min(1e5 * max(abs(value), 1e-300), allowed):
             spread = math.inf
         result.append(Estimate(q.name, value, spread, q.unit, i in bound))
     return tuple(result)
@@ -250,14 +253,15 @@ def symptoms(search: Search, best: Model | None) -> list[str]:
             )
     if best is not None:
         places = {q.name: k for k, q in enumerate(best.found.problem.parameters)}
+        then = {e.name: e for e in estimates(best.found, list(places.values()))}
         for i in search.base.free:
             q = search.base.problem.parameters[i]
-            a, b = float(search.base.values[i]), float(best.found.values[places[q.name]])
+            a, b = float(search.base.values[i]), then[q.name].value
             moved = abs(b - a) / max(float(sd[i]), 1e-300)
             if moved > BENT and abs(b - a) > 0.001 * abs(a):
                 rows.append(
                     f"{q.name} was bent: {a:.4g} ± {float(sd[i]):.2g}{_unit(q.unit)} in the calibrated base, "
-                    f"{b:.4g}{_unit(q.unit)} with {' and '.join(best.names)}"
+                    f"{str(then[q.name]).removeprefix(f'{q.name} = ')} with {' and '.join(best.names)}"
                 )
     if search.noise.doubted > 1:
         left = search.base if best is None else best.found
@@ -271,26 +275,11 @@ def _unit(unit: str | None) -> str:
     return f" {unit}" if unit else ""
 
 
-def identifiability(search: Search) -> list[str]:
+def identifiability(search: Search, best: Model | None) -> list[str]:
     """Parameters and candidates that these data cannot tell."""
-    rows: list[str] = []
-    base = search.base
-    jacobian = base.whitening(base.jacobian)
-    size = jacobian.norm(dim=0)
-    names = [base.problem.parameters[i].name for i in base.free]
-    for name, norm in zip(names, size.tolist(), strict=True):
-        if norm == 0:
-            rows.append(f"{name} has no effect on these data")
-    unit = jacobian[:, size > 0] / size[size > 0]
-    kept = [name for name, norm in zip(names, size.tolist(), strict=True) if norm > 0]
-    if unit.shape[1] > 1:
-        values, vectors = torch.linalg.eigh(unit.T @ unit)
-        for k in range(len(values)):
-            if float(values[k]) < 1e-6:
-                parts = vectors[:, k].abs()
-                mixed = [kept[j] for j in range(len(kept)) if float(parts[j]) > MIXED * float(parts.max())]
-                if len(mixed) > 1:
-                    rows.append(f"a common change of {', '.join(mixed)} moves no datum: only combinations can be told")
+    rows = _untold(search.base)
+    if best is not None:
+        rows += [row for row in _untold(best.found) if row not in rows]
     screening = search.screening
     for i, candidate in enumerate(search.candidates):
         if screening.best[i] < 0 and not candidate.blind:
@@ -302,6 +291,24 @@ def identifiability(search: Search) -> list[str]:
                     f"{search.candidates[j].name} and {candidate.name} are nearly the same here (correlation {c:.3f})"
                 )
     return rows[:12]
+
+
+def _untold(found: Fitted) -> list[str]:
+    """Parameters of a fit, and combinations of them, that move no datum."""
+    jacobian = found.whitening(found.jacobian)
+    size = jacobian.norm(dim=0)
+    names = [found.problem.parameters[i].name for i in found.free]
+    rows = [f"{name} has no effect on these data" for name, norm in zip(names, size.tolist(), strict=True) if norm == 0]
+    unit = jacobian[:, size > 0] / size[size > 0]
+    kept = [name for name, norm in zip(names, size.tolist(), strict=True) if norm > 0]
+    if unit.shape[1] > 1:
+        values, vectors = torch.linalg.eigh(unit.T @ unit)
+        for k in (values < UNSEEN).nonzero()[:, 0].tolist():
+            parts = vectors[:, k].abs()
+            mixed = [kept[j] for j in range(len(kept)) if float(parts[j]) > MIXED * float(parts.max())]
+            if len(mixed) > 1:
+                rows.append(f"a common change of {', '.join(mixed)} moves no datum: only combinations can be told")
+    return rows
 
 
 def other_minima(search: Search, model: Model) -> list[str]:

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -56,7 +55,7 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
         effects[i] = _Effect(column, wanted + doubt * from_power, float(screening.norm[column]))
     sizes = {i: effect.distance / effect.norm for i, effect in effects.items()}
     hidden: dict[int, float] = {}
-    if not search.exact:
+    if not search.exact and not search.stop.is_set():
         sizes, hidden = _corrected(search, effects, sizes)
     rows = []
     for i, candidate in enumerate(search.candidates):
@@ -115,6 +114,9 @@ def _corrected(
     unseen, seen = dict.fromkeys(now, 0.0), dict.fromkeys(now, math.inf)
     trials = list(now)
     for _ in range(ROUNDS):
+        if search.stop.is_set():
+            seen |= {trial: min(seen[trial], sizes[trial[0]]) for trial in trials}
+            break
         data, known = [], []
         for trial in trials:
             y = _simulated(search, trial[0], effects[trial[0]].column, trial[1] * now[trial])
@@ -125,7 +127,7 @@ def _corrected(
                 data.append(y)
                 known.append(trial)
         if known:
-            warm: Any = base.warm.expand(len(known), *base.warm.shape[1:]) if isinstance(base.warm, Tensor) else None
+            warm = None if base.warm is None else base.warm.repeated(len(known))
             found = fit(
                 base.problem,
                 base.whitening,
@@ -175,9 +177,6 @@ def _simulated(search: Search, i: int, column: int, size: float) -> Tensor | Non
     row = candidate.begin.clone()
     row[candidate.own] = candidate.shapes[int(screening.shape[column])]
     row[candidate.amplitudes[int(screening.amplitude[column])]] += size
-    warm = search.base.warm
-    if isinstance(warm, Tensor):
-        ode = getattr(candidate.problem.simulator, "ode", None)
-        warm = warm if ode is not None and len(ode.states) == warm.shape[-1] else None
+    warm = candidate.problem.guess(search.base.warm, 1)
     y = candidate.problem.evaluate(row[None], [], warm)[0][0]
     return y if bool(torch.isfinite(y).all()) else None

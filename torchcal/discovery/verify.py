@@ -66,7 +66,13 @@ def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None
         if not 0 < holdout < 1:
             raise DomainError(f"Expected holdout as a share between 0 and 1. Got {holdout}.")
         share = holdout
-    if int(recording.observed.sum()) * (1 - share) < LEAST_PER_PARAMETER * parameters:
+    left = int(recording.observed.sum()) * (1 - share)
+    if left < LEAST_PER_PARAMETER * parameters:
+        if holdout is not None:
+            raise DomainError(
+                f"Expected holdout to leave at least {LEAST_PER_PARAMETER} data for each of {parameters} parameters. "
+                f"Got {left:.0f} left (hold out less, or give a bool array)."
+            )
         return None
     x = recording.x
     seen = recording.observed.reshape(len(recording.outputs), recording.n).any(0)

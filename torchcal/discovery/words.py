@@ -201,6 +201,8 @@ def _proof(d: Any) -> str:
             f"; on {b.n} data kept from both fits from {b.rmse:.4g} to {a.rmse:.4g} (log score {b.log_score:.3g} to "
             f"{a.log_score:.3g}, 95 % intervals hold {_share(b.coverage)}, then {_share(a.coverage)})"
         )
+        if a.rmse > b.rmse:
+            text += ", where the effect does not show beyond chance"
     if d.before.model_error_sd and d.after.model_error_sd is not None:
         text += (
             f". The embedded model-error sd shrinks from {d.before.model_error_sd:.3g} to {d.after.model_error_sd:.3g}"
@@ -235,11 +237,11 @@ def _named(d: Any) -> list[str]:
             f"{apart}and on every rival of as many terms leaving at least three times as much."
         )
     elif rival is not None:
-        behind = top.log_evidence - rival.log_evidence
-        stands = f"stands {behind:.1f} natural-log units of evidence behind"
-        if behind < 0:
-            stands = f"has {-behind:.1f} natural-log units more evidence, and a probability of {rival.probability:.2g}"
-        parts.append(f"The next best{' without it' if d.tied else ''}, {_and(list(rival.terms))}, {stands}.")
+        parts.append(
+            f"The next best{' without it' if d.tied else ''}, {_and(list(rival.terms))}, has a probability of "
+            f"{rival.probability:.2g} ({top.log_evidence - rival.log_evidence:+.1f} natural-log units of evidence "
+            "for the name)."
+        )
     parts.append(_proof(d))
     if d.tied:
         parts += _larger(d)
@@ -278,6 +280,8 @@ def _ambiguous(d: Any) -> list[str]:
     known = [tied for tied in d.tied if tuple(tied) != NONE]
     if len(known) == 1:
         sure = sum(row.probability for row in d.ranking if set(known[0]) <= set(row.terms))
+        if d.settings.get("withdrawn"):
+            return [_where(d), d.settings["withdrawn"]]
         if d.settings.get("doubt"):
             return [_where(d), f"{_hypothesis(d, known[0])} explains it best. {d.settings['doubt']}"]
         return [
@@ -320,11 +324,12 @@ def _unexplained(d: Any) -> list[str]:
             f"The best of the library, {_hypothesis(d, best.terms)}, removes {_share(best.misfit_removed)} of the "
             "misfit beyond noise" + (f" ({best.note})" if best.note else "") + "."
         )
-    if d.settings.get("withdrawn"):
-        parts.append(d.settings["withdrawn"])
     if d.missing is not None:
-        size = float(d.missing.rate.abs().max())
+        size = float(d.missing.rate.max() - d.missing.rate.min())
         unit = f" {d.missing.unit}" if d.missing.unit else ""
         along = "from run to run" if d.missing.driver == RUN else f"against {d.missing.driver}"
-        parts.append(f"The missing change of {d.missing.target} {along} reaches {size:.3g}{unit}.")
+        parts.append(
+            f"The missing change of {d.missing.target} {along} varies by {size:.3g}{unit}, beside what a change of the "
+            "base's own parameters does."
+        )
     return parts

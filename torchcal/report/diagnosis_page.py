@@ -155,8 +155,9 @@ def _facts(diagnosis: Any) -> str:
     before, after = getattr(diagnosis, "before", None), getattr(diagnosis, "after", None)
     old, new = (getattr(scores, "held_out", None) for scores in (before, after))
     if old is not None and new is not None and _accepted(diagnosis):
-        unit = _rmse_unit(diagnosis) or " of the spread"
-        facts.append(("RMSE on held-out data", f"{in_digits(old.rmse, 3)} → {in_digits(new.rmse, 3)}{unit}"))
+        unit = _rmse_unit(diagnosis).replace("spread", "of the spread")
+        change = f"{in_digits(old.rmse, 3)} → {in_digits(new.rmse, 3)} {unit}".rstrip()
+        facts.append(("RMSE on held-out data", change))
     cells = "".join(f"<div><dt>{escaped(name)}</dt><dd>{escaped(value)}</dd></div>" for name, value in facts)
     return f'<dl class="facts">{cells}</dl>'
 
@@ -227,7 +228,7 @@ def _estimates(diagnosis: Any) -> str:
 
 
 def _held_out(diagnosis: Any) -> str:
-    unit = _rmse_unit(diagnosis).strip()
+    unit = _rmse_unit(diagnosis)
     rows = []
     models = [("base model", getattr(diagnosis, "before", None))]
     if _accepted(diagnosis):
@@ -241,7 +242,7 @@ def _held_out(diagnosis: Any) -> str:
                 {
                     "data": part.replace("_", " "),
                     "model": name,
-                    f"RMSE [{unit}]" if unit else "RMSE [spread]": Right(in_digits(score.rmse)),
+                    f"RMSE [{unit}]" if unit else "RMSE": Right(in_digits(score.rmse)),
                     "log score": Right(in_digits(score.log_score)),
                     "coverage": Right(percent(score.coverage)),
                     "data points": Right(str(score.n)),
@@ -385,9 +386,9 @@ def _accepted(diagnosis: Any) -> bool:
 
 
 def _rmse_unit(diagnosis: Any) -> str:
+    """Of errors, which are in units of each output's spread where there are several; empty where nobody told it."""
     recording = diagnosis.recording
-    unit = recording.units.get(recording.outputs[0]) if len(recording.outputs) == 1 else None
-    return f" {unit}" if unit else ""
+    return recording.units.get(recording.outputs[0], "") if len(recording.outputs) == 1 else "spread"
 
 
 def _unit(units: Mapping[str, str], name: str) -> str:

@@ -97,7 +97,7 @@ def held_out_scores(before: Any, after: Any = None, *, ax: Any = None, unit: str
             ``coverage`` and ``n``.
         after: The accepted model's, or None.
         ax: Three axes; a new figure by default.
-        unit: Unit of the RMSE; by default it is in units of each output's spread.
+        unit: Unit of the RMSE; by default it is in units of each output's spread, and where it is empty nobody told it.
 
     Returns:
         The axes, ``(3,)``.
@@ -112,7 +112,7 @@ def held_out_scores(before: Any, after: Any = None, *, ax: Any = None, unit: str
     models = [(before, "s", BASE, "none", "before")]
     models += [] if after is None else [(after, "o", ACCEPTED, ACCEPTED, "after")]
     heads = (
-        ("rmse", f"RMSE [{plain(unit)}]" if unit else "RMSE [spread]"),
+        ("rmse", "RMSE [spread]" if unit is None else f"RMSE [{plain(unit)}]" if unit else "RMSE"),
         ("log_score", "log score [nat]"),
         ("coverage", "coverage [1]"),
     )
