@@ -438,7 +438,35 @@ def test_solutions_are_parted_and_joined() -> None:
     for name in ("values", "states", "tangents"):
         assert torch.equal(getattr(swapped, name), getattr(expected, name))
     assert torch.equal(warm.rows(torch.tensor([1])).repeated(2).near(points[[1, 1]]), warm.states[[1, 1]])
-    assert warm.guess(2, 5) is None  # of another number of states
+
+
+def test_derivatives_from_a_warm_start_are_exact_where_a_state_is_small() -> None:
+    """ln A of a decay: where A has all but gone, a correction of a thousandth of the largest A is one of all of it."""
+    t = np.linspace(0, 20, 41)
+    decay = tc.ODESimulator(
+        lambda t, s, p, u: {"A": -p["k"] * s["A"]}, ["A"], [tc.Parameter("k")],
+        observe={"lnA": lambda t, s, p, u: s["A"].clamp_min(1e-300).log()},
+    )  # fmt: skip
+    bound = decay.bind(tc.Recording(runs=[tc.Run(time=t, outputs={"lnA": t}, initial={"A": 1.0})]))
+    warm = bound.linearise(bound.x, tensor(1.0)[None]).warm
+    cold = bound.linearise(bound.x, tensor(1.05)[None])
+    hot = bound.linearise(bound.x, tensor(1.05)[None], warm=warm)
+    torch.testing.assert_close(hot.y, cold.y, rtol=1e-7, atol=1e-7)
+    torch.testing.assert_close(hot.jacobian, cold.jacobian, rtol=1e-4, atol=1e-6)
+
+
+def test_a_prediction_that_leaves_the_range_of_the_rates_is_not_used() -> None:
+    t = np.linspace(0, 8, 41)
+    fed = tc.ODESimulator(
+        lambda t, s, p, u: {"A": -p["k"] * s["A"], "B": p["c"] * s["A"].sqrt() - s["B"]}, ["A", "B"],
+        [tc.Parameter("k"), tc.Parameter("c")],
+    )  # fmt: skip
+    bound = fed.bind(tc.Recording(runs=[tc.Run(time=t, outputs={"B": t}, initial={"A": 1.0, "B": 0.0})]))
+    warm = bound.linearise(bound.x, tensor(1.0, 1.0)[None]).warm
+    there = tensor(1.3, 1.0)[None]
+    assert float(warm.near(there).min()) < 0
+    found = bound.linearise(bound.x, there, warm=warm, march=False)
+    torch.testing.assert_close(found.y, bound.linearise(bound.x, there).y, rtol=1e-7, atol=1e-8)
 
 
 @pytest.mark.parametrize("guess", [1e3, math.nan, math.inf])

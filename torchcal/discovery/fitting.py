@@ -339,7 +339,7 @@ def fit(
         jacobian=jacobian[best],
         chi2=float(chi2[best]),
         at_bound=at_bound,
-        warm=None if warm is None else warm.rows(torch.tensor([best])),
+        warm=None if warm is None else Solution(warm.states[best : best + 1]),  # tangents would only take memory
         ends=values,
         ends_chi2=chi2,
         agreeing=agreeing,

@@ -188,9 +188,9 @@ class Problem:
     def guess(self, found: Solution | None, count: int) -> Solution | None:
         """Another problem's only solution as a warm start of this one, so many times; None where it is none."""
         bound = self.simulator
-        if found is None or not isinstance(bound, Trajectories):
+        if found is None or not isinstance(bound, Trajectories) or found.states.shape[-1] != len(bound.ode.states):
             return None
-        return found.guess(count, len(bound.ode.states))
+        return found.repeated(count)
 
     def drivers(self, values: Tensor, warm: Solution | None) -> dict[str, Tensor]:
         """What a change may vary with at every datum, ``(n_total conditions,)`` each: conditions, or time, states and

@@ -24,10 +24,11 @@ SMALLEST, SMALLEST_ANEW = 1e-8, 1e-12
 MAX_PASSES = 8
 #: Corrections with the derivatives of an earlier pass (chords) do not square, but each is at most this share of the one
 #: before; so small a one is the last; of so many.
-SHRINK, SMALL_CHORD, CHORDS = 0.2, 1e-7, 4
-#: Newton corrections, relative to the largest states, up to which chords follow, and up to which the derivatives before
-#: count as those of the trajectory found.
-CLOSE, NEAR = 0.1, 1e-3
+CONTRACTION, SMALL_CHORD, CHORDS = 0.2, 1e-7, 4
+#: Newton corrections, relative to the largest states, up to which chords follow; and relative to the largest of the
+#: state around where they are made, up to which the derivatives before count as those of the trajectory found. Around
+#: is this share of the trajectory to either side: a state may pass zero, or stay small.
+CLOSE, NEAR, AROUND = 0.1, 1e-3, 1 / 16
 
 
 class Closed(NamedTuple):
@@ -50,7 +51,7 @@ def close_gaps(
     """Trajectories from their first states on, and their derivatives by some parameters.
 
     A pass takes all steps and their derivatives from the states at hand; the linear recurrence of the gaps gives the
-    correction. Where it was small, more of them with the same derivatives follow, which cost the steps alone.
+    correction. Where it was small, more of them with the same derivatives follow, which take no derivatives.
 
     Args:
         steps: The steps.
@@ -92,7 +93,7 @@ def close_gaps(
             at = (good & ~ended & (far < CLOSE)).nonzero()[:, 0]
             if len(at):
                 moved[at], small = _chords(steps, values[rows[at]], moved[at], flow[at], floor[at], share[at])
-                ended[at] = small & (far[at] < NEAR) if columns else small
+                ended[at] = small & (_share_around(change[at], moved[at]) < NEAR) if columns else small
         states[rows] = torch.where(good[:, None, None, None], moved, now)
         settled[rows] = good & ended
         active[rows] = good & ~ended
@@ -116,7 +117,7 @@ def _chords(
         change = recur(flow, torch.nan_to_num(gap).unsqueeze(-1))[..., 0]
         moved = torch.cat([states[:, :, :1], states[:, :, 1:] + change], dim=2)
         now = _share(change, moved, floor)
-        better = now < SHRINK * share
+        better = now < CONTRACTION * share
         states = torch.where(better[:, None, None, None], moved, states)
         share = torch.where(better, now, share)
         if bool(((share < SMALL_CHORD) | ~better).all()):
@@ -128,3 +129,13 @@ def _share(change: Tensor, moved: Tensor, floor: Tensor) -> Tensor:
     """Largest correction ``(H,)`` of states, relative to these where it is made."""
     near = torch.maximum(moved[:, :, :-1].abs(), moved[:, :, 1:].abs())
     return (change.abs() / torch.maximum(near, floor)).flatten(1).amax(-1)
+
+
+def _share_around(change: Tensor, moved: Tensor) -> Tensor:
+    """Largest correction ``(H,)``, relative to the largest of the state around it."""
+    hyper, runs, nodes, size = moved.shape
+    reach = max(1, int(nodes * AROUND))
+    rows = moved.abs().movedim(2, -1).reshape(1, -1, nodes)
+    around = torch.nn.functional.max_pool1d(rows, 2 * reach + 1, stride=1, padding=reach)
+    near = around.reshape(hyper, runs, size, nodes).movedim(-1, 2)[:, :, 1:]
+    return (change.abs() / near.clamp_min(1e-300)).flatten(1).amax(-1)

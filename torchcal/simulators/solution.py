@@ -30,8 +30,8 @@ class Solution:
         """States at other values ``(H, P)``, to first order."""
         if self.values is None or self.tangents is None:
             return self.states
-        moved = (values - self.values)[:, None, None, list(self.columns), None]
-        found = self.states + (self.tangents @ moved)[..., 0]
+        moved = (values - self.values)[:, list(self.columns), None]
+        found = self.states + (self.tangents.flatten(1, 3) @ moved).view_as(self.states)
         sound = torch.isfinite(found).flatten(1).all(-1)
         return torch.where(sound[:, None, None, None], found, self.states)
 
@@ -44,14 +44,13 @@ class Solution:
             tangents=None if self.tangents is None else self.tangents[which],
         )
 
-    def repeated(self, count: int) -> "Solution":
-        """A single trajectory, so many times."""
-        return self.rows(torch.zeros(count, dtype=torch.long))
+    @property
+    def spare(self) -> Tensor | None:
+        """The states as they are, where a prediction has left the range in which rates are defined."""
+        return None if self.tangents is None else self.states
 
-    def guess(self, count: int, size: int) -> "Solution | None":
-        """A single trajectory as a guess for other parameters than its own; None where the states are not so many."""
-        if self.states.shape[-1] != size:
-            return None
+    def repeated(self, count: int) -> "Solution":
+        """A single trajectory so many times, as a guess for any parameters."""
         return Solution(self.states.expand(count, *self.states.shape[1:]))
 
     def updated(self, which: Tensor, other: "Solution") -> "Solution":

@@ -91,6 +91,9 @@ class Simulator:
     tensor([2., 5.])
     """
 
+    extended: tuple[Any, tuple[Any, ...]] | None = None
+    """Of a simulator that terms were added to: the one without them, and the terms (`torchcal.terms.extend`)."""
+
     def __init__(
         self,
         function: Callable[[Any, dict[str, Tensor]], Any],

@@ -128,7 +128,13 @@ class Steps:
         return float(((ends - states[:, :, 1:]).abs() / size).max())
 
     def solve(
-        self, values: Tensor, guess: Tensor | None = None, columns: Sequence[int] = (), *, march: bool = True
+        self,
+        values: Tensor,
+        guess: Tensor | None = None,
+        columns: Sequence[int] = (),
+        *,
+        other: Tensor | None = None,
+        march: bool = True,
     ) -> tuple[Tensor, Tensor]:
         """States at the ends of all steps and their derivatives by some parameters.
 
@@ -140,6 +146,7 @@ class Steps:
             values: Parameter values, ``(H, P)``.
             guess: Of the states.
             columns: Places of the parameters to derive by.
+            other: Another guess, for where that leads nowhere.
             march: Whether to solve from the beginning at all.
 
         Returns:
@@ -155,7 +162,10 @@ class Steps:
         pieces = zip(values.split(size), begin.split(size), strict=True)
         found = [close_gaps(self, v, s, columns) for v, s in pieces]
         states, settled, tangents = (torch.cat(parts) for parts in zip(*found, strict=True))
-        if not march:
+        if other is not None and not bool(settled.all()):
+            left = ~settled
+            states[left], tangents[left] = self.solve(values[left], other[left], columns, march=march)
+        elif not march:
             states[~settled] = math.inf
         elif not bool(settled.all()):
             states[~settled], tangents[~settled] = self.solve(values[~settled], None, columns)

@@ -271,10 +271,12 @@ class Trajectories(Simulator):
         columns = list(range(values.shape[-1])) if columns is None else list(columns)
         found = []
         with torch.no_grad():
-            guess = warm.near(values) if warm is not None and len(warm.states) == len(values) else None
+            if warm is not None and len(warm.states) != len(values):
+                warm = None
+            guess, other = (None, None) if warm is None else (warm.near(values), warm.spare)
             nodes = self.grid.nodes.numel()
             few = len(values) * nodes * len(self._states) * len(columns) <= NUMBERS
-            states, tangents = self.steps.solve(values, guess, columns if few else (), march=march)
+            states, tangents = self.steps.solve(values, guess, columns if few else (), other=other, march=march)
             size = max(1, POINTS // nodes)
             for k, (v, s) in enumerate(zip(values.split(size), states.split(size), strict=True)):
                 slopes = tangents[k * size : (k + 1) * size] if few else self.steps.sensitivities(v, s, columns)
