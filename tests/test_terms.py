@@ -211,8 +211,11 @@ def test_factors_on_one_parameter_multiply_and_rates_see_them() -> None:
     data = tc.Recording(runs=[tc.Run(time=t, outputs={"x": t}, initial={"x": 2.0})])
     right = whole.bind(data).at(data.x)(tensor(0.8, 0.4, 0.5, 0.3))
     values = {"k": 0.8, "fading.r": 0.4, "crowded.K": 0.5, "fed.b": 0.3}
-    for terms in ([fading, crowded, fed], [fed, crowded, fading]):
-        bound = extend(plain, terms).bind(data)
+    wholes = [extend(plain, terms) for terms in ([fading, crowded, fed], [fed, crowded, fading])]
+    wholes.append(extend(extend(plain, [fading]), [fed, crowded]))
+    wholes.append(extend(extend(extend(plain, [crowded]), [fed]), [fading]))
+    for simulator in wholes:
+        bound = simulator.bind(data)
         close(bound.at(data.x)(tensor(*(values[name] for name in bound.names))), right)
 
 
@@ -289,9 +292,13 @@ def test_static_factors_on_one_parameter_multiply() -> None:
     first = tc.Term("first", shifts={"m": lambda x, p: p["m"] * (x["h"] ** p["e"] - 1)}, parameters=[tc.Parameter("e")])
     other = tc.Term("other", shifts={"m": lambda x, p: p["m"] * p["g"] * x["t"]}, parameters=[tc.Parameter("g")])
     slope = 2.0 * X["h"] ** 0.3 * (1 + 0.2 * X["t"])
+    seen = tc.Term("seen", outputs={"q": lambda x, p, y: y + p["o"] * p["m"]}, parameters=[tc.Parameter("o")])
     for terms, values in (([first, other], (0.3, 0.2)), ([other, first], (0.2, 0.3))):
         found = extend(line(), terms).at(X, ["q"])(tensor(2.0, 1.5, *values))
         close(found, slope * X["t"] ** 2)
+        one_by_one = extend(extend(extend(line(), terms[:1]), [seen]), terms[1:])
+        found = one_by_one.at(X, ["q"])(tensor(2.0, 1.5, values[0], 0.1, values[1]))
+        close(found, slope * X["t"] ** 2 + 0.1 * slope)
 
 
 def test_a_static_sensor_and_a_static_freed_parameter() -> None:

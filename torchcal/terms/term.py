@@ -188,7 +188,8 @@ def extend(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
     """The simulator with terms added, their parameters free behind its own; a new object.
 
     Shifts come one after another, each on what those before have made of the parameters: two factors on a rate
-    constant are their product. Rates and outputs see the shifted parameters.
+    constant are their product. Rates and outputs see the shifted parameters. Terms that it has been extended with
+    before are as if given together with these.
 
     Raises:
         DomainError: If a term names an equation, output or parameter that the simulator does not have.
@@ -224,9 +225,16 @@ def _parameters(simulator: Simulator, terms: Sequence[Term]) -> tuple[Parameter,
     return tuple(found)
 
 
+def _plain(simulator: Simulator, terms: Sequence[Term]) -> tuple[Any, list[Term]]:
+    """The simulator without any terms, and all of them: those that it has been extended with come first."""
+    plain, before = simulator.extended or (simulator, ())
+    return plain, [*before, *terms]
+
+
 def _extend_ode(simulator: ODESimulator, terms: Sequence[Term]) -> ODESimulator:
     if not terms:
         return simulator
+    plain, every = _plain(simulator, terms)
     states = dict(simulator.states)
     initial = dict(simulator.initial)
     for term in terms:
@@ -244,7 +252,7 @@ def _extend_ode(simulator: ODESimulator, terms: Sequence[Term]) -> ODESimulator:
                 raise DomainError(
                     f"Expected the term {term.name!r} on an output of {list(simulator.observe)}. Got {place!r}."
                 )
-    shifting = [term for term in terms if term.shifts]
+    shifting = [term for term in every if term.shifts]
 
     def shifted(t: Any, s: dict[str, Tensor], p: dict[str, Tensor], u: dict[str, Tensor]) -> dict[str, Tensor]:
         if not shifting:
@@ -258,8 +266,8 @@ def _extend_ode(simulator: ODESimulator, terms: Sequence[Term]) -> ODESimulator:
 
     def rates(t: Any, s: dict[str, Tensor], p: dict[str, Tensor], u: dict[str, Tensor]) -> dict[str, Any]:
         p = shifted(t, s, p, u)
-        found = dict(simulator.rates(t, s, p, u))
-        for term in terms:
+        found = dict(plain.rates(t, s, p, u))
+        for term in every:
             own = term.own(p)
             for state, function in term.rates.items():
                 value = term.call(function, t, s, own, u)
@@ -267,9 +275,9 @@ def _extend_ode(simulator: ODESimulator, terms: Sequence[Term]) -> ODESimulator:
         return found
 
     observe: dict[str, Function] = {}
-    for name, function in simulator.observe.items():
-        observe[name] = _sensed(name, function, [term for term in terms if name in term.outputs], shifted)
-    return ODESimulator(
+    for name, function in plain.observe.items():
+        observe[name] = _sensed(name, function, [term for term in every if name in term.outputs], shifted)
+    extended = ODESimulator(
         rates,
         states,
         _parameters(simulator, terms),
@@ -277,6 +285,8 @@ def _extend_ode(simulator: ODESimulator, terms: Sequence[Term]) -> ODESimulator:
         initial=initial,
         max_step=simulator.max_step,
     )
+    extended.extended = plain, tuple(every)
+    return extended
 
 
 def _initial_of(term: Term, value: Any) -> Any:
@@ -308,19 +318,19 @@ def _extend_static(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
         freed = copy.copy(simulator)
         freed.parameters = parameters
         return freed
-    plain = simulator.names
+    plain, every = _plain(simulator, terms)
 
     def function(x: Any, p: dict[str, Tensor]) -> Any:
         moved = dict(p)
-        for term in terms:
+        for term in every:
             own = term.own(dict(moved))
             for name, shift in term.shifts.items():
                 moved[name] = moved[name] + term.call(shift, x, own)
-        result = simulator.function(x, {name: moved[name] for name in plain})
-        if not any(term.outputs for term in terms):
+        result = plain.function(x, {name: moved[name] for name in plain.names})
+        if not any(term.outputs for term in every):
             return result
         found = dict(result) if isinstance(result, Mapping) else {"y": result}
-        for term in terms:
+        for term in every:
             for name, sensor in term.outputs.items():
                 place = name if name in found else "y" if not isinstance(result, Mapping) else name
                 if place not in found:
@@ -330,7 +340,9 @@ def _extend_static(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
                 found[place] = term.call(sensor, x, term.own(moved), found[place])
         return found if isinstance(result, Mapping) else found["y"]
 
-    return Simulator(function, parameters)
+    extended = Simulator(function, parameters)
+    extended.extended = plain, tuple(every)
+    return extended
 
 
 def neutral_of(parameter: Parameter) -> float | None:
