@@ -308,7 +308,7 @@ def _result(
         after=after,
         improved=improved,
         symptoms=explain.symptoms(search, best),
-        noise=_told_noise(search, decision).record(search.problem),
+        noise=_told_noise(search, decision, 1.0 - confidence).record(search.problem),
         base=base,
         final=final,
         embedded=Table(
@@ -343,11 +343,11 @@ def _result(
     )
 
 
-def _told_noise(search: Search, decision: Decision) -> Noise:
+def _told_noise(search: Search, decision: Decision, alpha: float) -> Noise:
     """The noise that the verdict rests on."""
     if decision.best is not None:
         return beside(search, decision.best)
-    if decision.verdict == "consistent" and search.noise.open and search.p_detect < PLAINLY_WHITE:
+    if decision.verdict == "consistent" and search.noise.open and search.p_detect < alpha:
         return settled(search.base, search.noise, search.tangents)[0]
     return search.noise
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchcal.discovery.channels import Channel
 from torchcal.discovery.fitting import Fitted, fit, starts
-from torchcal.discovery.local import ENDS, WIDTH_OF_EDGE, region_text
+from torchcal.discovery.local import ENDS, WIDTH_OF_EDGE, is_window, region_text
 from torchcal.discovery.model import Model
 from torchcal.discovery.noise import estimate
 from torchcal.discovery.records import Estimate, Fit, Location, MissingRate, NeededShift, Table
@@ -295,9 +295,11 @@ def identifiability(search: Search, best: Model | None) -> list[str]:
 
 def _untold(found: Fitted) -> list[str]:
     """Parameters of a fit, and combinations of them, that move no datum."""
-    jacobian = found.whitening(found.jacobian)
+    told = [found.problem.parameters[i].name for i in found.free]
+    mine = [k for k, name in enumerate(told) if not is_window(name)]  # between two data an end of a window moves none
+    jacobian = found.whitening(found.jacobian[:, mine])
     size = jacobian.norm(dim=0)
-    names = [found.problem.parameters[i].name for i in found.free]
+    names = [told[k] for k in mine]
     rows = [f"{name} has no effect on these data" for name, norm in zip(names, size.tolist(), strict=True) if norm == 0]
     unit = jacobian[:, size > 0] / size[size > 0]
     kept = [name for name, norm in zip(names, size.tolist(), strict=True) if norm > 0]

@@ -95,11 +95,14 @@ def _turn(search: Search, prior: float) -> None:
     if math.isfinite(w.low) == math.isfinite(w.high) or float(inside) <= 0.5:
         return
     low, high = (-math.inf, w.low) if math.isfinite(w.low) else (w.high, math.inf)
+    # Of the amplitude the sign counts, and the order of magnitude: the fit begins near the base.
     other = dataclasses.replace(w, low=low, high=high, amplitude=-_amplitude(search, lead)[2])
     turned = refit_window(search, other, prior, edge=True, span=w.span)
+    if turned is not None and not search.problem.in_time:
+        turned = max(filter(None, (turned, _stepped(search, turned, w.driver))), key=lambda one: one.weight)
     if turned is not None and turned.physical and turned.weight > lead.weight - AS_GOOD:
         search.models.remove(lead)
-        search.models.append(turned)
+        _keep(search, turned)
 
 
 def _rivals(search: Search, prior: float) -> bool:

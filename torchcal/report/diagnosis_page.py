@@ -155,7 +155,7 @@ def _facts(diagnosis: Any) -> str:
     before, after = getattr(diagnosis, "before", None), getattr(diagnosis, "after", None)
     old, new = (getattr(scores, "held_out", None) for scores in (before, after))
     if old is not None and new is not None and _accepted(diagnosis):
-        unit = _rmse_unit(diagnosis).replace("spread", "of the spread")
+        unit = "of the spread" if len(diagnosis.recording.outputs) > 1 else _rmse_unit(diagnosis)
         change = f"{in_digits(old.rmse, 3)} → {in_digits(new.rmse, 3)} {unit}".rstrip()
         facts.append(("RMSE on held-out data", change))
     cells = "".join(f"<div><dt>{escaped(name)}</dt><dd>{escaped(value)}</dd></div>" for name, value in facts)

@@ -267,12 +267,13 @@ def _total(
     for i in sorted(range(len(planted)), key=lambda i: not planted[i].effect.factors):
         item, c = planted[i], numbers[i]
         gate = 1.0 if item.gate is None else item.gate(t, s, u)
+        if item.gate is not None and item.effect.factors:
+            raise ValueError(f"Expected no gate of a factor. Got one of {item.effect.name}.")
         added[i] = {
             state: rate(t, s, p, u, c) * (gate if state in family.states else 1.0)
             for state, rate in item.effect.rates.items()
         }
-        moved = {name: p[name] * (1 + gate * (factor(t, s, p, u, c) - 1))
-                 for name, factor in item.effect.factors.items()}  # fmt: skip
+        moved = {name: p[name] * factor(t, s, p, u, c) for name, factor in item.effect.factors.items()}
         p = {**p, **moved}
     return base, added
 
