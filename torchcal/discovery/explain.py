@@ -261,7 +261,7 @@ def symptoms(search: Search, best: Model | None) -> list[str]:
             if moved > BENT and abs(b - a) > 0.001 * abs(a):
                 rows.append(
                     f"{q.name} was bent: {a:.4g} ± {float(sd[i]):.2g}{_unit(q.unit)} in the calibrated base, "
-                    f"{str(then[q.name]).removeprefix(f'{q.name} = ')} with {' and '.join(best.names)}"
+                    f"{then[q.name].amount} with {' and '.join(best.names)}"
                 )
     if search.noise.doubted > 1:
         left = search.base if best is None else best.found

@@ -93,8 +93,13 @@ class Estimate:
     at_bound: bool = False
 
     def __str__(self) -> str:
+        return f"{self.name} = {self.amount}"
+
+    @property
+    def amount(self) -> str:
+        """Value, sd and unit in words."""
         spread = f" ± {self.sd:.2g}" if math.isfinite(self.sd) else " (not determined)"
-        text = f"{self.name} = {self.value:.4g}{spread}"
+        text = f"{self.value:.4g}{spread}"
         text += f" {self.unit}" if self.unit else ""
         return text + (" (at its bound)" if self.at_bound else "")
 

@@ -98,8 +98,8 @@ def _turn(search: Search, prior: float) -> None:
     # Of the amplitude the sign counts, and the order of magnitude: the fit begins near the base.
     other = dataclasses.replace(w, low=low, high=high, amplitude=-_amplitude(search, lead)[2])
     turned = refit_window(search, other, prior, edge=True, span=w.span)
-    if turned is not None and not search.problem.in_time:
-        turned = max(filter(None, (turned, _stepped(search, turned, w.driver))), key=lambda one: one.weight)
+    if turned is not None:
+        turned = _stepped(search, turned, w.driver)
     if turned is not None and turned.physical and turned.weight > lead.weight - AS_GOOD:
         search.models.remove(lead)
         _keep(search, turned)
@@ -159,18 +159,20 @@ def _refine_edges(search: Search, prior: float) -> None:
         scales = [span, dataclasses.replace(span, log=False)] if span.log else [span]
         found = [refit_window(search, w, prior, model, edge=True, span=scale) for scale in scales]
         other = max((one for one in found if one is not None), key=lambda one: one.weight, default=None)
-        if other is not None and not search.problem.in_time:  # time steps are not chosen to meet a step
-            other = max(filter(None, (other, _stepped(search, other, w.driver))), key=lambda one: one.weight)
+        if other is not None:
+            other = _stepped(search, other, w.driver)
         if other is not None and other.weight > model.weight:
             search.models.remove(model)
             _keep(search, other)
 
 
-def _stepped(search: Search, model: Model, driver: str) -> Model | None:
-    """A static local model with steps for edges, each between two of the data near the edge that was found.
+def _stepped(search: Search, model: Model, driver: str) -> Model:
+    """A static local model with steps for edges, each between two of the data near the edge that was found, if better.
 
     The misfit of a step jumps from datum to datum, and slopes lead to none of its minima.
     """
+    if search.problem.in_time:  # time steps are not chosen to meet a step
+        return model
     problem, values = model.candidate.problem, model.found.values
     along = search.drivers()[driver].unique()
     between = 0.5 * (along[1:] + along[:-1])
@@ -185,7 +187,8 @@ def _stepped(search: Search, model: Model, driver: str) -> Model | None:
     begin = torch.cartesian_prod(*choices)
     misfit = search.noise.whitening(problem).vector(problem.y - problem.evaluate(begin, [])[0]).square().sum(-1)
     begin = begin[misfit.nan_to_num(nan=torch.inf).argsort()[:STEPPED]]
-    return _long_enough(search.refit_one(model.numbers, model.candidate, begin, model.log_prior, window=model.window))
+    found = search.refit_one(model.numbers, model.candidate, begin, model.log_prior, window=model.window)
+    return max(filter(None, (model, _long_enough(found))), key=lambda one: one.weight)
 
 
 def _keep(search: Search, model: Model | None) -> None:

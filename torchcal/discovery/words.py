@@ -279,11 +279,11 @@ def _ambiguous(d: Any) -> list[str]:
     unknown = _unknown(d)
     known = [tied for tied in d.tied if tuple(tied) != NONE]
     if len(known) == 1:
-        sure = sum(row.probability for row in d.ranking if set(known[0]) <= set(row.terms))
         if d.settings.get("withdrawn"):
             return [_where(d), d.settings["withdrawn"]]
         if d.settings.get("doubt"):
             return [_where(d), f"{_hypothesis(d, known[0])} explains it best. {d.settings['doubt']}"]
+        sure = sum(row.probability for row in d.ranking if set(known[0]) <= set(row.terms))
         return [
             _where(d),
             f"{_and(known[0])}, the best explanation in the library, has a probability of {sure:.2f}, which is too "

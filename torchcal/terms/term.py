@@ -231,6 +231,18 @@ def _plain(simulator: Simulator, terms: Sequence[Term]) -> tuple[Any, list[Term]
     return plain, [*before, *terms]
 
 
+def _shifted(
+    terms: Sequence[Term], p: dict[str, Tensor], given: Callable[[dict[str, Any]], tuple[Any, ...]]
+) -> dict[str, Tensor]:
+    """Parameters as the terms shift them, one after another; ``given`` makes of ``p`` what their functions get."""
+    moved = dict(p)
+    for term in terms:
+        own = given(term.own(dict(moved)))
+        for name, function in term.shifts.items():
+            moved[name] = moved[name] + term.call(function, *own)
+    return moved
+
+
 def _extend_ode(simulator: ODESimulator, terms: Sequence[Term]) -> ODESimulator:
     if not terms:
         return simulator
@@ -255,14 +267,7 @@ def _extend_ode(simulator: ODESimulator, terms: Sequence[Term]) -> ODESimulator:
     shifting = [term for term in every if term.shifts]
 
     def shifted(t: Any, s: dict[str, Tensor], p: dict[str, Tensor], u: dict[str, Tensor]) -> dict[str, Tensor]:
-        if not shifting:
-            return p
-        moved = dict(p)
-        for term in shifting:
-            own = term.own(dict(moved))
-            for name, function in term.shifts.items():
-                moved[name] = moved[name] + term.call(function, t, s, own, u)
-        return moved
+        return _shifted(shifting, p, lambda own: (t, s, own, u)) if shifting else p
 
     def rates(t: Any, s: dict[str, Tensor], p: dict[str, Tensor], u: dict[str, Tensor]) -> dict[str, Any]:
         p = shifted(t, s, p, u)
@@ -321,11 +326,7 @@ def _extend_static(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
     plain, every = _plain(simulator, terms)
 
     def function(x: Any, p: dict[str, Tensor]) -> Any:
-        moved = dict(p)
-        for term in every:
-            own = term.own(dict(moved))
-            for name, shift in term.shifts.items():
-                moved[name] = moved[name] + term.call(shift, x, own)
+        moved = _shifted(every, p, lambda own: (x, own))
         result = plain.function(x, {name: moved[name] for name in plain.names})
         if not any(term.outputs for term in every):
             return result
