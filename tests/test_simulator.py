@@ -266,3 +266,13 @@ def test_a_function_that_maps_over_its_conditions_is_derived():
     simulator = tc.Simulator(lambda x, p: p["a"] * torch.vmap(lambda t: t * 2.0 + 1.0)(x), [tc.Parameter("a")])
     found = simulator.linearise(x, torch.tensor([[3.0]], dtype=torch.float64))
     torch.testing.assert_close(found.jacobian[0, :, 0], 2 * x + 1)
+
+
+def test_a_function_that_raises_is_told_with_the_values_it_was_called_with() -> None:
+    def picky(x, p):
+        raise ValueError("not here")
+
+    base = tc.Simulator(picky, parameters=[tc.Parameter("a"), tc.Parameter("b")])
+    values = torch.tensor([[1.0, 2.0], [1.0, 5.0]], dtype=torch.float64)
+    with pytest.raises(SimulatorError, match=r"ValueError: not here\. .* shape \(2, 1\) \(a = 1, b from 2 to 5\)"):
+        base.at(torch.zeros(3, dtype=torch.float64))(values)

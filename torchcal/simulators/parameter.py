@@ -9,7 +9,24 @@ from torch import Tensor
 
 from torchcal.errors import DomainError, EmbeddingError, ShapeError
 
-__all__ = ["Parameter", "Scaling", "free_parameters"]
+__all__ = ["Parameter", "Scaling", "free_parameters", "spans"]
+
+
+def spans(values: Mapping[str, Tensor]) -> str:
+    """Named batches in words, for a message about them: each value, or the smallest and the largest.
+
+    >>> spans({"k": torch.tensor([2.0]), "E": torch.tensor([0.5, 3.0])})
+    'k = 2, E from 0.5 to 3'
+    """
+    told = []
+    for name, batch in values.items():
+        try:
+            low, high = float(batch.detach().min()), float(batch.detach().max())
+        except RuntimeError:  # no values, or those of a transform of torch.func, which has none to tell
+            told.append(name)
+            continue
+        told.append(f"{name} = {low:.6g}" if low == high else f"{name} from {low:.6g} to {high:.6g}")
+    return ", ".join(told)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from torchcal.checks import whole
 from torchcal.data import Recording
 from torchcal.errors import DomainError, ShapeError, SimulatorError
 from torchcal.simulators.dual import Still, still
-from torchcal.simulators.parameter import Parameter
+from torchcal.simulators.parameter import Parameter, spans
 from torchcal.simulators.solution import Solution
 
 __all__ = ["Conditions", "Linearisation", "Simulator", "check_parameters"]
@@ -139,7 +139,7 @@ class Simulator:
                 raise SimulatorError(
                     f"Expected the simulator to return a tensor. It raised {type(error).__name__}: {error}. "
                     f"It was called with conditions {_describe(x)} and parameters of shape "
-                    f"{(*values.shape[:-1], 1)} ({', '.join(self.names)}).{_advice(error, x, self.names)}"
+                    f"{(*values.shape[:-1], 1)} ({spans(p)}).{_advice(error, x, self.names)}"
                 ) from error
             return self._flatten(result, values, n, outputs)
 

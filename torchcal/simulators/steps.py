@@ -15,6 +15,7 @@ from torch import Tensor
 from torchcal.errors import SimulatorError
 from torchcal.simulators.grid import Grid
 from torchcal.simulators.layout import Layout
+from torchcal.simulators.parameter import spans
 from torchcal.simulators.recurrence import recur
 from torchcal.simulators.shooting import begun, close_gaps
 
@@ -59,8 +60,8 @@ class Steps:
         except Exception as error:
             raise SimulatorError(
                 f"Expected rates(t, s, p, u) to return the rates by state. It raised {type(error).__name__}: {error}. "
-                f"It was called with states of shape {tuple(s.shape[:-1])} and parameters "
-                f"{', '.join(p)} of shape {tuple(next(iter(p.values())).shape)}."
+                f"It was called with states of shape {tuple(s.shape[:-1])} ({spans(named)}) and parameters "
+                f"of shape {tuple(next(iter(p.values())).shape)} ({spans(p)})."
             ) from error
         if not isinstance(rates, Mapping) or set(rates) != set(names):
             got = list(rates) if isinstance(rates, Mapping) else type(rates).__name__
