@@ -18,7 +18,7 @@ def test_denser_samples_lie_between_the_others_and_inputs_hold_as_they_did(hold)
     u = torch.tensor([1.0, 3.0, 5.0], dtype=F64)
     run = tc.Run(time=t, outputs={"x": torch.zeros(3, dtype=F64)}, inputs={"f": u}, hold=hold)
     proposed = ("a run", tc.Recording(runs=[run]), {"time": t, "initial": {"x": 2.0}, "inputs": {"f": u}})
-    text, recording, conditions = experiment._denser(proposed, tc.Recording(runs=[run]))
+    text, recording, conditions = experiment._denser(proposed, tc.Recording(runs=[run]), 4)
     assert text == "a run, sampled 4 times as densely"
     wanted = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0], dtype=F64)
     assert torch.equal(conditions["time"], wanted)
@@ -94,20 +94,50 @@ def test_an_experiment_that_a_model_does_not_bear_is_none(height, bearable):
     assert experiment._bearable([model], runs(height), noise) == bearable
 
 
+def models_of(names: str) -> tuple[list[SimpleNamespace], tc.Recording]:
+    recording = tc.Recording(x={"x": torch.linspace(-1, 1, 9, dtype=F64)}, y=torch.zeros(9, dtype=F64))
+    problem = SimpleNamespace(in_time=False, recording=recording, simulator=None)
+    found = SimpleNamespace(problem=problem)
+    return [SimpleNamespace(names=(name,), where=None, window=None, found=found) for name in names], recording
+
+
 def test_pairs_that_nothing_tells_apart_are_left_aside_and_said(monkeypatch):
-    """Of three models two are alike: 1.5 sd, and 1.9 with more samples. The third is told from both."""
-    models = [SimpleNamespace(names=(name,), where=None, window=None) for name in "abc"]
-    recording = tc.Recording(x={"x": torch.linspace(0, 1, 9, dtype=F64)}, y=torch.zeros(9, dtype=F64))
-    for model in models:
-        model.found = SimpleNamespace(problem=SimpleNamespace(in_time=False, recording=recording, simulator=None))
+    """Of three models two are alike: 0.4 sd, and 1.9 with more samples. The third is told from both."""
+    models, _ = models_of("abc")
     monkeypatch.setattr(
-        experiment, "_separations", lambda pairs, new, noise: [1.5, 50.0, 40.0] if new.n == 9 else [1.9, 99.0, 98.0]
+        experiment, "_separations", lambda pairs, new, noise: [0.6, 19.0, 18.0] if new.n == 9 else [1.9, 99.0, 98.0]
     )
     found = experiment.propose(models, SimpleNamespace())
-    assert found.separation == 40.0
+    assert found.separation == 18.0
     assert found.untold == [("a", "b")]
     monkeypatch.setattr(experiment, "_separations", lambda pairs, new, noise: [0.1, 0.2, 0.3])
     assert experiment.propose(models, SimpleNamespace()) is None
+
+
+@pytest.mark.parametrize(
+    ("distances", "wanted"),
+    [
+        ([1.0, 30.0, 900.0], "to 2"),  # far enough: the milder one
+        ([1.0, 8.0, 15.0], "to -2"),  # the one that tells most
+        ([3.5, 1.0, 1.0], "again, each 4 times"),
+        ([1.2, 1.0, 1.0], "again, each 16 times"),
+    ],
+)
+def test_the_mildest_experiment_that_tells_plenty_is_proposed_and_no_more_samples_than_it_takes(
+    monkeypatch, distances, wanted
+):
+    models, recording = models_of("ab")
+    first, above, below = distances
+
+    def separations(pairs, new, noise):
+        x = new.x["x"]
+        again = torch.equal(x.unique(), recording.x["x"])
+        plain = first if again else above if x.max() > 1 else below if x.min() < -1 else 0.0
+        return [plain * (new.n / 9) ** 0.5]
+
+    monkeypatch.setattr(experiment, "_separations", separations)
+    found = experiment.propose(models, SimpleNamespace())
+    assert found.description.endswith(wanted)
 
 
 def test_a_solution_that_blows_up_is_not_bearable():

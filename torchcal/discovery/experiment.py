@@ -13,25 +13,30 @@ from torchcal.data import Recording, Run
 from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.model import Model
 from torchcal.discovery.noise import Noise
+from torchcal.discovery.problem import Problem, Whitening
 from torchcal.discovery.records import Experiment
 from torchcal.errors import TorchcalError
 from torchcal.simulators import Trajectories
 
 __all__ = ["propose"]
 
-#: Distance in noise sd below which more samples are asked for, and how many times as many.
-ENOUGH, DENSER = 6.0, 4
+#: Distance in noise sd below which more samples are asked for, how many times as many at first, and at last, and the
+#: number of samples up to which these are more than at first.
+ENOUGH, DENSER, DENSEST, MANY = 6.0, 4, 16, 1000
+#: Distance beyond which a milder experiment is as good: models are not right far from what was recorded.
+PLENTY = 12.0
 #: Models that are told apart at most.
-MOST = 4
+MOST = 8
 #: Distance below which an experiment tells nothing apart.
 LEAST = 2.0
-
 #: How much larger the distance must be for a less simple experiment.
 WORTH = 1.01
 #: Below which no temperature goes, by unit.
 ABSOLUTE_ZERO = {"degC": -273.15, "°C": -273.15, "degF": -459.67, "°F": -459.67}
-#: Solver error, in noise sd, up to which a model bears an experiment.
-SETTLED = 0.1
+#: Solver error, in noise sd, up to which a model bears an experiment, with steps halved so often at most.
+SETTLED, HALVINGS = 0.1, 3
+#: How many times the largest reading no experiment shall make an output.
+FAR = 100.0
 
 Pair = tuple[Model, Model]
 Option = tuple[str, Recording, dict[str, Any]]
@@ -48,10 +53,14 @@ class Tried:
         """The smallest distance of the pairs that any experiment tells apart."""
         return min(distance for distance, clear in zip(self.distances, told, strict=True) if clear)
 
+    def worth(self, told: Sequence[bool]) -> float:
+        """The same, but that more than `PLENTY` is worth no more."""
+        return min(self.nearest(told), PLENTY)
+
 
 def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
     """The experiment, among a few that anyone can do, that separates the two nearest of the models most, those aside
-    that none of them tells apart.
+    that none of them tells apart; the first, and mildest, of those that separate them by `PLENTY`.
 
     Runs are repeated with other initial states, stronger or weaker inputs, or for longer; static conditions are moved
     beyond their range or gathered in a third of it. Where none separates the models well, the best is asked for with
@@ -66,11 +75,17 @@ def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
         return None
     problem = models[0].found.problem
     options = _in_time(models[0].found) if problem.in_time else _static(problem.recording)
-    tried = [Tried(option, found) for option in options if (found := _separations(pairs, option[1], noise)) is not None]
+    tried = []
+    for option in options:
+        if (found := _separations(pairs, option[1], noise)) is None:
+            continue
+        tried.append(Tried(option, found))
+        if min(found) >= PLENTY and _bearable(models, option[1], noise):
+            break
     hopeless: set[int] = set()
     while tried:
         told = [
-            k not in hopeless and max(one.distances[k] for one in tried) * DENSER**0.5 >= LEAST
+            k not in hopeless and max(one.distances[k] * _times(one.option[1])[-1] ** 0.5 for one in tried) >= LEAST
             for k in range(len(pairs))
         ]
         best = _best(tried, told)
@@ -79,8 +94,11 @@ def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
         if not _bearable(models, best.option[1], noise):
             tried = [one for one in tried if one is not best]
             continue
-        if best.nearest(told) < ENOUGH:
-            option = _denser(best.option, problem.recording)
+        plain = best.option
+        for times in _times(plain[1]):
+            if best.nearest(told) >= ENOUGH:
+                break
+            option = _denser(plain, problem.recording, times)
             denser = _separations(pairs, option[1], noise)
             best = best if denser is None else _best([best, Tried(option, denser)], told) or best
         if best.nearest(told) < LEAST:
@@ -92,19 +110,24 @@ def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
     return None
 
 
+def _times(recording: Recording) -> list[int]:
+    """How many times as many samples are asked for, in turn."""
+    return sorted({DENSER, max(DENSER, min(DENSEST, MANY // recording.n))})
+
+
 def _called(model: Model) -> str:
     """A model's terms, and where they act."""
     return " with ".join(model.names) + (f" where {model.where}" if model.where else "")
 
 
 def _bearable(models: Sequence[Model], recording: Recording, noise: Noise) -> bool:
-    """Whether the models' solutions in time settle there when steps are halved, and do not blow up."""
+    """Whether the models' solutions in time settle there when steps are halved a few times, and do not blow up."""
     for model in models:
         simulator = model.found.problem.simulator
         if isinstance(simulator, Trajectories):
             bound, values = _there(model.found, simulator, recording)
             try:
-                settled = bound.settled(values, SETTLED * _sd(recording, noise))
+                settled = bound.settled(values, SETTLED * _sd(recording, noise), halvings=HALVINGS)
             except TorchcalError:
                 return False
             if not bool(torch.isfinite(settled.outputs_of(values, settled.solve(values))).all()):
@@ -121,7 +144,7 @@ def _best(tried: Sequence[Tried], told: Sequence[bool]) -> Tried | None:
     """The experiment that tells the nearest of the pairs that can be told best; an earlier one where they are alike."""
     best: Tried | None = None
     for one in tried if any(told) else ():
-        if best is None or one.nearest(told) >= WORTH * best.nearest(told):
+        if best is None or one.worth(told) >= WORTH * best.worth(told):
             best = one
     return best
 
@@ -135,18 +158,19 @@ def _separations(pairs: Sequence[Pair], recording: Recording, noise: Noise) -> l
             y, jacobian = _predict(model.found, recording)
         except TorchcalError:
             return None
-        if not bool(torch.isfinite(y).all() and torch.isfinite(jacobian).all()):
+        if not bool(torch.isfinite(y).all() and torch.isfinite(jacobian).all()) or _explodes(model, y):
             return None
         predictions.append(y)
         slopes.append(jacobian)
-    sd = _sd(recording, noise)
+    white = _whitening(models[0].found.problem, recording, noise)
+    predictions, slopes = [white.vector(y) for y in predictions], [white(jacobian) for jacobian in slopes]
     distances = []
     for a, b in ((models.index(one), models.index(other)) for one, other in pairs):
-        gap = (predictions[a] - predictions[b]) / sd
+        gap = predictions[a] - predictions[b]
         # Either model may move its parameters, as far as the old data allow.
         rows, targets = [], []
         width = slopes[a].shape[1] + slopes[b].shape[1]
-        rows.append(torch.cat([slopes[a] / sd[:, None], -slopes[b] / sd[:, None]], dim=1))
+        rows.append(torch.cat([slopes[a], -slopes[b]], dim=1))
         targets.append(gap)
         first = 0
         for k in (a, b):
@@ -161,6 +185,20 @@ def _separations(pairs: Sequence[Pair], recording: Recording, noise: Noise) -> l
         solution = torch.linalg.lstsq(design / size, -target, driver="gelsd").solution
         distances.append(float((design / size @ solution + target).norm()))
     return distances
+
+
+def _explodes(model: Model, y: Tensor) -> bool:
+    """Whether any output goes far beyond all that was recorded: no model is right there."""
+    recording = model.found.problem.recording
+    for old, new in zip(recording.y.chunk(len(recording.outputs)), y.chunk(len(recording.outputs)), strict=True):
+        if float(new.abs().max()) > FAR * float(old[torch.isfinite(old)].abs().max()):
+            return True
+    return False
+
+
+def _whitening(problem: Problem, recording: Recording, noise: Noise) -> Whitening:
+    """Of noise at new conditions, as correlated from sample to sample as that of the recording."""
+    return Problem.of(problem.simulator, recording).whitening(_sd(recording, noise), noise.correlation)
 
 
 def _sd(recording: Recording, noise: Noise) -> Tensor:
@@ -272,18 +310,18 @@ def _blank(recording: Recording, x: dict[str, Tensor]) -> Recording:
     return Recording(x=x if isinstance(recording.x, dict) else x["x"], y=zeros)
 
 
-def _denser(option: Option, recording: Recording) -> Option:
+def _denser(option: Option, recording: Recording, times: int) -> Option:
     """The same with more samples: in time between the others, else of the same conditions."""
     description, _, conditions = option
     if "x" in conditions:
-        x = {name: values.repeat_interleave(DENSER) for name, values in conditions["x"].items()}
-        return f"{description}, each {DENSER} times", _blank(recording, x), {"x": x}
+        x = {name: values.repeat_interleave(times) for name, values in conditions["x"].items()}
+        return f"{description}, each {times} times", _blank(recording, x), {"x": x}
     run = _run(recording, conditions)
-    place = torch.arange((len(run.time) - 1) * DENSER + 1, dtype=torch.float64) / DENSER
+    place = torch.arange((len(run.time) - 1) * times + 1, dtype=torch.float64) / times
     left = place.long().clamp(max=len(run.time) - 2)
     time = run.time[left] + (place - left) * run.time.diff()[left]
     dense = {"time": time, "initial": conditions["initial"], "inputs": run.inputs_at(time)}
-    text = f"{description}, sampled {DENSER} times as densely"
+    text = f"{description}, sampled {times} times as densely"
     return text, Recording(runs=[_run(recording, dense)]), dense
 
 

@@ -155,7 +155,7 @@ class Trajectories(Simulator):
         denser = tuple(a * b for a, b in zip(old, factors, strict=True))
         return Trajectories(self.ode, self.recording, subdivide=self.subdivide, denser=denser)
 
-    def settled(self, values: Tensor, allowed: Tensor) -> "Trajectories":
+    def settled(self, values: Tensor, allowed: Tensor, *, halvings: int = HALVINGS) -> "Trajectories":
         """These trajectories, with steps so short that halving them changes no output by more than ``allowed``.
 
         A solution that is infinite with both steps counts as settled. Where the simulator has a ``max_step``, the
@@ -164,15 +164,16 @@ class Trajectories(Simulator):
         Args:
             values: Parameter values to look at, ``(H, d)``, physical units.
             allowed: Largest change of each output, ``(n_total,)``.
+            halvings: How often steps are halved at most.
 
         Raises:
-            SimulatorError: If it still changes after `HALVINGS` halvings.
+            SimulatorError: If it still changes after as many halvings.
         """
         if self.ode.max_step is not None:
             return self
         here = self
         y = here.outputs_of(values, here.solve(values))
-        for _ in range(HALVINGS):
+        for _ in range(halvings):
             finer = here.refined(2)
             z = finer.outputs_of(values, finer.solve(values))
             change = torch.where(torch.isfinite(y) | torch.isfinite(z), (z - y).abs(), torch.zeros_like(y))
@@ -182,7 +183,7 @@ class Trajectories(Simulator):
         share = float((change / allowed).nan_to_num(nan=math.inf).max())
         raise SimulatorError(
             f"Expected the solution to settle when time steps are halved. Got a change {share:.2g} times as large as "
-            f"allowed after {HALVINGS} times (a stiff or discontinuous model: smooth it, rescale it, replace a fast "
+            f"allowed after {halvings} times (a stiff or discontinuous model: smooth it, rescale it, replace a fast "
             "state by its equilibrium, or give max_step=)."
         )
 
