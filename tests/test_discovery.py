@@ -989,7 +989,6 @@ def costly(allowed=0, **parameters):
         ({"holdout": torch.ones(20)}, "bool array"),
         ({"holdout": torch.ones(20, dtype=torch.bool)}, "hold out less"),
         ({"holdout": torch.zeros(20, dtype=torch.bool)}, "hold out at least one"),
-        ({"fixed": {"a": 0.0, "b": 1.0}}, "fixed or dormant"),
         ({"holdout": 0.9}, "at least 4 data for each of 2 parameters"),
     ],
 )

@@ -44,6 +44,7 @@ class Candidate:
         shapes: Values of ``own`` on a grid of shapes, ``(G, len(own))``, amplitudes neutral.
         tangents: ∂y/∂amplitude at each shape, ``(G, n, len(amplitudes))``.
         begin: Base estimate with the terms at neutral, ``(P,)``.
+        bent: Starting values ``(S, P)`` of one whose tangents are the base's, but whose larger effects are not.
     """
 
     terms: tuple[Term, ...]
@@ -55,6 +56,7 @@ class Candidate:
     shapes: Tensor
     tangents: Tensor
     begin: Tensor
+    bent: Tensor | None = None
 
     @property
     def name(self) -> str:
@@ -73,17 +75,17 @@ class Candidate:
 
     @property
     def blind(self) -> bool:
-        """Whether the tangent vanishes at the neutral value, so that only a refit can tell."""
-        return not bool((self.tangents.abs() > 0).any())
+        """Whether the tangent at the neutral value vanishes or says nothing new, so that only a refit can tell."""
+        return self.bent is not None or not bool((self.tangents.abs() > 0).any())
 
 
 def base_columns(problem: Problem, fixed: Mapping[str, float] | None) -> tuple[list[int], dict[int, float]]:
-    """Places of the free parameters, and values of those held.
+    """Places of the free parameters, of which there may be none, and values of those held.
 
     Raises:
         EmbeddingError, DomainError: As `torchcal.simulators.free_parameters`.
     """
-    free, held = free_parameters(problem.parameters, fixed)
+    free, held = free_parameters(problem.parameters, fixed, least=0)
     place = {q.name: i for i, q in enumerate(problem.parameters)}
     return [place[q.name] for q in free], {place[name]: value for name, value in held.items()}
 

@@ -32,6 +32,7 @@ from torchcal.discovery.rounds import settle, with_all
 from torchcal.discovery.search import Search
 from torchcal.discovery.several import refit_several
 from torchcal.discovery.verdict import PLAINLY_WHITE, Decision, decide
+from torchcal.discovery.where import locate, missing_rate, needed_shifts
 from torchcal.display import NONE
 from torchcal.errors import ConvergenceWarning, DomainError, EmbeddingError, RecordingError
 from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories
@@ -73,8 +74,8 @@ def diagnose(
         recording: The data; of a `Recording(runs=...)` for an `ODESimulator`.
         candidates: Terms that might have been left out. A later term replaces an earlier one of the same name.
         holdout: None to hold out the last quarter (see `torchcal.discovery.verify.choose`), or blocks within where the
-            rest leaves the base too open to predict it; False for nothing, a share, or a bool array, True where held
-            out.
+            rest leaves the base, or what is named, too open to predict it; False for nothing, a share, or a bool array,
+            True where held out.
         fixed: Values of parameters that are not calibrated.
         confidence: 1 minus the probability of calling noise a mismatch: above 0.5, and at most 0.998, as a thousand
             simulated residuals tell no more.
@@ -139,7 +140,7 @@ def diagnose(
         with search.stop.listening():
             tick("calibrate the base")
             search.calibrate_base()
-            if holdout is None and mask is not None and _beyond_prediction(search, mask):
+            if holdout is None and mask is not None and _beyond_prediction(search, search.base, mask):
                 mask = verify.within(recording)
             search, detected = settle(search, problem, confidence)
             suspect: tuple[str, ...] = ()
@@ -153,6 +154,10 @@ def diagnose(
             if detected and terms and not search.stop.is_set():
                 refit_several(search)
             decision = decide(search, detected, mask)
+            best = decision.best
+            if holdout is None and mask is not None and best and _beyond_prediction(search, best.found, mask):
+                mask = verify.within(recording)
+                decision = decide(search, detected, mask)
             interrupted = _interruption(search)
             if interrupted:
                 _hold_back(search, decision)
@@ -224,9 +229,9 @@ def _contains(simulator: Simulator, term: Term) -> bool:
     return set(term.frees) <= freed
 
 
-def _beyond_prediction(search: Search, mask: Tensor) -> bool:
-    """Whether the rest of the data leaves the base so open that its predictions of the held-out ones mean nothing."""
-    apart = search.held_out(search.base, mask)
+def _beyond_prediction(search: Search, found: Fitted, mask: Tensor) -> bool:
+    """Whether the rest of the data leaves a model so open that its predictions of the held-out ones mean nothing."""
+    apart = search.held_out(found, mask)
     seen = mask & search.problem.keep
     if apart is None or not bool(seen.any()):
         return False
@@ -298,7 +303,9 @@ def _result(
         verdict=decision.verdict,
         terms=_in_order(search, best) if best else [],
         tied=decision.tied,
-        where=explain.locate(search, shown) if decision.verdict != "consistent" else Table([], ("kind", "target")),
+        where=Table([], ("kind", "target"))
+        if decision.verdict == "consistent"
+        else locate(search, shown, named=best is not None),
         ranking=ranking(search, decision, mask),
         detection_limit=limits(
             search, 1.0 - confidence, POWER, [term for term in terms if _contains(simulator, term)]
@@ -315,8 +322,8 @@ def _result(
             embed_each(search.base, search.noise, _embeddable(search)),
             ("parameter", "sd", "output_sd", "log_likelihood"),
         ),
-        shifts=explain.needed_shifts(search) if decision.verdict != "consistent" else [],
-        missing=explain.missing_rate(search) if decision.verdict != "consistent" else None,
+        shifts=needed_shifts(search) if decision.verdict != "consistent" else [],
+        missing=missing_rate(search) if decision.verdict != "consistent" else None,
         experiment=propose(decision.tied_models, search.noise) if decision.tied_models else None,
         equations=explain.formulas(best) if best else [],
         identifiability=explain.identifiability(search, best)

@@ -1,16 +1,20 @@
 """Why the best explanation of a recording may be no name, however probable it is."""
 
+import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
+from torchcal.discovery.candidates import spread_values
+from torchcal.discovery.explain import misfit_size
 from torchcal.discovery.local import force, is_window
 from torchcal.discovery.model import Model
 from torchcal.discovery.own_noise import beside
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.search import Search
+from torchcal.terms import Term, extend
 
 __all__ = ["distinct", "doubt", "left_open"]
 
@@ -23,18 +27,25 @@ EVEN, MANY = 0.55, 30
 ALONG = 3.3
 #: Distance of a term's amplitudes from neutral, in their joint sd, up to which the data leave them open.
 OPEN = 0.1
-#: The same of a term that acts in a window, where most terms can do what a few data want.
+#: The same of a term that acts in a window, where most terms can do what a few data want, or of data without noise,
+#: where nothing else weighs it.
 OPEN_IN_WINDOW = 2.0
 #: Distinct values of its driver at which a window must be open, and at which closed: its height, end and slope can be
 #: drawn through fewer, whatever they are. And the share of a term that may be missing, or left.
 LEVELS, NEARLY = 3, 0.2
+#: Noise sd by which an instrument's reading must fall while the true value rises to be no instrument's: a hard limit is
+#: one. And the least sd, in the data's spread.
+FALL, ROUNDING = 2.0, 1e-3
+#: Share of the range of the true values by which it is looked at beyond them.
+BEYOND = 0.2
 #: Share of the largest effect of the base's parameters below which a direction of them moves no datum.
 UNSEEN = 1e-7
 
 
 def doubt(search: Search, model: Model) -> str:
     """Why a model is no name, however probable, in a sentence; empty if it may be one."""
-    return left_open(search, model) or _noise_or_physics(search, model)
+    found = left_open(search, model) or _falling(search, model)
+    return found or ("" if search.exact else _noise_or_physics(search, model))
 
 
 def left_open(search: Search, model: Model) -> str:
@@ -44,7 +55,9 @@ def left_open(search: Search, model: Model) -> str:
         own = {*(term.full(q.name) for q in term.parameters), *term.frees}
         shapes = [i for i in model.candidate.own if names[i] in own and not is_window(names[i])]
         places = [i for i in model.candidate.amplitudes if names[i] in own]
-        if places and _distance(model, places, shapes) <= (OPEN if model.window is None else OPEN_IN_WINDOW):
+        least = OPEN if model.window is None and not search.exact else OPEN_IN_WINDOW
+        # Without noise the misfit is what an amplitude is uncertain by.
+        if places and _distance(model, places, shapes, misfit_size(model.found) if search.exact else 1.0) <= least:
             return "The data leave the size of what it adds open: more conditions would tell."
     if model.window is not None and _levels(model) < LEVELS:
         return (
@@ -70,15 +83,16 @@ def _levels(model: Model) -> int:
     return min(len(driver[there].unique()) for there in (share >= 1 - NEARLY, share <= NEARLY))
 
 
-def _distance(model: Model, places: Sequence[int], shapes: Sequence[int]) -> float:
-    """Of a term's amplitudes from neutral, in their joint sd with its shapes held, but not the ends of its window.
+def _distance(model: Model, places: Sequence[int], shapes: Sequence[int], size: float) -> float:
+    """Of a term's amplitudes from neutral, in their joint sd with its shapes held, but not the ends of its window; that
+    of the noise is ``size`` times what the fit was weighed with.
 
     A product may be determined where neither of its factors is; and what the base leaves open of its own parameters,
     the scale of a state that is not seen, say, is no matter of the term.
     """
     found, candidate = model.found, model.candidate
     away = found.values[list(places)] - candidate.neutral[[candidate.own.index(i) for i in places]]
-    columns = found.whitening(found.jacobian)
+    columns = found.whitening(found.jacobian) / max(size, 1e-300)
     mine = [found.free.index(i) for i in places]
     kept = [k for k, i in enumerate(found.free) if i not in {*places, *shapes}]
     moved = columns[:, mine] @ away
@@ -89,7 +103,7 @@ def _distance(model: Model, places: Sequence[int], shapes: Sequence[int]) -> flo
     values = found.values.clone()
     values[candidate.own] = candidate.neutral
     jacobian = found.problem.evaluate(values[None], [found.free[k] for k in base])[1][0]
-    slope = found.whitening(jacobian)
+    slope = found.whitening(jacobian) / max(size, 1e-300)
     if not bool(slope.isfinite().all()):
         return left
     unit = slope.norm(dim=0)
@@ -105,6 +119,87 @@ def _beside(columns: Tensor, moved: Tensor) -> float:
     unit = columns / columns.norm(dim=0).clamp_min(1e-300)
     left = moved - unit @ torch.linalg.lstsq(unit, moved[:, None], rcond=1e-10, driver="gelsd").solution[:, 0]
     return float(left.norm())
+
+
+def _falling(search: Search, model: Model) -> str:
+    """Why a model's instruments are none: the reading of one falls where the true value rises."""
+    problem = model.found.problem
+    instruments = [term for term in model.candidate.terms if term.is_sensor and not term.states]
+    if not instruments:
+        return ""
+    others = [term for term in model.candidate.terms if term not in instruments]
+    bare = search.problem.with_simulator(extend(search.problem.simulator, others))
+    bare = dataclasses.replace(bare, keep=problem.keep)
+    values = spread_values(bare, [q.name for q in problem.parameters], model.found.values)
+    true = bare.evaluate(values[None], [], bare.guess(model.found.warm, 1))[0][0]
+    drivers = problem.drivers_at_data(model.found.values[None], model.found.warm)
+    p = {name: values.new_tensor(value) for name, value in model.found.by_name.items()}
+    sd = _noise_at_data(search, model)
+    for term in instruments:
+        for name, function in term.outputs.items():
+            number = problem.recording.outputs.index(name) if name in problem.recording.outputs else 0
+            here = (problem.output_of == number).nonzero()[:, 0]
+            reading = _reading(problem, term, function, {d: along[here] for d, along in drivers.items()}, p)
+            if reading is None:
+                continue
+            y = _range(true[here])
+            slope = _slope(reading, y)
+            fall = -(y.diff() * 0.5 * (slope[:-1] + slope[1:]).clamp_max(0)).nansum()
+            if float(fall) > FALL * float(sd[here].median()):
+                return (
+                    f"By it the reading of {name} falls where the true value rises, at the recorded values or just "
+                    "beyond them, as that of no instrument does."
+                )
+            true[here] = reading(true[here])
+    return ""
+
+
+def _noise_at_data(search: Search, model: Model) -> Tensor:
+    """Sd of the noise, or of what a model leaves where there is none, ``(n,)``."""
+    problem = model.found.problem
+    if not search.exact:
+        return beside(search, model).sd[problem.index]
+    left = model.found.residual.square().mean().sqrt()
+    return torch.maximum(left, ROUNDING * problem.recording.spread[problem.index])
+
+
+def _reading(
+    problem: Problem, term: Term, function: Callable[..., Tensor], drivers: dict[str, Tensor], p: dict[str, Tensor]
+) -> Callable[[Tensor], Tensor] | None:
+    """What an instrument shows of true values ``(m,)``; None where that depends on anything but these."""
+
+    def reading(y: Tensor, by: int = 0) -> Tensor:
+        at = {name: along.roll(by) for name, along in drivers.items()}
+        x = at if isinstance(problem.recording.x, dict) else next(iter(at.values()))
+        shown = function(at["t"], at, term.own(p), at, y) if problem.in_time else function(x, term.own(p), y)
+        return shown + 0 * y
+
+    y = torch.linspace(1.0, 2.0, len(next(iter(drivers.values()))), dtype=torch.float64)
+    try:
+        same = torch.equal(reading(y), reading(y, len(y) // 2))
+    except Exception:  # the simulator calls it otherwise, and tells what is wrong
+        return None
+    return reading if same else None
+
+
+def _range(true: Tensor) -> Tensor:
+    """As many values from somewhat below the true ones ``(m,)`` to somewhat above, but not beyond 0 if all are on one
+    side of it: a fit likes the turning point of a response, where it bends most, and stops just short of it."""
+    low, high = true.min(), true.max()
+    beyond = BEYOND * (high - low)
+    return torch.linspace(
+        float((low - beyond).clamp_min(0) if low >= 0 else low - beyond),
+        float((high + beyond).clamp_max(0) if high <= 0 else high + beyond),
+        len(true),
+        dtype=true.dtype,
+    )
+
+
+def _slope(reading: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
+    """Of what is shown by what is true, ``(m,)``; 0 where the one does not follow from the other."""
+    with torch.enable_grad():
+        leaf = y.detach().clone().requires_grad_(True)
+        return torch.autograd.grad(reading(leaf).sum(), leaf)[0].detach()
 
 
 def _noise_or_physics(search: Search, model: Model) -> str:

@@ -1,4 +1,4 @@
-"""From the search to the records of a result: where, how much, what would tell, and what cannot be told."""
+"""From the search to the records of a result: how much, what was bent, and what cannot be told."""
 
 import math
 from collections.abc import Sequence
@@ -6,29 +6,25 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchcal.discovery.channels import Channel
 from torchcal.discovery.fitting import Fitted, fit, starts
 from torchcal.discovery.local import ENDS, WIDTH_OF_EDGE, is_window, region_text
 from torchcal.discovery.model import Model
 from torchcal.discovery.noise import estimate
-from torchcal.discovery.records import Estimate, Fit, Location, MissingRate, NeededShift, Table
+from torchcal.discovery.records import Estimate, Fit
 from torchcal.discovery.screen import Window
 from torchcal.discovery.search import Search
-from torchcal.discovery.structure import Place, Structure
+from torchcal.discovery.structure import Structure
 
 __all__ = [
     "estimates",
     "fit_record",
     "identifiability",
-    "locate",
-    "missing_rate",
-    "needed_shifts",
+    "misfit_size",
     "other_minima",
+    "removed",
+    "surpassed",
     "symptoms",
 ]
-
-#: Share of an output's evidence that counts beside an equation's.
-OUTPUT_SHARE = 0.9
 
 #: Gaps between data that an end of a window may lie in, where its edge is a step.
 GAPS = 200
@@ -36,11 +32,10 @@ GAPS = 200
 MIXED = 0.02
 #: Smallest squared effect of a direction of unit size, each parameter's effect being 1, that is one.
 UNSEEN = 1e-6
+#: Share of an estimate from which on its sd is so large that it may be told in a combination only.
+LOOSE = 0.1
 #: Log evidence between two candidates that are told apart.
 APART = 5.0
-
-#: A span begins where the estimated change exceeds this share of its largest magnitude.
-SPAN_LEVEL = 0.3
 #: Starts from which what is named is fitted again, and steps; a minimum that is higher by less than `RIVAL` in χ² and
 #: more than `ELSEWHERE` sd away is another one.
 STARTS, AGAIN, RIVAL, ELSEWHERE = 4, 60, 4.0, 4.0
@@ -54,9 +49,7 @@ def estimates(found: Fitted, places: Sequence[int], window: Window | None = None
     An sd beyond what the bounds allow, or far beyond the estimate, says that the data do not determine it. Where the
     edge of a static window is a step, its end is known by the gaps between data that it may lie in.
     """
-    sd = found.sd()
-    if isinstance(found.problem.recording.noise, str):
-        sd = sd * misfit_size(found)
+    sd = _sd(found)
     bound = {i for i, at in zip(found.free, found.at_bound.tolist(), strict=True) if at}
     result = []
     for i in places:
@@ -68,8 +61,14 @@ def estimates(found: Fitted, places: Sequence[int], window: Window | None = None
         allowed = math.inf if q.low is None or q.high is None else q.high - q.low
         if spread > min(1e5 * max(abs(value), 1e-300), allowed):
             spread = math.inf
-        result.append(Estimate(q.name, value, spread, q.unit, i in bound))
+        at_bound = i in bound or (i in found.free and value in (q.low, q.high) and not is_window(q.name))
+        result.append(Estimate(q.name, value, spread, q.unit, at_bound))
     return tuple(result)
+
+
+def _sd(found: Fitted) -> Tensor:
+    """Standard deviations of all parameters ``(P,)``. Without noise the misfit takes its place."""
+    return found.sd() * (misfit_size(found) if isinstance(found.problem.recording.noise, str) else 1.0)
 
 
 def _stepped_sd(found: Fitted, i: int, driver: str, spread: float) -> float:
@@ -114,62 +113,6 @@ def fit_record(
     )
 
 
-def spans(channel: Channel, driver: str, profile: Tensor) -> tuple[tuple[float, float], ...]:
-    """Ranges of the driver where the change is large."""
-    values = channel.drivers[driver]
-    order = values.argsort(stable=True)
-    along, size = values[order], profile[order].abs()
-    high = size >= SPAN_LEVEL * float(size.max())
-    found: list[tuple[float, float]] = []
-    start: float | None = None
-    last = 0.0
-    for value, inside in zip(along.tolist(), high.tolist(), strict=True):
-        if inside and start is None:
-            start = value
-        if not inside and start is not None:
-            found.append((start, last))
-            start = None
-        last = value
-    if start is not None:
-        found.append((start, last))
-    return tuple(found[:6])
-
-
-def locate(search: Search, best: Model | None) -> Table[Location]:
-    """Where the mismatch sits; a named local term says it best."""
-    rows = []
-    if best is not None and best.window is not None:
-        w = best.window
-        drivers = search.drivers()[w.driver]
-        low = w.low if math.isfinite(w.low) else float(drivers.min())
-        high = w.high if math.isfinite(w.high) else float(drivers.max())
-        kind, target = _acts_on(best)
-        rows.append(Location(kind, target, w.driver, ((low, high),), removed(search, best), best.log_evidence))
-    seen = set()
-    sensor = best is not None and _acts_on(best)[0] == "output"  # then it has been shown to be the output
-    for place in search.structure.places if sensor else by_plausibility(search):
-        key = (place.channel.kind, place.channel.target)
-        if place.evidence < 2.0 or key in seen:
-            continue
-        seen.add(key)
-        rows.append(
-            Location(place.channel.kind, place.channel.target, place.driver,
-                     spans(place.channel, place.driver, place.profile), place.share, place.evidence)
-        )  # fmt: skip
-        if len(rows) >= 8:
-            break
-    return Table(rows, ("kind", "target", "driver", "spans", "share", "evidence"))
-
-
-def _acts_on(model: Model) -> tuple[str, str]:
-    term = model.candidate.terms[0]
-    if term.rates:
-        return "equation", next(iter(term.rates))
-    if term.outputs:
-        return "output", next(iter(term.outputs))
-    return "parameter", next(iter([*term.shifts, *term.frees]))
-
-
 def removed(search: Search, model: Model) -> float:
     """Share of the squared misfit beyond noise that a model removes."""
     freedom = search.problem.n - len(search.base.free)
@@ -186,85 +129,26 @@ def surpassed(search: Search, model: Model, larger: Model) -> float:
     return min(max((model.found.chi2 - larger.found.chi2) / whole, 0.0), 1.0) if whole > 0 else 0.0
 
 
-def needed_shifts(search: Search) -> list[NeededShift]:
-    """The shift of each parameter against the driver that it varies with most."""
-    rows: dict[str, Place] = {}
-    for place in search.structure.places:
-        if place.channel.kind == "parameter" and place.channel.target not in rows and place.evidence > 0:
-            rows[place.channel.target] = place
-    result = []
-    for name, place in rows.items():
-        values = place.channel.drivers[place.driver]
-        order = values.argsort(stable=True)
-        pick = order[torch.linspace(0, len(order) - 1, min(60, len(order))).round().long().unique()]
-        a, b = values[pick], place.profile[pick]
-        ranks = [v.argsort().argsort().double() for v in (a, b)]
-        correlation = float(torch.corrcoef(torch.stack(ranks))[0, 1]) if len(pick) > 2 else 0.0
-        result.append(NeededShift(name, place.channel.unit, place.driver, a, b, place.sd[pick], correlation))
-    return result[:6]
-
-
-def by_plausibility(search: Search) -> list[Place]:
-    """Places by falling evidence; in time an output's must be clearly larger than an equation's.
-
-    A change of an output can copy whatever any equation does to that output, and instruments err in simple ways.
-    """
-    def weight(place: Place) -> float:
-        return place.evidence * (OUTPUT_SHARE if place.channel.kind == "output" and search.problem.in_time else 1.0)
-
-    return sorted(search.structure.places, key=lambda place: -weight(place))
-
-
-def missing_rate(search: Search) -> MissingRate | None:
-    """The best smooth unknown change of one equation or output, or of one parameter of a static simulator.
-
-    A parameter that changes in time and acts in one equation is a missing rate of that equation, in one run: what it
-    does to the rate depends on the states too, which differ between runs at the same time.
-    """
-    kinds = search.problem.kinds
-    for place in by_plausibility(search):
-        channel = place.channel
-        if place.evidence <= 0:
-            return None
-        kind, target, unit, size = channel.kind, channel.target, channel.unit, torch.ones_like(place.profile)
-        if kind not in kinds:
-            if place.driver != "t" or len(channel.rates) != 1 or len(search.problem.recording.runs or ()) > 1:
-                continue
-            kind = "equation"
-            target, size = next(iter(channel.rates.items()))
-            unit = next((c.unit for c in search.structure.channels if (c.kind, c.target) == (kind, target)), None)
-        values, rate, sd = channel.drivers[place.driver], place.profile * size, place.sd * size.abs()
-        order = values.argsort(stable=True)
-        return MissingRate(
-            kind, target, place.driver, values[order], rate[order], sd[order], unit, channel.time, rate
-        )
-    return None
-
-
 def symptoms(search: Search, best: Model | None) -> list[str]:
     """Calibrated values that give the mismatch away."""
-    rows = []
-    sd = search.base.sd() * (misfit_size(search.base) if search.exact else 1.0)
-    for i, at in zip(search.base.free, search.base.at_bound.tolist(), strict=True):
-        q = search.base.problem.parameters[i]
-        if at:
-            rows.append(
-                f"{q.name} runs to its bound, {float(search.base.values[i]):.4g}{_unit(q.unit)}, in the calibrated base"
-            )
+    base, then = search.base, {}
     if best is not None:
-        places = {q.name: k for k, q in enumerate(best.found.problem.parameters)}
-        then = {e.name: e for e in estimates(best.found, list(places.values()))}
-        for i in search.base.free:
-            q = search.base.problem.parameters[i]
-            a, b = float(search.base.values[i]), then[q.name].value
-            moved = abs(b - a) / max(float(sd[i]), 1e-300)
-            if moved > BENT and abs(b - a) > 0.001 * abs(a):
-                rows.append(
-                    f"{q.name} was bent: {a:.4g} ± {float(sd[i]):.2g}{_unit(q.unit)} in the calibrated base, "
-                    f"{then[q.name].amount} with {' and '.join(best.names)}"
-                )
+        then = {e.name: e for e in estimates(best.found, range(len(best.found.values)))}
+    runs, bent = [], []
+    for e, at, sd in zip(estimates(base, base.free), base.at_bound.tolist(), _sd(base)[base.free], strict=True):
+        moved = 0.0 if best is None else abs(then[e.name].value - e.value)
+        is_bent = moved > max(BENT * max(float(sd), 1e-300), 0.001 * abs(e.value))
+        with_terms = f"{then[e.name].amount} with {' and '.join(best.names)}" if best is not None else ""
+        if at:
+            text = f"{e.name} runs to its bound, {e.value:.4g}{_unit(e.unit)}, in the calibrated base"
+            runs.append(f"{text}; it is {with_terms}" if is_bent else text)
+        elif is_bent:
+            bent.append(f"{e.name} was bent: {e.amount} in the calibrated base, {with_terms}")
+    rows = runs + bent
     if search.noise.doubted > 1:
-        left = search.base if best is None else best.found
+        # A misfit that is smooth on coarse spacing passes for fast: what leaves less tells more of the noise.
+        leader = best or search.physical_leader
+        left = base if leader is None or leader.found.chi2 > base.chi2 else leader.found
         doubted = estimate(left.problem, left.residual, left.jacobian, search.problem.recording.noise).doubted
         if doubted > 1:
             rows.append(f"the residual's fastest part is {doubted:.1f} times the noise sd that was given")
@@ -277,9 +161,15 @@ def _unit(unit: str | None) -> str:
 
 def identifiability(search: Search, best: Model | None) -> list[str]:
     """Parameters and candidates that these data cannot tell."""
-    rows = _untold(search.base)
+    unseen, mixed = _untold(search.base)
     if best is not None:
-        rows += [row for row in _untold(best.found) if row not in rows]
+        more = _untold(best.found)
+        unseen, mixed = unseen + more[0], mixed + more[1]
+    rows = [f"{name} has no effect on these data" for name in dict.fromkeys(unseen)]
+    rows += [
+        f"a common change of {', '.join(group)} moves no datum: only combinations can be told"
+        for group in _merged(mixed)
+    ]
     screening = search.screening
     for i, candidate in enumerate(search.candidates):
         if screening.best[i] < 0 and not candidate.blind:
@@ -293,24 +183,37 @@ def identifiability(search: Search, best: Model | None) -> list[str]:
     return rows[:12]
 
 
-def _untold(found: Fitted) -> list[str]:
-    """Parameters of a fit, and combinations of them, that move no datum."""
-    told = [found.problem.parameters[i].name for i in found.free]
-    mine = [k for k, name in enumerate(told) if not is_window(name)]  # between two data an end of a window moves none
-    jacobian = found.whitening(found.jacobian[:, mine])
+def _untold(found: Fitted) -> tuple[list[str], list[list[str]]]:
+    """Parameters of a fit that move no datum, and combinations of others that do not and leave two of them open."""
+    names = [found.problem.parameters[i].name for i in found.free]
+    jacobian = found.whitening(found.jacobian)
     size = jacobian.norm(dim=0)
-    names = [told[k] for k in mine]
-    rows = [f"{name} has no effect on these data" for name, norm in zip(names, size.tolist(), strict=True) if norm == 0]
-    unit = jacobian[:, size > 0] / size[size > 0]
-    kept = [name for name, norm in zip(names, size.tolist(), strict=True) if norm > 0]
-    if unit.shape[1] > 1:
-        values, vectors = torch.linalg.eigh(unit.T @ unit)
-        for k in (values < UNSEEN).nonzero()[:, 0].tolist():
-            parts = vectors[:, k].abs()
-            mixed = [kept[j] for j in range(len(kept)) if float(parts[j]) > MIXED * float(parts.max())]
-            if len(mixed) > 1:
-                rows.append(f"a common change of {', '.join(mixed)} moves no datum: only combinations can be told")
-    return rows
+    # Between two data an end of a window moves none.
+    mine = [k for k, name in enumerate(names) if not is_window(name)]
+    unseen = [names[k] for k in mine if float(size[k]) == 0]
+    kept = [k for k in mine if float(size[k]) > 0]
+    if len(kept) < 2:
+        return unseen, []
+    loose = (~(_sd(found) <= LOOSE * found.values.abs()))[found.free]  # an sd of infinity, or none, is loose too
+    unit = jacobian[:, kept] / size[kept]
+    values, vectors = torch.linalg.eigh(unit.T @ unit)
+    groups = []
+    for k in (values < UNSEEN).nonzero()[:, 0].tolist():
+        parts = vectors[:, k].abs()
+        members = [kept[j] for j in range(len(kept)) if float(parts[j]) > MIXED * float(parts.max())]
+        if sum(bool(loose[j]) for j in members) > 1:
+            groups.append([names[j] for j in members])
+    return unseen, groups
+
+
+def _merged(groups: Sequence[list[str]]) -> list[list[str]]:
+    """Groups of names, those that share one made one."""
+    merged: list[list[str]] = []
+    for group in groups:
+        apart = [other for other in merged if not set(other) & set(group)]
+        together = [name for other in merged if set(other) & set(group) for name in other]
+        merged = [*apart, list(dict.fromkeys([*together, *group]))]
+    return merged
 
 
 def other_minima(search: Search, model: Model) -> list[str]:

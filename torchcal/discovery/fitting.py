@@ -68,7 +68,7 @@ class Fitted:
         scale = j.square().sum(0).sqrt()
         scale = torch.where(scale > 0, scale, torch.ones_like(scale))
         values, vectors = torch.linalg.eigh((j / scale).T @ (j / scale))
-        inverse = 1.0 / values.clamp_min(1e-13 * max(float(values.max()), 1e-300))
+        inverse = 1.0 / values.clamp_min(max([1e-300, *(1e-13 * values).tolist()]))
         return (vectors * inverse) @ vectors.T / (scale[:, None] * scale)
 
     @property

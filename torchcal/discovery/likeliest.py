@@ -153,7 +153,7 @@ def settled(found: Fitted, noise: Noise, tangents: Tangents) -> tuple[Noise, flo
 def with_unknown(
     model: Fitted, given: Tensor | str | None, tangents: Tangents, unit: Tensor
 ) -> tuple[Noise, float]:
-    """The likeliest noise beside a model and something smooth and unknown, and the log evidence of the two.
+    """The likeliest noise beside a model and something unknown, smooth or a wave, and the log evidence of the two.
 
     Args:
         model: The model's fit.
@@ -161,33 +161,43 @@ def with_unknown(
         tangents: The base's.
         unit: Of unknown noise, as in `Noise`.
     """
-    noise = estimate(model.problem, model.residual, model.jacobian, given, unit)
     problem = model.problem
-    looks = responses_of(problem, [c for c in channels(problem, model) if c.kind in problem.kinds])
-    found: dict[_Places, tuple[Noise, float]] = {}
+    available = [c for c in channels(problem, model) if c.kind in problem.kinds]
+    looks = responses_of(problem, available)
 
-    def evidence(at: _Places) -> float:
-        if at not in found:
-            tried = _at(model, noise, *at)
-            residual = Residual(weighed(model, tried.whitening(problem)), tried, draws=0)
-            seen = evidences(residual, looks)
-            gain = max(seen) - math.log(len(seen)) if seen else -math.inf
-            found[at] = tried, _log_density(residual.found.whitening, residual.e, tried, tangents, problem) + gain
-        return found[at][1]
+    def likeliest(noise: Noise) -> tuple[Noise, float, Tensor | None]:
+        """Beside what is unknown, among the coefficients and sizes near an estimate."""
+        found: dict[_Places, tuple[Noise, float, Tensor | None]] = {}
 
-    factors = range(len(SMALLER) if noise.open and problem.order is None else 1)
-    places = tuple(int((GRID - rho).abs().argmin()) for rho in noise.correlation)
-    best = places, (0,) * len(places)
-    evidence(best)
-    for _ in range(ROUNDS if noise.source != "replicates" else 0):
-        before = best
-        for k, n in enumerate(torch.bincount(problem.output_of, minlength=len(places)).tolist()):
-            rhos = {best[0][k], *TRIED} if n >= LEAST and problem.follows else {best[0][k]}
-            wanted = itertools.product(rhos, factors if n else (0,))
-            best = max((_with(best, k, *one) for one in wanted), key=evidence)
-        if best == before:
-            break
-    return found[best]
+        def evidence(at: _Places) -> float:
+            if at not in found:
+                tried = _at(model, noise, *at)
+                residual = Residual(weighed(model, tried.whitening(problem)), tried, draws=0)
+                seen, wave = evidences(residual, looks, available)
+                gain = max(seen) - math.log(len(seen)) if seen else -math.inf
+                like = _log_density(residual.found.whitening, residual.e, tried, tangents, problem)
+                found[at] = tried, like + gain, wave
+            return found[at][1]
+
+        factors = range(len(SMALLER) if noise.open and problem.order is None else 1)
+        places = tuple(int((GRID - rho).abs().argmin()) for rho in noise.correlation)
+        best = places, (0,) * len(places)
+        evidence(best)
+        for _ in range(ROUNDS if noise.source != "replicates" else 0):
+            before = best
+            for k, n in enumerate(torch.bincount(problem.output_of, minlength=len(places)).tolist()):
+                rhos = {best[0][k], *TRIED} if n >= LEAST and problem.follows else {best[0][k]}
+                wanted = itertools.product(rhos, factors if n else (0,))
+                best = max((_with(best, k, *one) for one in wanted), key=evidence)
+            if best == before:
+                break
+        return found[best]
+
+    noise, evidence, wave = likeliest(estimate(problem, model.residual, model.jacobian, given, unit))
+    if wave is not None:  # no noise is estimated from a wave
+        other = likeliest(estimate(problem, model.residual - wave, model.jacobian, given, unit))
+        noise, evidence = max(((noise, evidence), other[:2]), key=lambda one: one[1])
+    return noise, evidence
 
 
 def _with(at: _Places, k: int, rho: int, factor: int) -> _Places:

@@ -12,11 +12,13 @@ from torchcal.display import DECADES
 from torchcal.simulators import Parameter
 from torchcal.terms import Term
 
-__all__ = ["EDGE", "ENDS", "WIDTHS", "Span", "beyond", "force", "is_window", "localised", "region_text"]
+__all__ = ["EDGE", "ENDS", "SHORT", "WIDTHS", "Span", "beyond", "force", "is_window", "localised", "region_text"]
 
 #: Width of a window's edges, as a share of the driver's range: wide enough for a fit to move them; and the limits
 #: between which it is fitted, from nearly a step.
 EDGE, WIDTHS = 0.02, (0.004, 0.1)
+#: Share of the driver's range below which a window is none: a kick at one moment is another kind of physics.
+SHORT = 0.02
 #: The narrowest of a static recording, whose ends are sought between its data: no time step has to meet them.
 STEP = 1e-4
 
@@ -49,6 +51,11 @@ class Span:
     def size(self) -> float:
         """Of the range, on the scale."""
         return math.log(self.high / self.low) if self.log else self.high - self.low
+
+    def share(self, low: float, high: float) -> float:
+        """Of the range, that lies between two values of the driver; negative where nothing does."""
+        low, high = max(low, self.low), min(high, self.high)
+        return (math.log(high / low) if self.log else high - low) / self.size
 
     def distance(self, d: Any, end: Any) -> Any:
         """From an end of a window to a value of the driver, on the scale."""

@@ -1,6 +1,7 @@
 """Data that are no noise of the rest: single samples far from their neighbours, or from a model that explains these."""
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -15,8 +16,12 @@ SPIKE = 4.5
 #: Robust sd from which on a residual of a model that explains the rest is an outlier, where its neighbours' are not
 #: half as large that way.
 LONE = 4.5
-#: By how many times the bend behind it a first or last sample must be off to be an outlier.
-BENT = 10.0
+#: How many times as far as the bend of those beside it would take it a sample must be off to be an outlier.
+BENT = 3.0
+#: Distance, in that of the farthest neighbour, below which two neighbours tell no more of a bend than one.
+APART = 0.1
+#: How many times as large the product of the distances to both neighbours must be in places for a table to be uneven.
+UNEVEN = 2.0
 #: Share of supposed outliers with another one as nearest neighbour above which they are no outliers.
 TOGETHER = 0.4
 #: Probability of as many of them at one value of a condition by chance, below which they are no outliers.
@@ -41,13 +46,11 @@ def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
             high, far = (_high(values, sd is not None) for values in (left, left / scale))
             found[places] = high & far if not _clustered(problem, places, high) else False
             continue
-        off = _off_neighbours(r)
-        bend = r[1:-1] - 0.5 * (r[:-2] + r[2:])  # a curve leaves its neighbours' range nowhere, but bends everywhere
-        robust = math.sqrt(1.3 / 1.5) * 1.4826 * float(bend.abs().median())
-        if sd is not None:
-            robust = max(robust, math.sqrt(1.3))  # what white noise gives
-        if robust > 0:
-            found[places] = _alone(r, _with_ends(r, off, SPIKE * robust), SPIKE * robust)
+        at = problem.order[problem.condition_of[places]].double()
+        # A curve leaves its neighbours' range nowhere, but bends everywhere.
+        least = SPIKE * math.sqrt(1.3) * _bends(at, r).clamp_min(float(sd is not None))  # 1 is what white noise gives
+        if bool((least > 0).all()):
+            found[places] = _alone(at, r, _with_ends(at, r, _off_neighbours(r), least), least)
     return found
 
 
@@ -91,28 +94,68 @@ def _off_neighbours(r: Tensor) -> Tensor:
     return off
 
 
-def _with_ends(r: Tensor, off: Tensor, least: float) -> Tensor:
+def _bends(at: Tensor, r: Tensor) -> Tensor:
+    """Usual distance of samples ``(m,)`` from the lines through their neighbours, in that of white noise of unit size.
+
+    White noise bends alike whatever the spacing; a curve bends with the product of the distances to both neighbours. By
+    how much more they bend where that is large is seen from the thirds where it is smallest and largest.
+    """
+    before, behind = at.diff()[:-1], at.diff()[1:]
+    span = before + behind
+    share = torch.where(span > 0, before / span.clamp_min(1e-300), torch.full_like(span, 0.5))
+    line = r[:-2] + share * (r[2:] - r[:-2])
+    size = ((r[1:-1] - line).square() / (1 + share.square() + (1 - share).square())).sqrt()
+    reach = before * behind
+    third = len(size) // 3
+    order = reach.argsort()
+    near, far = (float(reach[part].median().clamp_min(1e-300)) for part in (order[:third], order[-third:]))
+    usual = size.median()
+    power = 0.0
+    if far > UNEVEN * near and float(usual) > 0:
+        less, more = (float(size[part].median().clamp_min(1e-300)) for part in (order[:third], order[-third:]))
+        power = min(max(math.log(more / less) / math.log(far / near), 0.0), 1.0)
+    grown = reach.clamp_min(1e-300) ** power
+    found = 1.4826 * torch.maximum(usual, (size / grown).median() * grown)
+    return torch.cat([found[:1], found, found[-1:]])
+
+
+def _with_ends(at: Tensor, r: Tensor, off: Tensor, least: Tensor) -> Tensor:
     """The same with both ends measured from a line through the next four.
 
     Scaled to vary as much as the others do by noise alone; 0 where one of the four is off itself, by more than
-    ``least``, or where they bend: a parabola with their bend b would end 3.4 b off the line, and a decay more.
+    ``least``, or where they bend: a decay ends farther off the line than the parabola through them.
     """
     off = off.clone()
-    for end, next_ in ((0, r[1:5]), (-1, r[-5:-1].flip(0))):
-        beside = off[1:5] if end == 0 else off[-5:-1]
-        near, far = next_[:2].mean(), next_[2:].mean()
-        here = float((r[end] - near - 0.75 * (near - far)) * math.sqrt(1.3 / 2.8))
-        bend = float((next_[1] + next_[2] - next_[0] - next_[3]).abs()) / 4
-        plain = abs(here) > BENT * bend and not bool((beside.abs() > least).any())
-        off[end] = here if plain else 0.0
+    for end, next_, x in ((0, r[1:5], at[1:5] - at[0]), (-1, r[-5:-1].flip(0), at[-1] - at[-5:-1].flip(0))):
+        beside = slice(1, 5) if end == 0 else slice(-5, -1)
+        parabola = _through(x, 2)
+        if len(parabola) < 3:
+            off[end] = 0.0
+            continue
+        near, far = x[:2].mean(), x[2:].mean()
+        away = float(near / (far - near))
+        line = torch.tensor([1 + away, 1 + away, -away, -away], dtype=r.dtype) / 2
+        here = float(r[end] - line @ next_)
+        bend = float((line @ x.square()) * (parabola[2] @ next_))
+        plain = abs(here) > BENT * abs(bend) and not bool((off[beside].abs() > least[beside]).any())
+        off[end] = here * math.sqrt(1.3 / (1 + float(line.square().sum()))) if plain else 0.0
     return off
 
 
-def _alone(r: Tensor, off: Tensor, least: float) -> Tensor:
+def _through(x: Tensor, degree: int) -> Tensor:
+    """What gives the coefficients of the polynomial that comes nearest to samples at x ``(k,)``, ``(degree + 1, k)``;
+    of a lower degree where they are at too few places."""
+    size = x.abs().max().clamp_min(1e-300)
+    powers = torch.arange(min(degree, len((x / size / APART).round().unique()) - 1) + 1)
+    return torch.linalg.pinv((x / size)[:, None] ** powers) / (size**powers)[:, None]
+
+
+def _alone(at: Tensor, r: Tensor, off: Tensor, least: Tensor) -> Tensor:
     """Which differences from neighbours are at least so large, singly or two together, bool ``(m,)``.
 
     Those beside the top of a curve are nearly as large as at its top; those beside a spike are not. Before and behind a
-    step the values differ; before and behind a spike they do not.
+    step the values differ; before and behind a spike they do not. Two at the top of a curve are off their neighbours,
+    but not off the parabola through those.
     """
     high = (off.abs() > least).tolist()
     size = [*off.abs().tolist(), 0.0]
@@ -125,9 +168,32 @@ def _alone(r: Tensor, off: Tensor, least: float) -> Tensor:
         if 0 < end - k <= 2:
             inside = 0 < k and end < len(high)
             step = abs(float(r[max(k - 3, 0) : k].median() - r[end : end + 3].median())) if inside else 0.0
-            found[k:end] = max(size[k - 1] if k else 0.0, size[end], step) < 0.5 * max(size[k:end])
+            alone = max(size[k - 1] if k else 0.0, size[end], step) < 0.5 * max(size[k:end])
+            found[k:end] = alone and _off_curve(at, r, high, k, end, least)
         k = end + 1
     return found
+
+
+def _off_curve(at: Tensor, r: Tensor, high: Sequence[bool], k: int, end: int, least: Tensor) -> bool:
+    """Whether one of the samples from k to ``end`` is as far off the parabola through two before and two behind, and
+    not for how these bend.
+
+    By the farther the worse that tells for how they are spaced. Samples that are ``high`` themselves are passed over.
+    """
+    before = [i for i in range(max(k - 4, 0), k) if not high[i]][-2:]
+    behind = [i for i in range(end, min(end + 4, len(r))) if not high[i]][:2]
+    around = torch.tensor([*before, *behind])
+    if not before or not behind:
+        return True
+    for i in range(k, end):
+        x = at[around] - at[i]
+        weights, even = (_through(part, 2)[0] for part in (x, around.double() - i))
+        worse = float((1 + weights.square().sum()) / (1 + even.square().sum()))
+        off = abs(float(r[i] - weights @ r[around]))
+        bend = abs(float((weights - _through(x, 1)[0]) @ r[around]))
+        if off > float(least[i]) * math.sqrt(max(worse, 1.0)) and off > BENT * bend:
+            return True
+    return False
 
 
 def _clustered(problem: Problem, places: Tensor, high: Tensor) -> bool:

@@ -83,7 +83,7 @@ class Estimate:
         value: In ``unit``.
         sd: Standard deviation; infinite where the data do not say.
         unit: Its unit, where known.
-        at_bound: Whether the estimate lies on a bound that it wants to cross.
+        at_bound: Whether the estimate lies on one of its bounds.
     """
 
     name: str
@@ -192,7 +192,8 @@ class Location:
         driver: What the mismatch varies with: a condition, ``"t"``, a state, an input, or ``"run"``, counted from 0.
         spans: Ranges of the driver in which it sits, ``((low, high), …)``.
         share: Share of the misfit beyond noise that a change there, varying with the driver, can remove.
-        evidence: Log evidence of a smooth unknown change there against none.
+        evidence: Log evidence of an unknown change there, smooth or an oscillation, against none.
+        period: Of an oscillation, in units of the driver; None of a smooth change.
     """
 
     kind: str
@@ -201,6 +202,7 @@ class Location:
     spans: tuple[tuple[float, float], ...]
     share: float
     evidence: float
+    period: float | None = None
 
 
 @dataclass(frozen=True)

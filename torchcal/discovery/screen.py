@@ -6,6 +6,7 @@ with the whitened residual r of the calibrated base and the whitened tangent s o
 value, projected off the tangents of everything that was calibrated. Linear: it screens and does not decide.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from torchcal.discovery.candidates import Candidate
 from torchcal.discovery.channels import responses
-from torchcal.discovery.local import Span
+from torchcal.discovery.local import SHORT, Span
 from torchcal.discovery.structure import Residual
 from torchcal.simulators import Trajectories
 
@@ -23,6 +24,8 @@ __all__ = ["Screening", "Window", "contributions", "screen", "windows", "windows
 
 #: A tangent whose projection keeps less than this share of it says nothing new.
 VANISHED = 1e-5
+#: Places at which windows may begin or end, both ends of the driver among them.
+CUTS = 13
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,10 +203,15 @@ def windows_of(
         if not float(driver[order[-1]]) > float(driver[order[0]]):
             continue
         running = torch.cat([response.new_zeros(len(response), 1), response[:, order].cumsum(1)], dim=1)
-        cuts = torch.linspace(0, len(order), 13).round().long().unique()
-        edges = [
-            (int(a), int(b)) for x, a in enumerate(cuts) for b in cuts[x + 1 :] if (int(a), int(b)) != (0, len(order))
-        ]
+        ordered, span = driver[order], Span.of(driver)
+        ends = {
+            (a, b): _ends(ordered, a, b)
+            for a, b in itertools.combinations(_cuts(ordered, span), 2)
+            if (a, b) != (0, len(order))
+        }
+        edges = [one for one, (low, high) in ends.items() if span.share(low, high) >= SHORT]
+        if not edges:
+            continue
         columns = torch.stack([running[:, b] - running[:, a] for a, b in edges], dim=-1)
         norm = columns.norm(dim=0)
         keep = norm > max(VANISHED * total, 1e-300)
@@ -215,14 +223,31 @@ def windows_of(
         if sign:
             z, simulated = (sign * z).clamp_min(0), (sign * simulated).clamp_min(0)
         null = torch.maximum(null, simulated.abs().amax(0))
-        ordered = driver[order]
         chosen = int(z.abs().argmax())
         open_ended = torch.tensor([a == 0 or b == len(order) for a, b in edges])
         simple = int(torch.where(open_ended, z.abs(), torch.zeros_like(z)).argmax())
         for k in dict.fromkeys((chosen, simple)):
-            a, b = edges[k]
-            low = -math.inf if a == 0 else float(0.5 * (ordered[a - 1] + ordered[a]))
-            high = math.inf if b == len(order) else float(0.5 * (ordered[b - 1] + ordered[b]))
+            low, high = ends[edges[k]]
             size = float((unit[:, k] @ residual.e) / norm[k].clamp_min(1e-300))
             found.append(Window(number, name, low, high, float(z[k].abs()), size))
     return found, null
+
+
+def _cuts(ordered: Tensor, span: Span) -> list[int]:
+    """Places in an ordered driver at which windows may end: as even in its range as in its points.
+
+    A driver that rests somewhere has most of its points there, where no window is long enough.
+    """
+    along = ordered.log() if span.log else ordered
+    measure = torch.linspace(0, 1, len(ordered) + 1, dtype=torch.float64)
+    between = torch.cat([along[:1], 0.5 * (along[1:] + along[:-1]), along[-1:]])
+    measure = 0.5 * (measure + (between - along[0]) / (along[-1] - along[0]))
+    wanted = torch.linspace(0, 1, CUTS, dtype=torch.float64)
+    return sorted({int((measure - share).abs().argmin()) for share in wanted})
+
+
+def _ends(ordered: Tensor, a: int, b: int) -> tuple[float, float]:
+    """Where a window of the points from a to b, exclusive, begins and ends."""
+    low = -math.inf if a == 0 else float(0.5 * (ordered[a - 1] + ordered[a]))
+    high = math.inf if b == len(ordered) else float(0.5 * (ordered[b - 1] + ordered[b]))
+    return low, high

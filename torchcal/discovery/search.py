@@ -1,6 +1,7 @@
 """Every surviving candidate is added and refitted with everything else; evidence and what is left decide."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from torchcal.discovery.base import calibrate_base
 from torchcal.discovery.candidates import Candidate, base_columns, drivers_scale, prepare
-from torchcal.discovery.fitting import Fitted, follow_slopes, refit, starts, weighed
+from torchcal.discovery.fitting import Fitted, fit, follow_slopes, refit, starts, weighed
 from torchcal.discovery.likeliest import Tangents, settled, with_unknown
 from torchcal.discovery.local import ENDS, is_window
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
@@ -38,6 +39,9 @@ FEW, CHANCE = 6, 0.2
 SHAPES, SHAPES_FAR, FAR = 3, 8, 30.0
 #: Amplitudes tried from first guesses, as shares of the range or of the largest linear estimate.
 GUESSED = (0.1, 0.4, 0.9)
+#: Sizes, in those of the misfit, at which an effect whose tangent is the base's is looked at; steps in which the base
+#: makes up for it; and the χ² a datum that it must leave to be something else.
+LARGER, MADE_UP, SEEN = (1.0, 4.0), 12, 0.01
 #: Shares of the linear estimate from which refits begin.
 STEPS = (0.05, 1.0)
 #: Log evidence by which something unknown must explain the base's residual better than any noise, to be there.
@@ -119,6 +123,9 @@ class Search:
             self.tick(f"screen {term.name}")
             self.candidates.append(prepare(self.base.problem, self.base, [term], self.fixed, scale))
         self.screening = screen(self.residual, self.candidates)
+        for i, candidate in enumerate(self.candidates):
+            if self.screening.best[i] < 0 and not candidate.blind:
+                self.candidates[i] = dataclasses.replace(candidate, bent=self._bent(candidate))
         self._alike()
         self.structure = analyse(self.residual, every=True)
         self.local, local_null = windows(self.residual, self.candidates, self.screening)
@@ -296,6 +303,33 @@ class Search:
             row[names.index(self.base.problem.parameters[i].name)] -= size * moved
         return row
 
+    def _bent(self, candidate: Candidate) -> Tensor | None:
+        """Larger effects of a candidate whose tangents are the base's, as starts of a refit; None where these are too.
+
+        At each size the base's parameters make up for the effect as far as they can.
+        """
+        names = [q.name for q in candidate.problem.parameters]
+        columns = [names.index(self.base.problem.parameters[i].name) for i in self.base.free]
+        low, high = candidate.problem.limits()
+        w = self.noise.whitening(candidate.problem)
+        least = max(float(self.residual.e.norm()), math.sqrt(self.problem.n))
+        rows = []
+        for g, a in itertools.product(range(len(candidate.shapes)), range(len(candidate.amplitudes))):
+            effect = float(w.vector(candidate.tangents[g, :, a]).norm())
+            side = candidate.one_sided(candidate.amplitudes[a])
+            for share, sign in itertools.product(LARGER if effect > 0 else (), (side,) if side else (1, -1)):
+                rows.append(self._step_along(candidate, g, a, sign * share * least / effect).clamp(low, high))
+        if not rows:
+            return None
+        begin = torch.stack(rows)
+        same = self.base.y.expand(len(begin), -1)
+        found = fit(candidate.problem, w, begin, columns, data=same, max_steps=MADE_UP, finish=0)
+        if found is None or found.ends is None or found.ends_chi2 is None:
+            return None
+        bound = (found.ends[:, columns] <= low[columns]) | (found.ends[:, columns] >= high[columns])
+        seen = (found.ends_chi2 > 1.0 + SEEN * self.problem.n) & ~bound.any(-1)  # where the base is not held back
+        return found.ends[seen] if bool(seen.any()) else None
+
     def made_up(self, effect: Tensor) -> Tensor:
         """The change of the base's free parameters that has most of an effect on the data ``(n,)``, to first order."""
         w = self.base.whitening
@@ -307,6 +341,8 @@ class Search:
 
     def _blind_begin(self, candidate: Candidate) -> Tensor:
         """Amplitudes of all magnitudes, where the tangent says nothing."""
+        if candidate.bent is not None:
+            return candidate.bent
         rows = []
         for place in candidate.amplitudes:
             q = candidate.problem.parameters[place]

@@ -1,7 +1,8 @@
 """Is there more in a residual than noise, and where does it sit?
 
 The residual of a fit, whitened and projected off the fit's tangent space, is compared with unknown smooth changes of
-every channel against every driver. Probabilities come from simulated noise that went through the same projection.
+every channel against every driver, and with oscillations of every output. Probabilities come from simulated noise that
+went through the same projection.
 """
 
 import math
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from torchcal.discovery.channels import Channel, channels
 from torchcal.discovery.fitting import Fitted
+from torchcal.discovery.lines import Lines, lines_of
 from torchcal.discovery.local import Span
 from torchcal.discovery.noise import GRID, Noise, orthonormal
 from torchcal.discovery.problem import Problem
@@ -109,6 +111,7 @@ class Place:
         profile: Estimated change at the channel's points, ``(K,)``.
         sd: Its standard deviation there.
         size: Chosen prior size.
+        period: Of an oscillation, in units of the driver; None of a smooth change.
     """
 
     channel: Channel
@@ -118,6 +121,7 @@ class Place:
     profile: Tensor
     sd: Tensor
     size: float
+    period: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,25 +224,63 @@ def responses_of(problem: Problem, available: Sequence[Channel]) -> list[_Look]:
     found = []
     for channel in available:
         data = problem.n if channel.kind != "output" else int((channel.matrix != 0).sum())
-        most = max(ALONG[0], data // DATA_EACH[0 if problem.in_time else 1])
         for name, driver in channel.drivers.items():
             distinct = len(driver.unique())
             if distinct < 2:
                 continue
-            tried = IN_TIME if name == "t" else ALONG
-            counts = dict.fromkeys(min(count, distinct) for count in tried if count <= most)
+            counts = dict.fromkeys(min(count, distinct) for count in _counts(problem, data, name))
             scales = [driver, driver.log()] if name != "t" and Span.of(driver).log else [driver]
             parts = [_features(scale, count) for scale in scales for count in counts]
             found.append(_Look(channel, name, parts, channel.response(torch.cat(parts, dim=1))))
     return found
 
 
-def evidences(residual: Residual, looks: Sequence[_Look]) -> list[float]:
-    """Log evidence for a smooth change of each channel against each driver."""
-    found: dict[int, float] = {}
-    for number, _, change in _changes(residual, looks, residual.e[:, None]):
-        found[number] = max(found.get(number, -math.inf), float(_evidence(change.along[:, None], change.s)[0]))
-    return list(found.values())
+def _counts(problem: Problem, data: int, driver: str) -> list[int]:
+    """Numbers of smooth functions along a driver that are tried with some data."""
+    most = max(ALONG[0], data // DATA_EACH[0 if problem.in_time else 1])
+    return [count for count in (IN_TIME if driver == "t" else ALONG) if count <= most]
+
+
+def _lines(residual: Residual, available: Sequence[Channel]) -> list[Lines]:
+    """Oscillations of every output."""
+    problem = residual.found.problem
+    driver = "t" if problem.in_time else ""
+    return lines_of(
+        problem, available, residual.noise.step, residual.found.whitening.sd,
+        lambda data: _counts(problem, data, driver)[-1],
+    )  # fmt: skip
+
+
+def _line_place(lines: Lines, residual: Residual, excess: float) -> Place:
+    """The likeliest oscillation of an output."""
+    found = residual.found
+    evidence, number = lines.evidence(residual.e[:, None], SIZES)
+    profile, removed = lines.wave(found.residual, residual.e, number, SIZES)
+    left = max(float(residual.e.square().sum()) - removed - residual.freedom, 0.0)
+    sd = found.whitening.sd * math.sqrt(2.0 / sum(len(places) for places, _ in lines.parts))
+    return Place(
+        lines.channel, lines.driver, float(evidence[0]), 1.0 - min(left / excess, 1.0), profile, sd,
+        float(profile.abs().max()), 1.0 / float(lines.frequencies[number]),
+    )  # fmt: skip
+
+
+def evidences(
+    residual: Residual, looks: Sequence[_Look], available: Sequence[Channel]
+) -> tuple[list[float], Tensor | None]:
+    """Log evidence for a smooth change of each channel against each driver, and for oscillations of each output.
+
+    Also returns the oscillation ``(n,)`` that the residual has where one is likelier than all else.
+    """
+    smooth: dict[int, float] = {}
+    for key, _, change in _changes(residual, looks, residual.e[:, None]):
+        smooth[key] = max(smooth.get(key, -math.inf), float(_evidence(change.along[:, None], change.s)[0]))
+    found, wave = list(smooth.values()), None
+    for lines in _lines(residual, available):
+        evidence, number = lines.evidence(residual.e[:, None], SIZES)
+        if float(evidence[0]) > max([0.0, *found]):
+            wave = lines.wave(residual.found.residual, residual.e, number, SIZES)[0]
+        found.append(float(evidence[0]))
+    return found, wave
 
 
 def _changes(residual: Residual, looks: Sequence[_Look], residuals: Tensor) -> Iterator[tuple[int, _Look, _Change]]:
@@ -279,6 +321,9 @@ def analyse(residual: Residual, *, every: bool = False) -> Structure:
             simulated = _evidence(change.null, change.s)[0]
             nulls[key] = torch.maximum(nulls[key], simulated) if key in nulls else simulated
     places = list(best.values())
+    for lines in _lines(residual, chosen):
+        places.append(_line_place(lines, residual, excess))
+        nulls[-len(places)] = lines.evidence(residual.null, SIZES)[0]
     places.sort(key=lambda place: -place.evidence)
     if not nulls:
         return Structure(places, 1.0, available, torch.zeros(1, dtype=torch.float64))

@@ -388,8 +388,13 @@ def _decide_exact(search: Search, ranked: list[Model], mask: Tensor | None, deci
                 decision.tied = [list(m.names) for m in decision.tied_models]
                 _tie_other_names(search, good[0], decision)
             break
+        if accepted is not None and doubt(search, good[0]):
+            break  # what is there already may be a name all the same
         accepted = good[0]
-    if accepted is not None:
+    if accepted is not None and (why := doubt(search, accepted)):
+        decision.verdict, decision.doubt = "ambiguous", why
+        decision.tied, decision.tied_models = [list(accepted.names), list(NONE)], [accepted]
+    elif accepted is not None:
         decision.verdict, decision.best = "named", accepted
     most = len(accepted.numbers) if accepted else len(decision.tied_models[0].numbers) if decision.tied_models else 1
     _weigh(search, decision, [m for m in search.models if len(m.numbers) <= most])

@@ -8,7 +8,7 @@ import torch
 
 from torchcal.discovery.candidates import prepare
 from torchcal.discovery.channels import responses
-from torchcal.discovery.local import EDGE, ENDS, WIDTH_OF_EDGE, WIDTHS, Span, beyond, is_window, localised
+from torchcal.discovery.local import EDGE, ENDS, SHORT, WIDTH_OF_EDGE, WIDTHS, Span, beyond, is_window, localised
 from torchcal.discovery.model import PRIOR, Model
 from torchcal.discovery.screen import Window, windows_of
 from torchcal.discovery.search import Search
@@ -37,8 +37,6 @@ AS_GOOD = 0.5
 SAME = 1e-4
 #: How far ends are moved for other starts, as a share of the driver's range: where they are sought, and sharpened.
 SHIFT, FINE = 0.1, 0.03
-#: Share of the driver's range below which a window is none: a kick at one moment is another kind of physics.
-SHORT = 0.02
 #: Data below which no window is sought; nor is any without noise, where a window bends to whatever is left.
 LEAST = 30
 #: Gaps between data, around an edge that was found, where it is tried as a step; and fits from there.
@@ -132,13 +130,9 @@ def _different(ranked: list[Window], spans: dict[str, Span]) -> list[Window]:
     kept: list[Window] = []
     for w in ranked:
         span = spans[w.driver]
-        low, high = max(w.low, span.low), min(w.high, span.high)
-        covered = 0.0
-        for other in (o for o in kept if o.driver == w.driver):
-            a, b = max(low, other.low), min(high, other.high)
-            if b > a and high > low:
-                covered = max(covered, Span(a, b, span.log).size / Span(low, high, span.log).size)
-        if covered < ALIKE:
+        own = span.share(w.low, w.high)
+        within = [span.share(max(w.low, o.low), min(w.high, o.high)) for o in kept if o.driver == w.driver]
+        if max(within, default=0.0) < ALIKE * own:
             kept.append(w)
         if len(kept) == MOST_EACH:
             break
@@ -315,6 +309,4 @@ def _long_enough(model: Model | None) -> Model | None:
     """The model, unless its window has closed or is too short for one."""
     if model is None or model.window is None or model.window.span is None:
         return None
-    span = model.window.span
-    low, high = max(model.window.low, span.low), min(model.window.high, span.high)
-    return model if high > low and Span(low, high, span.log).size >= SHORT * span.size else None
+    return model if model.window.span.share(model.window.low, model.window.high) >= SHORT else None

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from torchcal.discovery.channels import RUN
-from torchcal.display import NONE, percent
+from torchcal.display import DECADES, NONE, percent
 
 __all__ = ["paragraph"]
 
@@ -19,8 +19,21 @@ CLOSE = 3.0
 #: Probability from which on the base, or something unknown, is told beside tied hypotheses; and how many times as
 #: likely as the next one of these is plainly the best.
 LISTED, PLAINLY = 0.05, 3.0
-#: Hypotheses that hold a named term and more, of which the paragraph lists so many.
-MORE = 4
+#: Hypotheses that hold a named term and more, and detection limits, of which the paragraph lists so many.
+MORE, LIMITS = 4, 6
+#: Differences in log evidence, and distances in noise sd, beyond which a number tells nothing more.
+FAR = 100.0
+#: Share of a driver's range from which on spans say nothing.
+EVERYWHERE = 0.9
+#: Probability of what hypotheses that hold a name have beside it, from which on it is told.
+BESIDE = 0.005
+#: Probability by noise alone below which what is left is structure; and the share of the misfit that something can
+#: remove at most and be no name: all but what is less than that.
+WHITE, NEARLY_ALL = 0.005, 0.999
+#: Share of the misfit of a recording without noise that a name must remove, on held-out data too.
+REMOVED = 0.9
+#: A parameter depends on what acts beside it when that moves it by more than this many of its sd.
+MOVED = 2.0
 
 
 def _share(share: float) -> str:
@@ -30,6 +43,11 @@ def _share(share: float) -> str:
 
 def _probability(p: float) -> str:
     return f"{p:.2g}" if p >= 0.001 else "< 0.001"
+
+
+def _up_to(value: float) -> str:
+    """A difference in log evidence, or a distance in noise sd."""
+    return f"more than {FAR:.0f}" if value > FAR else f"{value:.1f}"
 
 
 def _and(names: list[str]) -> str:
@@ -82,6 +100,8 @@ def _unknown(d: Any) -> float:
 def _hypothesis(d: Any, terms: Sequence[str]) -> str:
     if tuple(terms) == NONE:
         return "something that is not in this library"
+    if not terms:
+        return "the base alone"
     rows = [row for row in d.ranking if row.refitted and set(row.terms) == set(terms)]
     best = max(rows, key=lambda row: row.probability, default=None)
     return " with ".join(terms) + (f" where {best.region}" if best is not None and best.region else "")
@@ -149,10 +169,12 @@ def _consistent(d: Any) -> list[str]:
             )
     if not limits:
         return [nothing]
-    shown = ", ".join(f"{limit.term} {limit.smallest:.3g} {limit.unit or ''}".rstrip() for limit in limits[:6])
+    shown = ", ".join(f"{limit.term} {limit.smallest:.3g} {limit.unit or ''}".rstrip() for limit in limits[:LIMITS])
+    more = len(limits) - LIMITS
+    others = f", and {more} other{'s' if more > 1 else ''}" if more > 0 else ""
     return [
         f"{nothing} The smallest effects that these data could have shown "
-        f"(with probability {limits[0].power:.0%}): {shown}."
+        f"(with probability {limits[0].power:.0%}): {shown}{others}."
     ]
 
 
@@ -161,20 +183,51 @@ def _where(d: Any) -> str:
         return ""
     place = d.where[0]
     spans = ", ".join(f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}" for low, high in place.spans[:3])
+    everywhere = _everywhere(d, place)
     if place.driver == RUN:
+        largest = "" if everywhere else f" (largest in {spans}, counted from 0)"
+        advice = " A parameter of the simulator with per_run=True would take it up." if not d.terms else ""
         return (
-            f"The mismatch sits in the {place.kind} {place.target} and differs from run to run (largest in {spans}, "
-            f"counted from 0): one change for each run removes {_share(place.share)} of the misfit beyond noise. A "
-            f"parameter of the simulator with per_run=True would take it up.{_embedded(d)}"
+            f"The mismatch sits in the {place.kind} {place.target} and differs from run to run{largest}: one change "
+            f"for each run removes {_share(place.share)} of the misfit beyond noise.{advice}{_embedded(d)}"
+        )
+    largest = "" if everywhere else f" (largest at {spans})"
+    if place.period is not None:
+        return (
+            f"The mismatch sits in the {place.kind} {place.target} and oscillates with {place.driver} (period "
+            f"{place.period:.3g}): a wave there removes {_share(place.share)} of the misfit beyond noise.{_embedded(d)}"
         )
     return (
-        f"The mismatch sits in the {place.kind} {place.target} and varies with {place.driver} (largest at {spans}): a "
-        f"smooth change there removes {_share(place.share)} of the misfit beyond noise{_elsewhere(d)}.{_embedded(d)}"
+        f"The mismatch sits in the {place.kind} {place.target} and varies with {place.driver}{largest}: a smooth "
+        f"change there removes {_share(place.share)} of the misfit beyond noise{_elsewhere(d)}.{_embedded(d)}"
     )
 
 
+def _everywhere(d: Any, place: Any) -> bool:
+    """Whether a place's spans are all of its driver's range, or nearly: they say nothing then."""
+    if place.driver == RUN:
+        runs = range(len(d.recording.runs or ()))
+        return all(any(round(low) <= run <= round(high) for low, high in place.spans) for run in runs)
+    values = d.drivers.get(place.driver)
+    own = place.driver.removesuffix(" itself")
+    if values is None and own in d.recording.outputs:
+        values = d.recording.split(d.base.prediction)[own]
+    if values is None or not bool(values.isfinite().all()):
+        return False
+    ends = (float(values.min()), float(values.max()))
+    decades = ends[0] > 0 and ends[1] >= DECADES * ends[0]
+
+    def length(low: float, high: float) -> float:
+        low, high = max(low, ends[0]), min(high, ends[1])
+        return 0.0 if high <= low else math.log(high / low) if decades else high - low
+
+    return sum(length(low, high) for low, high in place.spans) >= EVERYWHERE * length(*ends)
+
+
 def _elsewhere(d: Any) -> str:
-    """Where else a change would remove about as much."""
+    """Where else a change would remove about as much; a name says where it is."""
+    if d.terms:
+        return ""
     first = d.where[0]
     close = [place for place in d.where[1:] if place.evidence > first.evidence - CLOSE and place.driver != RUN]
     other = next((place for place in close if (place.kind, place.target) != (first.kind, first.target)), None)
@@ -187,7 +240,7 @@ def _embedded(d: Any) -> str:
     first, second = d.embedded[:2]
     return (
         f" Model error embedded in one parameter at a time is likeliest in {first.parameter} (sd {first.sd:.3g}; "
-        f"{first.log_likelihood - second.log_likelihood:.1f} in log-likelihood before {second.parameter})."
+        f"{_up_to(first.log_likelihood - second.log_likelihood)} in log-likelihood before {second.parameter})."
     )
 
 
@@ -213,16 +266,11 @@ def _proof(d: Any) -> str:
 def _named(d: Any) -> list[str]:
     top = _accepted(d)
     estimates = "; ".join(str(estimate) for estimate in top.estimates)
-    mine = [row for row in d.ranking if (_holds(d, row) if d.tied else set(row.terms) == set(d.terms))]
-    held = {id(row) for row in mine}
-    others = [row for row in d.ranking if row.terms and row.refitted and id(row) not in held]
-    if d.tied:
-        others = [row for row in others if not set(row.terms) >= set(d.terms)]
-    rival = max(others, key=lambda row: row.probability, default=None)
-    probability = sum(row.probability for row in mine)
-    with_others = " alone or with others" if d.tied else ""
+    probability = sum(row.probability for row in d.ranking if _holds(d, row))
+    alone = sum(row.probability for row in d.ranking if _holds(d, row) and set(row.terms) == set(d.terms))
+    with_others = " alone or with others" if d.tied or probability - alone >= BESIDE else ""
     likely = "" if d.settings.get("nearly") else f"probability{with_others} {probability:.3f}; "
-    does = f"removes {_share(top.misfit_removed)} of the misfit beyond noise"
+    does = f"removes {_share(min(top.misfit_removed, 1.0 - d.remaining))} of the misfit beyond noise"
     if top.misfit_removed < LITTLE:  # the base's misfit is as large as noise, and has a shape
         does = f"lowers χ² from {d.base.chi2:.4g} to {d.final.chi2:.4g}"
     parts = [
@@ -236,18 +284,37 @@ def _named(d: Any) -> list[str]:
             "What is left is more than noise, as on most real recordings; the name rests on the share that is removed, "
             f"{apart}and on every rival of as many terms leaving at least three times as much."
         )
-    elif rival is not None:
-        parts.append(
-            f"The next best{' without it' if d.tied else ''}, {_and(list(rival.terms))}, has a probability of "
-            f"{rival.probability:.2g} ({top.log_evidence - rival.log_evidence:+.1f} natural-log units of evidence "
-            "for the name)."
-        )
+    else:
+        parts += _rival(d, probability)
     parts.append(_proof(d))
     if d.tied:
         parts += _larger(d)
     if d.remaining > LITTLE:
         parts.append(f"{_share(d.remaining)} of the misfit remains unexplained.")
     return parts
+
+
+def _rival(d: Any, probability: float) -> list[str]:
+    """The likeliest of what has not all that is named, which has a probability."""
+    shares: dict[tuple[str, ...], float] = {}
+    for row in d.ranking:
+        names = tuple(sorted(row.terms))
+        if not set(names) >= set(d.terms) and (row.refitted or row.terms == NONE):
+            shares[names] = shares.get(names, 0.0) + row.probability
+    if not shares:
+        return []
+    rival, share = max(shares.items(), key=lambda item: item[1])
+    behind = _behind(share, probability)
+    without = "without it" if len(d.terms) == 1 else "without all of them"
+    return [
+        f"The next best {without}, {_hypothesis(d, rival)}, has a probability of {_probability(share)} "
+        f"({_up_to(behind)} behind the name in log odds)."
+    ]
+
+
+def _behind(p: float, first: float) -> float:
+    """Log odds of a probability behind another one."""
+    return math.log(first / p) if p > 0 and first > 0 else math.inf
 
 
 def _holds(d: Any, row: Any) -> bool:
@@ -258,21 +325,37 @@ def _holds(d: Any, row: Any) -> bool:
 def _larger(d: Any) -> list[str]:
     """What is likely beside the named terms."""
     more = [row for row in d.ranking if _holds(d, row) and set(row.terms) != set(d.terms)]
-    shown = [row for row in more[:MORE] if row.probability >= 0.005]
+    shown = [row for row in more[:MORE] if row.probability >= BESIDE]
     listed = [f"{_and([name for name in row.terms if name not in d.terms])} ({row.probability:.2f})" for row in shown]
     if len(more) > len(shown):
         listed.append("others")
     together = sum(row.probability for row in more)
     parts = [f"Something else acts beside it with a probability of {together:.2f}: {', or '.join(listed)}."]
-    return parts + _experiment(d)
+    return parts + _depends(d, more) + _experiment(d)
+
+
+def _depends(d: Any, more: Sequence[Any]) -> list[str]:
+    """Which estimate is another one with what is likelier to act beside the named terms."""
+    top = _accepted(d)
+    for row in sorted(more, key=lambda row: -row.probability):
+        if row.probability <= top.probability:
+            break
+        other = {e.name: e for e in row.estimates}
+        moved = [e for e in top.estimates if e.name in other and abs(other[e.name].value - e.value) > MOVED * e.sd]
+        if moved:
+            name = max(moved, key=lambda e: abs(other[e.name].value - e.value) / max(e.sd, 1e-300)).name
+            beside = _and([term for term in row.terms if term not in d.terms])
+            return [f"{name} depends on what acts beside it: {other[name].amount} with {beside}."]
+    return []
 
 
 def _experiment(d: Any) -> list[str]:
     if d.experiment is None:
         return []
-    text = f"What would tell them apart: {d.experiment.description} (predicted distance {d.experiment.separation:.1f} "
+    distance = f"predicted distance {_up_to(d.experiment.separation)} noise sd"
+    text = f"What would tell them apart: {d.experiment.description} ({distance})"
     untold = [f"{a} from {b}" for a, b in d.experiment.untold]
-    return [text + "noise sd)" + (f"; no simple experiment tells {', or '.join(untold)}." if untold else ".")]
+    return [text + (f"; no simple experiment tells {', or '.join(untold)}." if untold else ".")]
 
 
 def _ambiguous(d: Any) -> list[str]:
@@ -321,8 +404,8 @@ def _unexplained(d: Any) -> list[str]:
     best = next((row for row in d.ranking if row.terms and row.refitted), None)
     if best is not None:
         parts.append(
-            f"The best of the library, {_hypothesis(d, best.terms)}, removes {_share(best.misfit_removed)} of the "
-            "misfit beyond noise" + (f" ({best.note})" if best.note else "") + "."
+            f"The best of the library, {_hypothesis(d, best.terms)}, removes "
+            f"{_share(min(best.misfit_removed, NEARLY_ALL))} of the misfit beyond noise{_no_name(d, best)}."
         )
     if d.missing is not None:
         size = float(d.missing.rate.max() - d.missing.rate.min())
@@ -333,3 +416,23 @@ def _unexplained(d: Any) -> list[str]:
             "base's own parameters does."
         )
     return parts
+
+
+def _no_name(d: Any, best: Any) -> str:
+    """Why the best of the library is no name, as the end of a sentence."""
+    if best.note:
+        return f" ({best.note})"
+    if d.noise.source == "none":
+        apart = best.misfit_removed >= REMOVED and len(best.terms) == 1 and d.held_out is not None
+        return ", but not of what was held out" if apart else ""
+    unknown = _unknown(d)
+    mine = sum(row.probability for row in d.ranking if set(row.terms) == set(best.terms))
+    left = best.p_white is not None and best.p_white < WHITE
+    reasons = []
+    if unknown > mine:
+        reasons.append(f"something unknown is likelier by {_up_to(_behind(mine, unknown))} in log odds")
+    if left:
+        reasons.append(f"what it leaves is not noise (probability {_probability(best.p_white)})")
+    elif not reasons and d.noise.source == "given":
+        reasons.append("it leaves more than the noise that is given")
+    return ", but " + _and(reasons) if reasons else ""

@@ -28,6 +28,9 @@ from torchcal.report.markup import (
 
 __all__ = ["page", "write"]
 
+#: Distance in noise sd beyond which a number tells nothing more.
+FAR = 100.0
+
 PACKAGES = ("torchcal", "torch", "pyro-ppl", "numpy", "matplotlib")
 
 MEANING = {
@@ -278,9 +281,11 @@ def _experiment(diagnosis: Any) -> str:
     if experiment is None:
         return ""
     rows = [{"condition": str(name), "value": in_words(value)} for name, value in experiment.conditions.items()]
+    far = experiment.separation > FAR
+    distance = f"more than {FAR:.0f}" if far else in_digits(experiment.separation, 3)
     text = (
         f"<p>{escaped(experiment.description)}</p><p>The two nearest hypotheses that it tells apart would differ there "
-        f"by {escaped(in_digits(experiment.separation, 3))} noise sd.</p>"
+        f"by {escaped(distance)} noise sd.</p>"
     )
     for one, other in getattr(experiment, "untold", ()):
         text += f"<p>No simple experiment tells {escaped(one)} from {escaped(other)}.</p>"

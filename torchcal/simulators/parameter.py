@@ -109,13 +109,14 @@ class Parameter:
 
 
 def free_parameters(
-    parameters: Sequence[Parameter], fixed: Mapping[str, float] | None = None
+    parameters: Sequence[Parameter], fixed: Mapping[str, float] | None = None, *, least: int = 1
 ) -> tuple[tuple[Parameter, ...], dict[str, float]]:
     """Split parameters into those to be inferred and those held, dormant ones at their neutral value.
 
     Args:
         parameters: All parameters of a simulator.
         fixed: Values of parameters that the user holds.
+        least: How many must be left free, 1 or 0.
 
     Returns:
         The free parameters, in order, and ``{name: value}`` of the held ones.
@@ -148,7 +149,7 @@ def free_parameters(
         if parameter.neutral is not None and parameter.name not in held:
             held[parameter.name] = parameter.neutral
     free = tuple(parameter for parameter in parameters if parameter.name not in held)
-    if not free:
+    if len(free) < least:
         raise EmbeddingError(
             f"Expected at least one free parameter. Got all of {names} fixed or dormant. "
             "Free one of them, or call the simulator directly."

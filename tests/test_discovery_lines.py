@@ -1,0 +1,104 @@
+"""Oscillations that smooth functions do not follow, and terms whose tangents are the base's: neither goes unseen."""
+
+import math
+
+import pytest
+import torch
+
+import torchcal as tc
+
+F64 = torch.float64
+
+
+def decay() -> tc.ODESimulator:
+    return tc.ODESimulator(
+        lambda t, s, p, u: {"x": -p["k"] * s["x"]}, {"x": "K"}, [tc.Parameter("k", low=0.0, initial=0.2)]
+    )
+
+
+def source() -> tc.Term:
+    return tc.Term("source", equation="x", rate=lambda t, s, p, u: p["b"], parameters=[tc.Parameter("b")])
+
+
+def rippled(samples: float, kappa: float, *, seed: int = 0, n: int = 240, uneven: bool = False) -> tuple:
+    g = torch.Generator().manual_seed(seed)
+    t = torch.linspace(0, 10, n, dtype=F64)
+    if uneven:
+        t = t + 0.3 * (t[1] - t[0]) * torch.rand(n, generator=g, dtype=F64)
+    wave = torch.sin(2 * math.pi * t / (t[1] - t[0] if not uneven else 10 / (n - 1)) / samples)
+    y = 5 * torch.exp(-0.2 * t) + 0.02 * (kappa * math.sqrt(2) * wave + torch.randn(n, generator=g, dtype=F64))
+    return t, y
+
+
+def diagnosed(t: torch.Tensor, y: torch.Tensor, noise: float | None):
+    run = tc.Run(time=t, outputs={"x": y})
+    return tc.diagnose(decay(), tc.Recording(runs=[run], noise=noise), [source()], progress=False)
+
+
+@pytest.mark.parametrize("samples", [4, 8, 11])
+@pytest.mark.parametrize("noise", [0.02, None])
+@pytest.mark.parametrize("uneven", [False, True])
+def test_a_ripple_is_no_noise_however_fast(samples, noise, uneven):
+    d = diagnosed(*rippled(samples, 2.0, uneven=uneven), noise)
+    assert d.verdict == "unexplained"
+    assert d.p_detect < 0.01
+    period = samples * 10 / 239
+    assert d.where[0].kind == "output"
+    assert d.where[0].period == pytest.approx(period, rel=0.02)
+    assert f"oscillates with t (period {d.where[0].period:.3g})" in str(d).replace("\n", " ")
+    assert d.missing is not None
+    assert d.missing.kind == "output"
+    crossings = int((d.missing.rate[1:] * d.missing.rate[:-1] < 0).sum())
+    assert crossings == pytest.approx(2 * 10 / period, rel=0.05)
+    if noise is None:  # the ripple is not taken for noise
+        assert d.noise.sd["x"] < 0.03  # of 0.02, and 0.045 with the ripple
+
+
+@pytest.mark.parametrize("uneven", [False, True])
+def test_white_noise_has_no_line(uneven):
+    assert [diagnosed(*rippled(8, 0.0, seed=s, uneven=uneven), None).verdict for s in range(4)] == ["consistent"] * 4
+
+
+def test_fringes_along_the_only_condition_are_seen():
+    g = torch.Generator().manual_seed(1)
+    x = torch.linspace(0.4, 0.8, 200, dtype=F64)
+    y = 2.0 - x + 0.01 * (3 * torch.sin(2 * math.pi * x / 0.013) + torch.randn(200, generator=g, dtype=F64))
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, parameters=[tc.Parameter("a"), tc.Parameter("b")])
+    bend = tc.Term("bend", outputs={"y": lambda x, p, y: y + p["c"] * x**2}, parameters=[tc.Parameter("c")])
+    d = tc.diagnose(line, tc.Recording(x=x, y=y), [bend], progress=False)
+    assert d.verdict == "unexplained"
+
+
+def chromatogram() -> tuple[tc.Simulator, torch.Tensor, tc.Term]:
+    """A decay, and spreading: at neutral its tangent is that of the rate, but not further on."""
+    base = tc.Simulator(
+        lambda x, p: {"y": p["A"] * torch.exp(-p["k"] * x["d"])},
+        parameters=[tc.Parameter("A", low=0.0), tc.Parameter("k", low=0.0)],
+    )
+    spreading = tc.Term(
+        "spreading",
+        outputs={"y": lambda x, p, y: y / (1 + p["s"] * x["d"])},
+        parameters=[tc.Parameter("s", low=0.0)],
+    )
+    return base, torch.linspace(0.2, 6, 120, dtype=F64), spreading
+
+
+def test_a_term_whose_tangent_is_the_base_s_is_refitted_where_its_larger_effects_are_not():
+    base, x, spreading = chromatogram()
+    noise = 0.3 * torch.randn(120, generator=torch.Generator().manual_seed(0), dtype=F64)
+    y = 80 * torch.exp(-0.2 * x) / (1 + 0.8 * x) + noise
+    d = tc.diagnose(base, tc.Recording(x={"d": x}, y={"y": y}, noise=0.3), [spreading], progress=False)
+    assert d.verdict == "named"
+    assert d.terms == ["spreading"]
+    s = next(e for row in d.ranking for e in row.estimates if e.name == "spreading.s")
+    assert abs(s.value - 0.8) < 4 * s.sd < 0.2
+
+
+def test_a_term_that_is_the_base_s_own_at_any_size_is_not():
+    base, x, _ = chromatogram()
+    faster = tc.Term("faster", shifts={"k": lambda x, p: p["k"] * p["q"]}, parameters=[tc.Parameter("q")])
+    noise = 0.3 * torch.randn(120, generator=torch.Generator().manual_seed(0), dtype=F64)
+    y = 80 * torch.exp(-0.2 * x) / (1 + 0.8 * x) + noise
+    d = tc.diagnose(base, tc.Recording(x={"d": x}, y={"y": y}, noise=0.3), [faster], progress=False)
+    assert d.verdict == "unexplained"
+    assert d.detection_limit[0].note == "already in the base model"

@@ -1,0 +1,312 @@
+"""What a diagnosis says of its numbers: the place of a name, its rivals, spans, bounds, limits and distances."""
+
+import dataclasses
+import sys
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+import torchcal as tc
+from torchcal.discovery import explain, where, words
+from torchcal.discovery.channels import Channel
+from torchcal.discovery.records import Estimate, Experiment, Hypothesis, Limit, Location
+from torchcal.discovery.structure import Place
+from torchcal.report import diagnosis_page
+
+F64 = torch.float64
+T = torch.linspace(0, 10, 11, dtype=F64)
+WHOLE, PART = ((0.0, 10.0),), ((2.0, 5.0),)
+
+
+def row(terms, probability, **more):
+    more = {"refitted": terms != words.NONE, "misfit_removed": 0.9, **more}
+    return Hypothesis(tuple(terms), 0.0, probability, **more)
+
+
+def finding(verdict="named", **more):
+    """What the sentences of a diagnosis are made of."""
+    score = SimpleNamespace(rmse=0.1)
+    return SimpleNamespace(**{
+        "verdict": verdict, "terms": ["drag"] if verdict == "named" else [], "tied": [], "where": [], "ranking": [],
+        "settings": {}, "remaining": 0.0, "after": None, "embedded": [], "experiment": None, "held_out": None,
+        "missing": None, "detection_limit": [], "p_detect": 0.5, "confidence": 0.99, "drivers": {"t": T},
+        "before": SimpleNamespace(fitted=score, held_out=None, model_error_sd=None),
+        "noise": SimpleNamespace(source="given", correlation={}),
+        "recording": SimpleNamespace(runs=[None] * 4, outputs=("y",), split=lambda values: {"y": values}),
+        "base": SimpleNamespace(prediction=2 * T), **more,
+    })  # fmt: skip
+
+
+def said(d):
+    return " ".join(part for part in getattr(words, f"_{d.verdict}")(d) if part)
+
+
+# --- where -----------------------------------------------------------------------------------------------------
+
+
+def channel(kind, target, **rates):
+    return Channel(kind, target, None, {"t": T}, T, torch.eye(11, dtype=F64), {name: T for name in rates})
+
+
+def located(term, *, inside=(), named=True):
+    """Places by falling evidence: a parameter before the equations and the output."""
+    kinds = {("parameter", "kd"): 50.0, ("equation", "M"): 40.0, ("parameter", "kp"): 30.0, ("output", "y"): 20.0,
+             ("equation", "R"): 10.0}  # fmt: skip
+    places = [Place(channel(*key), "t", evidence, 0.5, T, T, 1.0) for key, evidence in kinds.items()]
+    search = SimpleNamespace(
+        structure=SimpleNamespace(places=places),
+        problem=SimpleNamespace(in_time=True, recording=SimpleNamespace(outputs=("y",))),
+    )
+    model = SimpleNamespace(
+        window=None, candidate=SimpleNamespace(terms=[term]), structure=SimpleNamespace(channels=list(inside))
+    )
+    return [(place.kind, place.target) for place in where.locate(search, model, named=named)]
+
+
+def rate(t, s, p, u):
+    return p["q"]
+
+
+Q = {"parameters": [tc.Parameter("q")]}
+ACTS = {
+    "equation": (tc.Term("one", equation="R", rate=rate, **Q), (), ("equation", "R")),
+    "parameter": (tc.Term("one", shifts={"kp": rate}, **Q), (), ("parameter", "kp")),
+    "value of a run": (tc.Term("one", frees=("k",)), [channel("parameter", "k[1]", M=1)], ("equation", "M")),
+    "no place": (tc.Term("one", frees=("ki",)), [channel("parameter", "ki", R=1)], ("equation", "R")),
+    "output": (tc.Term("one", outputs={"y": lambda t, s, p, u, y: y + p["q"]}, **Q), (), ("output", "y")),
+}
+
+
+@pytest.mark.parametrize(("term", "inside", "first"), ACTS.values(), ids=ACTS)
+def test_what_a_name_acts_on_comes_first(term, inside, first):
+    found = located(term, inside=inside)
+    assert found[0] == first
+    others = located(term, inside=inside, named=False)  # of a tie nobody knows
+    assert others[0] == ("parameter", "kd")
+    assert found[1:] == [key for key in others if key != first]
+
+
+def captured(monkeypatch, base, recording, terms):
+    """The search behind a diagnosis, and its best model."""
+    seen = []
+    locate = where.locate
+
+    def spy(search, shown, **kwargs):
+        seen.append((search, shown))
+        return locate(search, shown, **kwargs)
+
+    monkeypatch.setattr(sys.modules["torchcal.discovery.diagnose"], "locate", spy)  # of that name is a function, too
+    tc.diagnose(base, recording, terms, progress=False)
+    return seen[0]
+
+
+def test_a_parameter_that_was_dormant_is_where_its_contribution_is_large(monkeypatch):
+    x, z = torch.linspace(0, 1, 40, dtype=F64), torch.linspace(-1, 1, 40, dtype=F64)[torch.arange(40) * 7 % 40]
+    base = tc.Simulator(
+        lambda x, p: p["a"] + p["b"] * x["x"] + p["c"] * x["z"] ** 4,
+        [tc.Parameter("a"), tc.Parameter("b"), tc.Parameter("c", neutral=0.0)],
+    )
+    noise = torch.randn(40, generator=torch.Generator().manual_seed(0), dtype=F64)
+    recording = tc.Recording(x={"x": x, "z": z}, y=1 + x + 2 * z**4 + 0.05 * noise, noise=0.05)
+    search, best = captured(monkeypatch, base, recording, [tc.Term("bowl", frees=("c",))])
+    assert best.names == ("bowl",)
+    first = where.locate(search, best, named=True)[0]
+    assert (first.kind, first.target, first.driver) == ("parameter", "c", "z")
+    assert first.share > 0.95
+    (left, right) = first.spans  # z⁴ exceeds 0.3 where |z| > 0.74
+    assert left == (-1.0, pytest.approx(-0.74, abs=0.06))
+    assert right == (pytest.approx(0.74, abs=0.06), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("driver", "spans", "told"),
+    [
+        ("t", PART, " (largest at 2 to 5)"), ("t", WHOLE, ""), ("t", ((0.3, 4.9), (5.0, 9.9)), ""),
+        ("y itself", ((0.0, 20.0),), ""), ("y itself", WHOLE, " (largest at 0 to 10)"),
+        ("run", ((1.0, 1.0),), " (largest in 1, counted from 0)"), ("run", ((0.0, 3.0),), ""),
+        ("run", ((0.0, 0.0), (2.0, 3.0)), " (largest in 0, 2 to 3, counted from 0)"),
+        ("run", ((0.0, 1.0), (2.0, 3.0)), ""),
+    ],
+)  # fmt: skip
+def test_spans_are_told_where_they_are_not_everywhere(driver, spans, told):
+    for verdict in ("named", "unexplained"):
+        text = words._where(finding(verdict, where=[Location("parameter", "k", driver, spans, 0.5, 20.0)]))
+        verb = "differs from run to run" if driver == "run" else f"varies with {driver}"
+        assert f"{verb}{told}: " in text
+        assert ("per_run=True" in text) == (driver == "run" and verdict != "named")
+
+
+def test_spans_over_decades_are_measured_in_decades():
+    place = Location("parameter", "k", "c", ((1e3, 1e6),), 0.5, 20.0)
+    assert not words._everywhere(finding(drivers={"c": torch.logspace(0, 6, 13, dtype=F64)}), place)
+
+
+def test_a_name_is_in_one_place():
+    places = [Location("equation", "R", "t", PART, 0.5, 20.0), Location("parameter", "kd", "t", PART, 0.6, 40.0)]
+    assert "kd" not in words._where(finding(where=places))
+    assert "kd" in words._where(finding("ambiguous", where=places))
+
+
+# --- a name and its rivals -------------------------------------------------------------------------------------
+
+TOP = Estimate("drag.c", 1.0, 0.1, "1/m")
+
+
+def test_a_rival_does_not_hold_the_name():
+    rows = [row(["drag", "offset"], 0.5), row(["drag"], 0.4, estimates=(TOP,)), row(["spring"], 0.02),
+            row(["spring"], 0.02, region="t > 3"), row([], 0.03)]  # fmt: skip
+    text = said(finding(ranking=rows))
+    assert "probability alone or with others 0.900" in text
+    assert "The next best without it, spring, has a probability of 0.04 (3.1 behind the name in log odds)." in text
+
+
+@pytest.mark.parametrize(
+    ("rows", "told"),
+    [
+        ([row(words.NONE, 0.02), row(["spring"], 0.01)], "something that is not in this library, has a probability of "
+         "0.02 (3.9 behind"),
+        ([row([], 0.02), row(["spring"], 0.01)], "the base alone, has a probability of 0.02"),
+        ([row(["spring"], 0.0), row([], 0.0)], "spring, has a probability of < 0.001 (more than 100 behind"),
+        ([row(["spring"], 1e-90), row([], 0.0)], "spring, has a probability of < 0.001 (more than 100 behind"),
+    ],
+)  # fmt: skip
+def test_the_likeliest_rival_is_told(rows, told):
+    assert told in said(finding(ranking=[row(["drag"], 0.97, estimates=(TOP,)), *rows]))
+
+
+def test_what_has_a_part_of_a_name_is_a_rival():
+    rows = [row(["drag", "bias"], 0.9), row(["drag"], 0.06)]
+    assert "The next best without all of them, drag, has" in said(finding(terms=["bias", "drag"], ranking=rows))
+
+
+def test_an_embedded_error_is_not_told_by_thousands():
+    errors = [SimpleNamespace(parameter=name, sd=0.1, log_likelihood=value) for name, value in (("a", 4e5), ("b", 1.0))]
+    assert "(sd 0.1; more than 100 in log-likelihood before b)" in words._embedded(finding(embedded=errors))
+    errors[0].log_likelihood = 21.0
+    assert "20.0 in log-likelihood before b" in words._embedded(finding(embedded=errors))
+
+
+def test_what_is_removed_and_what_remains_are_all():
+    rows = [row(["drag"], 0.99, misfit_removed=1.0, estimates=(TOP,))]
+    text = said(finding(ranking=rows, remaining=0.031))
+    assert "removes 97 % of the misfit" in text
+    assert "3.1 % of the misfit remains unexplained" in text
+
+
+def test_an_estimate_that_depends_on_what_acts_beside_it_is_told():
+    other = [dataclasses.replace(TOP, value=1.5, sd=0.2), Estimate("offset.b", 3.0, 0.1)]
+    rows = [row(["drag", "offset"], 0.6, estimates=tuple(other)), row(["drag"], 0.3, estimates=(TOP,))]
+    tied = [["drag", "offset"], ["drag"]]
+    told = "drag.c depends on what acts beside it: 1.5 ± 0.2 1/m with offset."
+    assert told in said(finding(ranking=rows, tied=tied))
+    rows[0] = row(["drag", "offset"], 0.6, estimates=(dataclasses.replace(TOP, value=1.19),))
+    assert "depends on" not in said(finding(ranking=rows, tied=tied))  # within 2 sd
+    rows[0] = row(["drag", "offset"], 0.2, estimates=tuple(other))
+    assert "depends on" not in said(finding(ranking=rows, tied=tied))  # less likely
+
+
+# --- no name ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("source", "best", "unknown", "told"),
+    [
+        ("given", {"p_white": 0.3}, 0.9, ", but something unknown is likelier by 2.9 in log odds."),
+        ("given", {"p_white": 1e-4}, 0.01, ", but what it leaves is not noise (probability < 0.001)."),
+        ("given", {"p_white": 0.002}, 1.0, ", but something unknown is likelier by 3.0 in log odds and what it leaves "
+         "is not noise (probability 0.002)."),
+        ("given", {"p_white": 0.3}, 0.01, ", but it leaves more than the noise that is given."),
+        ("estimated", {"note": "its window has closed"}, 0.9, " (its window has closed)."),
+    ],
+)  # fmt: skip
+def test_why_the_best_of_the_library_is_no_name(source, best, unknown, told):
+    rows = [row(["drag"], 0.05, **{"misfit_removed": 1.0, **best}), row(words.NONE, unknown)]
+    noise = SimpleNamespace(source=source, correlation={})
+    assert f"removes 99.9 % of the misfit beyond noise{told}" in said(finding("unexplained", ranking=rows, noise=noise))
+
+
+def test_without_noise_a_name_is_lost_on_held_out_data():
+    rows, noise = [row(["drag"], 0.05, misfit_removed=0.95)], SimpleNamespace(source="none", correlation={})
+    d = finding("unexplained", ranking=rows, noise=noise, held_out=T > 5)
+    assert "removes 95 % of the misfit beyond noise, but not of what was held out." in said(d)
+    rows[0] = row(["drag"], 0.05, misfit_removed=0.5)
+    assert "removes 50 % of the misfit beyond noise." in said(d)
+
+
+@pytest.mark.parametrize(("count", "told"), [(6, "term5 0.5."), (7, ", and 1 other."), (9, ", and 3 others.")])
+def test_limits_that_are_left_out_are_counted(count, told):
+    limits = [Limit(f"term{k}", "c", 0.5, None, 0.95) for k in range(count)]
+    assert said(finding("consistent", detection_limit=limits)).endswith(told)
+
+
+@pytest.mark.parametrize(("separation", "told"), [(12.34, "12.3"), (99.96, "100"), (35e4, "more than 100")])
+def test_no_distance_is_told_by_thousands(separation, told):
+    experiment = Experiment("longer", separation)
+    assert f"(predicted distance {told}" in words._experiment(finding(experiment=experiment))[0]
+    assert f"would differ there by {told}" in diagnosis_page._experiment(finding(experiment=experiment))
+
+
+# --- symptoms and what is not identified -----------------------------------------------------------------------
+
+
+def parabola(noise=0.02):
+    x = torch.linspace(0, 1, 30, dtype=F64)
+    base = tc.Simulator(lambda x, p: p["a"] + p["kd"] * x, [tc.Parameter("a"), tc.Parameter("kd", low=0.0)])
+    bend = tc.Term("bend", outputs={"y": lambda x, p, y: y - p["q"] * x**2}, parameters=[tc.Parameter("q")])
+    wobble = noise * torch.randn(30, generator=torch.Generator().manual_seed(1), dtype=F64)
+    return base, tc.Recording(x=x, y=1 + 0.5 * x - 2 * x**2 + wobble, noise=noise), [bend]
+
+
+def test_a_parameter_on_its_bound_is_told_once(monkeypatch):
+    search, best = captured(monkeypatch, *parabola())
+    (line,) = [line for line in explain.symptoms(search, best) if line.startswith("kd")]
+    assert line.startswith("kd runs to its bound, 0, in the calibrated base; it is 0.")
+    assert line.endswith("with bend")
+
+
+def test_an_estimate_on_its_bound_says_so():
+    parameters = [tc.Parameter("k", low=0.0), tc.Parameter("c", low=0.0), tc.Parameter("held", low=0.0)]
+    found = SimpleNamespace(
+        values=torch.tensor([0.0, 1.0, 0.0], dtype=F64), free=[0, 1], at_bound=torch.tensor([False, False]),
+        sd=lambda: torch.tensor([0.1, 0.1, 0.0], dtype=F64),
+        problem=SimpleNamespace(parameters=parameters, recording=SimpleNamespace(noise=None), in_time=True),
+    )  # fmt: skip
+    assert [e.at_bound for e in explain.estimates(found, range(3))] == [True, False, False]
+
+
+def test_the_fastest_part_is_that_of_the_best_model(monkeypatch):
+    search, best = captured(monkeypatch, *parabola(noise=0.002))
+    x = torch.linspace(-1, 1, 30, dtype=F64)
+    rough = 0.5 * torch.sin(40 * x)  # no curve that is smooth on this spacing follows it
+    base = dataclasses.replace(search.base, y=search.problem.y - rough, chi2=1e9)
+    search.base, search.noise = base, dataclasses.replace(search.noise, doubted=8.2)
+    assert not any("fastest" in line for line in explain.symptoms(search, best))
+    assert not any("fastest" in line for line in explain.symptoms(search, None))
+    search.models = []
+    assert any("fastest" in line for line in explain.symptoms(search, None))
+
+
+def untold(columns, sd):
+    names = "abcdef"[: columns.shape[1]]
+    return explain._untold(SimpleNamespace(
+        jacobian=columns, whitening=lambda values: values, free=list(range(len(names))), chi2=1.0,
+        values=torch.ones(len(names), dtype=F64), sd=lambda: torch.tensor(sd, dtype=F64),
+        problem=SimpleNamespace(parameters=[tc.Parameter(name) for name in names],
+                                recording=SimpleNamespace(noise=None), n=len(columns)),
+    ))  # fmt: skip
+
+
+def test_a_direction_is_told_where_it_leaves_parameters_open():
+    x = torch.linspace(0, 1, 20, dtype=F64)
+    same = torch.stack([x, x, x**2, 0 * x], dim=1)
+    assert untold(same, [torch.inf, 0.5, 0.01, 0.0]) == (["d"], [["a", "b"]])
+    assert untold(same, [0.01, 0.02, 0.01, 0.0]) == (["d"], [])  # stiff, and each is known well
+    assert untold(same, [0.5, 0.02, 0.01, 0.0]) == (["d"], [])
+    assert untold(same[:, 3:], [0.0]) == (["a"], [])
+
+
+def test_directions_that_share_a_parameter_are_one_line():
+    groups = [["a", "b"], ["c", "d"], ["e"], ["b", "c"], ["f", "g"]]
+    assert explain._merged(groups) == [["e"], ["a", "b", "c", "d"], ["f", "g"]]
+    assert explain._merged([]) == []

@@ -1,0 +1,182 @@
+"""Oscillations in what is left: faster than smooth functions follow, and no noise that a coefficient describes.
+
+A line in the spectrum is neither smooth nor correlated noise. What is left of an output is compared, whitened, with a
+wave of unknown size and phase in every run, at each of the frequencies that the smooth functions are too few for.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.channels import Channel
+from torchcal.discovery.problem import Problem
+
+__all__ = ["Lines", "lines_of"]
+
+#: Fewest data of an output, and of a run of it, in which a line is sought.
+LEAST, LEAST_RUN = 24, 8
+#: Steps of the grid in a gap between data where gaps are uneven, and how far from whole multiples even ones may be.
+FINER, EVEN = 4, 0.02
+#: Cells of the grid for each datum beyond which the data are too uneven for it.
+MOST_CELLS = 16
+#: Waves that the smooth functions follow, for each function; and their share of the fastest that data can show.
+FOLLOWED, FASTEST = 0.25, 0.98
+#: Quantisation step, in noise sd, from which on rounding makes lines of its own.
+COARSE = 1.7
+#: Simulated residuals that are transformed at a time, times cells.
+NUMBERS = 2**22
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Waves of one output at the frequencies of a grid.
+
+    Attributes:
+        channel: The output.
+        driver: Along what: time, or the only condition.
+        along: That, at every datum, ``(n,)``.
+        parts: Places of the data of every run, and their cells on the grid.
+        size: Cells, with as many empty ones behind.
+        first: The slowest frequency, by its number.
+        last: One more than the fastest's.
+        step: Width of a cell.
+    """
+
+    channel: Channel
+    driver: str
+    along: Tensor
+    parts: list[tuple[Tensor, Tensor]]
+    size: int
+    first: int
+    last: int
+    step: float
+
+    @classmethod
+    def of(cls, problem: Problem, channel: Channel, functions: int) -> "Lines | None":
+        """Of an output; None where its data follow in nothing, or are too few or too uneven.
+
+        Args:
+            problem: The used data.
+            channel: Of kind ``"output"``.
+            functions: How many smooth functions are tried along the same.
+        """
+        if problem.order is None:
+            return None
+        number = problem.recording.outputs.index(channel.target)
+        along = problem.order[problem.condition_of]
+        runs = [p for p in problem.sequences if int(problem.output_of[p[0]]) == number and len(p) >= LEAST_RUN]
+        gaps = [along[places].diff() for places in runs]
+        moving = torch.cat([gap[gap > 0] for gap in gaps]) if gaps else torch.zeros(0)
+        count = sum(len(places) for places in runs)
+        if count < LEAST or len(moving) < LEAST // 2:
+            return None
+        usual = float(moving.median())
+        multiple = moving / usual
+        step = usual if float((multiple - multiple.round()).abs().max()) < EVEN else usual / FINER
+        span = max(float(gap.sum()) for gap in gaps)
+        cells = round(span / step) + 1
+        if cells > MOST_CELLS * count:
+            return None
+        parts = [(p, ((along[p] - along[p[0]]) / step).round().long()) for p in runs]
+        size = 2 * cells
+        first = max(math.ceil(FOLLOWED * functions * size * step / span), 1)
+        last = math.floor(FASTEST * 0.5 / usual * size * step) + 1
+        driver = "t" if problem.in_time else next(iter(channel.drivers))
+        return None if last <= first else cls(channel, driver, along, parts, size, first, last, step)
+
+    @property
+    def frequencies(self) -> Tensor:
+        """Of all waves, ``(F,)``."""
+        return torch.arange(self.first, self.last, dtype=torch.float64) / (self.size * self.step)
+
+    def evidence(self, residuals: Tensor, sizes: Tensor) -> tuple[Tensor, Tensor]:
+        """Log evidence of a wave against none, with all frequencies and sizes as likely, in each column ``(B,)``.
+
+        Also returns the likeliest frequency's number in the first column.
+
+        Args:
+            residuals: Whitened, ``(n, B)``.
+            sizes: That are tried, in noise sd.
+        """
+        found: list[Tensor] = []
+        for block in residuals.split(max(1, NUMBERS // self.size), dim=1):
+            logs = torch.full((), -math.inf, dtype=torch.float64)
+            energies = [self._energy(block, *part) for part in self.parts]
+            for size in sizes.tolist():
+                logs = torch.logaddexp(logs, self._log(size, energies))
+            if not found:
+                best = logs[:, 0].argmax()
+            found.append(logs.logsumexp(0))
+        return torch.cat(found) - math.log(len(sizes) * (self.last - self.first)), best
+
+    def wave(self, values: Tensor, whitened: Tensor, number: Tensor, sizes: Tensor) -> tuple[Tensor, float]:
+        """The likeliest wave of one frequency in the residual ``(n,)``, and the χ² that it removes.
+
+        Args:
+            values: The residual.
+            whitened: The same, whitened.
+            number: Of the frequency.
+            sizes: That are tried.
+        """
+        frequency = self.frequencies[number]
+        energies = [self._energy(whitened[:, None], *part)[number, 0] for part in self.parts]
+        logs = torch.stack([self._log(size, energies) for size in sizes.tolist()])
+        size = float(sizes[logs.argmax()])
+        profile, removed = torch.zeros_like(values), 0.0
+        for (places, _), energy in zip(self.parts, energies, strict=True):
+            gain = self._gain(size, places)
+            angle = 2 * math.pi * frequency * self.along[places]
+            design = torch.stack([angle.cos(), angle.sin()], dim=-1)
+            weights = torch.linalg.lstsq(design, values[places, None]).solution
+            profile[places] = gain / (1 + gain) * (design @ weights)[:, 0]
+            removed += (1 - (1 / (1 + gain)) ** 2) * float(energy)
+        return profile, removed
+
+    def _log(self, size: float, energies: Sequence[Tensor]) -> Tensor:
+        """Log evidence of a wave of some size, by the χ² that it removes from every run."""
+        gains = [self._gain(size, places) for places, _ in self.parts]
+        terms = [0.5 * gain / (1 + gain) * energy - math.log1p(gain)
+                 for gain, energy in zip(gains, energies, strict=True)]  # fmt: skip
+        return torch.stack(terms).sum(0)
+
+    def _gain(self, size: float, places: Tensor) -> float:
+        """Squared size of a run's part of a wave."""
+        return size**2 * len(places) / sum(len(p) for p, _ in self.parts)
+
+    def _energy(self, residuals: Tensor, places: Tensor, cells: Tensor) -> Tensor:
+        """χ² that a wave of each frequency removes from a run, ``(F, B)``."""
+        grid = torch.zeros(self.size, residuals.shape[1], dtype=torch.float64).index_add_(0, cells, residuals[places])
+        spectrum = torch.fft.rfft(grid, dim=0)[self.first : self.last]
+        return 2.0 / len(places) * (spectrum.real.square() + spectrum.imag.square())
+
+
+def lines_of(
+    problem: Problem,
+    available: Sequence[Channel],
+    step: Mapping[str, float],
+    sd: Tensor,
+    functions: Callable[[int], int],
+) -> list[Lines]:
+    """Of all outputs but those that are recorded in steps as large as their noise.
+
+    Args:
+        problem: The used data.
+        available: All channels, of which outputs are taken.
+        step: Of quantised outputs.
+        sd: Of the used data, ``(n,)``.
+        functions: How many smooth functions are tried along that what data follow in, by the number of data.
+    """
+    found = []
+    for channel in available:
+        if channel.kind != "output":
+            continue
+        mine = channel.matrix != 0
+        if step.get(channel.target, 0.0) > COARSE * float(sd[mine].median() if bool(mine.any()) else math.inf):
+            continue
+        lines = Lines.of(problem, channel, functions(int(mine.sum())))
+        if lines is not None:
+            found.append(lines)
+    return found

@@ -1,0 +1,193 @@
+"""Where the mismatch sits: the places that the search found, and what a name acts on before them."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.explain import removed
+from torchcal.discovery.model import Model
+from torchcal.discovery.records import Location, MissingRate, NeededShift, Table
+from torchcal.discovery.search import Search
+from torchcal.discovery.structure import Place
+
+__all__ = ["locate", "missing_rate", "needed_shifts"]
+
+#: Share of an output's evidence that counts beside an equation's.
+OUTPUT_SHARE = 0.9
+#: A span begins where the estimated change exceeds this share of its largest magnitude.
+SPAN_LEVEL = 0.3
+#: Log evidence from which on a place is listed, and how many are.
+LEAST_EVIDENCE, LISTED = 2.0, 8
+
+
+def _spans(place: Place) -> tuple[tuple[float, float], ...]:
+    """Ranges of the driver where the change is large; of an oscillation all of it."""
+    values = place.channel.drivers[place.driver]
+    if place.period is not None:
+        return ((float(values.min()), float(values.max())),)
+    return _ranges(values, place.profile)
+
+
+def _ranges(values: Tensor, change: Tensor) -> tuple[tuple[float, float], ...]:
+    """Ranges of some values where a change at them is large."""
+    order = values.argsort(stable=True)
+    along, size = values[order], change[order].abs()
+    high = size >= SPAN_LEVEL * float(size.max())
+    found: list[tuple[float, float]] = []
+    start: float | None = None
+    last = 0.0
+    for value, inside in zip(along.tolist(), high.tolist(), strict=True):
+        if inside and start is None:
+            start = value
+        if not inside and start is not None:
+            found.append((start, last))
+            start = None
+        last = value
+    if start is not None:
+        found.append((start, last))
+    return tuple(found[:6])
+
+
+def locate(search: Search, best: Model | None, *, named: bool = False) -> Table[Location]:
+    """Where the mismatch sits; a local term says it best, and of a name what it acts on comes first.
+
+    Args:
+        search: The finished one.
+        best: The accepted model, or the likeliest of those that are tied; None where there is none.
+        named: Whether it is accepted.
+    """
+    rows = []
+    if best is not None and best.window is not None:
+        w = best.window
+        drivers = search.drivers()[w.driver]
+        low = w.low if math.isfinite(w.low) else float(drivers.min())
+        high = w.high if math.isfinite(w.high) else float(drivers.max())
+        kind, target = _acts_on(best)
+        rows.append(Location(kind, target, w.driver, ((low, high),), removed(search, best), best.log_evidence))
+    sensor = best is not None and _acts_on(best)[0] == "output"  # then it has been shown to be the output
+    places = [
+        place
+        for place in (search.structure.places if sensor else _by_plausibility(search))
+        if place.evidence >= LEAST_EVIDENCE
+    ]
+    if named and best is not None and best.window is None:
+        own = _own_places(search, best)
+        places.sort(key=lambda place: (place.channel.kind, place.channel.target) not in own)
+        if not places or (places[0].channel.kind, places[0].channel.target) not in own:
+            rows.append(_contributed(search, best, [place.driver for place in places]))
+    seen = set()
+    for place in places:
+        key = (place.channel.kind, place.channel.target)
+        if key in seen:
+            continue
+        seen.add(key)
+        rows.append(Location(*key, place.driver, _spans(place), place.share, place.evidence, place.period))
+        if len(seen) >= LISTED:
+            break
+    return Table(rows[:LISTED], ("kind", "target", "driver", "spans", "share", "evidence"))
+
+
+def _own_places(search: Search, model: Model) -> set[tuple[str, str]]:
+    """Kinds and targets of what a model's terms act on; of a parameter that is no place, the equations it acts in."""
+    known = {(place.channel.kind, place.channel.target) for place in search.structure.places}
+    outputs = search.problem.recording.outputs
+    inside = [] if model.structure is None else [c for c in model.structure.channels if c.kind == "parameter"]
+    own: set[tuple[str, str]] = set()
+    for term in model.candidate.terms:
+        if term.rates:
+            own |= {("equation", name) for name in term.rates}
+        elif term.outputs:
+            own |= {("output", name if name in outputs else outputs[0]) for name in term.outputs}  # no name is y
+        else:
+            for name in (*term.shifts, *term.frees):
+                mine = {key for key in known if key[0] == "parameter" and _is_of(key[1], name)}
+                acted = {("equation", state) for c in inside if _is_of(c.target, name) for state in c.rates}
+                own |= mine or acted
+    return own
+
+
+def _is_of(target: str, name: str) -> bool:
+    """Whether a parameter's name is this one, or of its value in one run."""
+    return target == name or target.startswith(f"{name}[")
+
+
+def _contributed(search: Search, model: Model, drivers: Sequence[str]) -> Location:
+    """What a model adds to the data, along the first of some drivers: where no place of the base stands for its term.
+    """
+    found, candidate = model.found, model.candidate
+    without = found.values.clone()
+    without[candidate.own] = candidate.neutral
+    change = found.y - found.problem.evaluate(without[None], [])[0][0]
+    size = (change / search.noise.sd[found.problem.index]).abs().nan_to_num(nan=0.0, posinf=0.0)
+    at_data = found.problem.drivers_at_data(found.values[None], found.warm)
+    driver = next((name for name in drivers if name in at_data), next(iter(at_data)))
+    values, which = at_data[driver].unique(return_inverse=True)
+    largest = torch.zeros_like(values).scatter_reduce(0, which, size.to(values), "amax")
+    kind, target = _acts_on(model)
+    return Location(kind, target, driver, _ranges(values, largest), removed(search, model), model.log_evidence)
+
+
+def _acts_on(model: Model) -> tuple[str, str]:
+    term = model.candidate.terms[0]
+    if term.rates:
+        return "equation", next(iter(term.rates))
+    if term.outputs:
+        return "output", next(iter(term.outputs))
+    return "parameter", next(iter([*term.shifts, *term.frees]))
+
+
+def needed_shifts(search: Search) -> list[NeededShift]:
+    """The shift of each parameter against the driver that it varies with most."""
+    rows: dict[str, Place] = {}
+    for place in search.structure.places:
+        if place.channel.kind == "parameter" and place.channel.target not in rows and place.evidence > 0:
+            rows[place.channel.target] = place
+    result = []
+    for name, place in rows.items():
+        values = place.channel.drivers[place.driver]
+        order = values.argsort(stable=True)
+        pick = order[torch.linspace(0, len(order) - 1, min(60, len(order))).round().long().unique()]
+        a, b = values[pick], place.profile[pick]
+        ranks = [v.argsort().argsort().double() for v in (a, b)]
+        correlation = float(torch.corrcoef(torch.stack(ranks))[0, 1]) if len(pick) > 2 else 0.0
+        result.append(NeededShift(name, place.channel.unit, place.driver, a, b, place.sd[pick], correlation))
+    return result[:6]
+
+
+def _by_plausibility(search: Search) -> list[Place]:
+    """Places by falling evidence; in time an output's must be clearly larger than an equation's.
+
+    A change of an output can copy whatever any equation does to that output, and instruments err in simple ways.
+    """
+    def weight(place: Place) -> float:
+        return place.evidence * (OUTPUT_SHARE if place.channel.kind == "output" and search.problem.in_time else 1.0)
+
+    return sorted(search.structure.places, key=lambda place: -weight(place))
+
+
+def missing_rate(search: Search) -> MissingRate | None:
+    """The best smooth unknown change of one equation or output, or of one parameter of a static simulator.
+
+    A parameter that changes in time and acts in one equation is a missing rate of that equation, in one run: what it
+    does to the rate depends on the states too, which differ between runs at the same time.
+    """
+    kinds = search.problem.kinds
+    for place in _by_plausibility(search):
+        channel = place.channel
+        if place.evidence <= 0:
+            return None
+        kind, target, unit, size = channel.kind, channel.target, channel.unit, torch.ones_like(place.profile)
+        if kind not in kinds:
+            if place.driver != "t" or len(channel.rates) != 1 or len(search.problem.recording.runs or ()) > 1:
+                continue
+            kind = "equation"
+            target, size = next(iter(channel.rates.items()))
+            unit = next((c.unit for c in search.structure.channels if (c.kind, c.target) == (kind, target)), None)
+        values, rate, sd = channel.drivers[place.driver], place.profile * size, place.sd * size.abs()
+        order = values.argsort(stable=True)
+        return MissingRate(
+            kind, target, place.driver, values[order], rate[order], sd[order], unit, channel.time, rate
+        )
+    return None
