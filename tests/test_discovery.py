@@ -1050,9 +1050,15 @@ def test_simulator_and_recording_of_different_kinds():
 
 
 def test_all_parameters_dormant():
-    simulator = tc.Simulator(Costly(0), [tc.Parameter("a", neutral=0.0), tc.Parameter("b", neutral=1.0)])
-    with pytest.raises(tc.errors.DomainError, match="dormant"):
-        quiet(simulator, DATA, [BEND])
+    """There is nothing to calibrate, and one of them may still be what is missing."""
+    simulator = tc.Simulator(
+        lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a", neutral=0.0), tc.Parameter("b", neutral=1.0)]
+    )
+    noise = torch.randn(len(X), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    offset, steeper = tc.Term("offset", frees=("a",)), tc.Term("steeper", frees=("b",))
+    found = quiet(simulator, tc.Recording(x=X, y=X + 0.3 + 0.05 * noise, noise=0.05), [offset, steeper])
+    assert found.terms == ["offset"]
+    assert quiet(simulator, tc.Recording(x=X, y=X + 0.05 * noise, noise=0.05), [offset]).verdict == "consistent"
 
 
 def test_fewer_data_than_parameters():
