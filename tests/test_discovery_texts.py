@@ -310,3 +310,23 @@ def test_directions_that_share_a_parameter_are_one_line():
     groups = [["a", "b"], ["c", "d"], ["e"], ["b", "c"], ["f", "g"]]
     assert explain._merged(groups) == [["e"], ["a", "b", "c", "d"], ["f", "g"]]
     assert explain._merged([]) == []
+
+
+@pytest.mark.parametrize(("second", "told"), [(lambda x: x**3, True), (lambda x: torch.sin(40 * x), False)])
+def test_two_terms_that_do_much_the_same_may_stand_for_one_law(second, told):
+    x = torch.linspace(0.3, 1.0, 200, dtype=F64)
+    shapes = torch.stack([torch.ones_like(x), x, second(x)])
+    terms = [tc.Term(name, outputs={"y": lambda x, p, y: y}, parameters=[tc.Parameter("q")]) for name in ("one", "two")]
+    values = torch.tensor([0.3, 1.0, 2.0], dtype=F64)
+    model = SimpleNamespace(
+        found=SimpleNamespace(
+            values=values, y=values @ shapes, whitening=lambda change: change / 0.1,
+            problem=SimpleNamespace(
+                parameters=[tc.Parameter(name) for name in ("a", "one.q", "two.q")],
+                evaluate=lambda rows, columns: (rows @ shapes, None, None),
+            ),
+        ),
+        candidate=SimpleNamespace(terms=terms, own=[1, 2], amplitudes=[1, 2], neutral=torch.zeros(2, dtype=F64)),
+    )  # fmt: skip
+    rows = explain._one_law(model)
+    assert [row.startswith("one and two do much the same here (correlation 0.9") for row in rows] == [True] * told

@@ -1,5 +1,6 @@
 """From the search to the records of a result: how much, what was bent, and what cannot be told."""
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -39,6 +40,8 @@ APART = 5.0
 #: Starts from which what is named is fitted again, and steps; a minimum that is higher by less than `RIVAL` in χ² and
 #: more than `ELSEWHERE` sd away is another one.
 STARTS, AGAIN, RIVAL, ELSEWHERE = 4, 60, 4.0, 4.0
+#: Correlation of what two accepted terms do to the data from which on one law between them may look like their sum.
+ONE_LAW = 0.9
 #: A base parameter that moves by this many sd when a term is added was bent by it.
 BENT = 3.0
 
@@ -180,7 +183,30 @@ def identifiability(search: Search, best: Model | None) -> list[str]:
                 rows.append(
                     f"{search.candidates[j].name} and {candidate.name} are nearly the same here (correlation {c:.3f})"
                 )
-    return rows[:12]
+    return [*([] if best is None else _one_law(best)), *rows][:12]
+
+
+def _one_law(model: Model) -> list[str]:
+    """Pairs of accepted terms that do nearly the same to the data: a law between them looks like their sum."""
+    found, candidate = model.found, model.candidate
+    names = [q.name for q in found.problem.parameters]
+    without = found.values.repeat(len(candidate.terms), 1)
+    for row, term in zip(without, candidate.terms, strict=True):
+        own = {*(term.full(q.name) for q in term.parameters), *term.frees}
+        for i in candidate.amplitudes:
+            if names[i] in own:
+                row[i] = candidate.neutral[candidate.own.index(i)]
+    if len(without) < 2:
+        return []
+    change = found.whitening((found.y - found.problem.evaluate(without, [])[0]).T)
+    unit = change / change.norm(dim=0).clamp_min(1e-300)
+    rows = []
+    for i, j in itertools.combinations(range(len(candidate.terms)), 2):
+        alike = float(unit[:, i] @ unit[:, j])
+        if alike > ONE_LAW:
+            pair = " and ".join(candidate.terms[k].name for k in (i, j))
+            rows.append(f"{pair} do much the same here (correlation {alike:.3f}): one law between them may look like both")
+    return rows
 
 
 def _untold(found: Fitted) -> tuple[list[str], list[list[str]]]:
