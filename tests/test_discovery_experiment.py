@@ -7,6 +7,7 @@ import torch
 
 import torchcal as tc
 from torchcal.discovery import experiment
+from torchcal.discovery.problem import Problem
 from torchcal.simulators import Trajectories
 
 F64 = torch.float64
@@ -102,7 +103,7 @@ def models_of(names: str) -> tuple[list[SimpleNamespace], tc.Recording]:
 
 
 def test_pairs_that_nothing_tells_apart_are_left_aside_and_said(monkeypatch):
-    """Of three models two are alike: 0.4 sd, and 1.9 with more samples. The third is told from both."""
+    """Of three models two are alike: 0.6 sd, and 1.9 with more samples. The third is told from both."""
     models, _ = models_of("abc")
     monkeypatch.setattr(
         experiment, "_separations", lambda pairs, new, noise: [0.6, 19.0, 18.0] if new.n == 9 else [1.9, 99.0, 98.0]
@@ -156,3 +157,31 @@ def test_a_solution_that_blows_up_is_not_bearable():
     )
     noise = SimpleNamespace(sd=torch.full((10,), 0.01, dtype=F64))
     assert not experiment._bearable([model], blank, noise)
+
+
+def drifting(y: torch.Tensor) -> SimpleNamespace:
+    """A model of a constant, and its problem."""
+    ode = tc.ODESimulator(
+        lambda t, s, p, u: {"x": 0 * s["x"] + p["a"]}, {"x": "K"}, [tc.Parameter("a", initial=0.0)], observe=("x",)
+    )
+    t = torch.arange(len(y), dtype=F64)
+    problem = Problem.of(ode, tc.Recording(runs=[tc.Run(time=t, outputs={"x": y}, initial={"x": 0.0})]))
+    return SimpleNamespace(found=SimpleNamespace(problem=problem))
+
+
+def test_more_samples_of_slow_noise_tell_hardly_more():
+    problem = drifting(torch.arange(50, dtype=F64)).found.problem
+    noise = SimpleNamespace(sd=torch.ones(50, dtype=F64), correlation=torch.tensor([0.9], dtype=F64))
+    told = []
+    for times in (1, 4, 16):
+        t = torch.arange(49 * times + 1, dtype=F64) / times
+        blank = tc.Recording(runs=[tc.Run(time=t, outputs={"x": torch.zeros_like(t)}, initial={"x": 0.0})])
+        told.append(float(experiment._whitening(problem, blank, noise).vector(torch.ones_like(t)).norm()))
+    assert told[2] < 1.05 * told[0]
+
+
+def test_an_output_that_was_zero_may_move_but_not_explode():
+    model = drifting(torch.zeros(50, dtype=F64))
+    noise = SimpleNamespace(sd=torch.full((50,), 0.1, dtype=F64))
+    assert not experiment._explodes(model, torch.full((50,), 1.0, dtype=F64), noise)
+    assert experiment._explodes(model, torch.full((50,), 1e6, dtype=F64), noise)

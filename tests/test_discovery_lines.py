@@ -6,6 +6,8 @@ import pytest
 import torch
 
 import torchcal as tc
+from torchcal.discovery.local import Span
+from torchcal.discovery.screen import _cuts
 
 F64 = torch.float64
 
@@ -59,6 +61,48 @@ def test_white_noise_has_no_line(uneven):
     assert [diagnosed(*rippled(8, 0.0, seed=s, uneven=uneven), None).verdict for s in range(4)] == ["consistent"] * 4
 
 
+def test_a_ripple_of_another_phase_in_every_run_is_seen():
+    """Functions that all runs share follow none of them, however slow."""
+    g = torch.Generator().manual_seed(0)
+    t = torch.linspace(0, 10, 60, dtype=F64)
+    runs = []
+    for r in range(5):
+        wave = 0.2 * torch.sin(2 * math.pi * (t / 1.2 + 0.37 * r))
+        y = 5 * torch.exp(-0.2 * t) + wave + 0.05 * torch.randn(60, generator=g, dtype=F64)
+        runs.append(tc.Run(time=t, outputs={"x": y}, initial={"x": 5.0}))
+    d = tc.diagnose(decay(), tc.Recording(runs=runs), [source()], progress=False)
+    assert d.verdict == "unexplained"
+    assert d.where[0].period == pytest.approx(1.2, rel=0.05)
+    assert d.noise.sd["x"] < 0.07
+
+
+def test_a_hum_with_harmonics_is_not_taken_for_noise():
+    g = torch.Generator().manual_seed(2)
+    t = torch.linspace(0, 10, 240, dtype=F64)
+    hum = sum(torch.sin(2 * math.pi * k * t / 0.4 + k) for k in (1, 2, 3))
+    y = 5 * torch.exp(-0.2 * t) + 0.1 * hum + 0.02 * torch.randn(240, generator=g, dtype=F64)
+    d = diagnosed(t, y, None)
+    assert d.verdict == "unexplained"
+    assert d.noise.sd["x"] < 0.04
+
+
+@pytest.mark.parametrize("noise", [0.1 / math.sqrt(12), None])
+def test_rounding_makes_lines_that_are_none(noise):
+    x = torch.linspace(0, 1, 400, dtype=F64)
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, parameters=[tc.Parameter("a"), tc.Parameter("b")])
+    bend = tc.Term("bend", outputs={"y": lambda x, p, y: y + p["c"] * x**2}, parameters=[tc.Parameter("c")])
+    y = (12.3 * x / 0.1).round() * 0.1
+    assert tc.diagnose(line, tc.Recording(x=x, y=y, noise=noise), [bend], progress=False).verdict == "consistent"
+
+
+def test_windows_end_between_values_and_not_inside_ties():
+    levels = torch.tensor([1.0] * 8 + [2.0] * 8 + [3.0] * 8, dtype=F64)
+    assert _cuts(levels, Span.of(levels)) == [0, 8, 16, 24]
+    rests = torch.cat([torch.linspace(0, 1, 20, dtype=F64), 1 + 1e-6 * torch.arange(200, dtype=F64)])
+    cuts = _cuts(rests, Span.of(rests))
+    assert sum(cut < 20 for cut in cuts) >= 6  # half of them where it moves
+
+
 def test_fringes_along_the_only_condition_are_seen():
     g = torch.Generator().manual_seed(1)
     x = torch.linspace(0.4, 0.8, 200, dtype=F64)
@@ -67,6 +111,7 @@ def test_fringes_along_the_only_condition_are_seen():
     bend = tc.Term("bend", outputs={"y": lambda x, p, y: y + p["c"] * x**2}, parameters=[tc.Parameter("c")])
     d = tc.diagnose(line, tc.Recording(x=x, y=y), [bend], progress=False)
     assert d.verdict == "unexplained"
+    assert d.where[0].period == pytest.approx(0.013, rel=0.02)
 
 
 def chromatogram() -> tuple[tc.Simulator, torch.Tensor, tc.Term]:
@@ -92,6 +137,21 @@ def test_a_term_whose_tangent_is_the_base_s_is_refitted_where_its_larger_effects
     assert d.terms == ["spreading"]
     s = next(e for row in d.ranking for e in row.estimates if e.name == "spreading.s")
     assert abs(s.value - 0.8) < 4 * s.sd < 0.2
+
+
+def test_it_is_refitted_beside_a_parameter_that_rests_on_its_bound():
+    base, x, spreading = chromatogram()
+    wavy = tc.Simulator(
+        lambda x, p: {"y": base.function(x, p)["y"] - p["c"] * torch.cos(20 * x["d"])},
+        parameters=[*base.parameters, tc.Parameter("c", low=0.0)],
+    )
+    noise = 0.3 * torch.randn(120, generator=torch.Generator().manual_seed(0), dtype=F64)
+    y = 80 * torch.exp(-0.2 * x) / (1 + 0.8 * x) + 0.3 * torch.cos(20 * x) + noise
+    d = tc.diagnose(wavy, tc.Recording(x={"d": x}, y={"y": y}, noise=0.36), [spreading], progress=False)
+    assert d.base.estimates[2].at_bound
+    row = next(row for row in d.ranking if row.terms == ("spreading",))
+    assert row.refitted
+    assert row.misfit_removed > 0.9
 
 
 def test_a_term_that_is_the_base_s_own_at_any_size_is_not():

@@ -2,13 +2,26 @@
 
 import math
 
-__all__ = ["DECADES", "NONE", "percent"]
+__all__ = ["DECADES", "FAR", "NONE", "percent", "up_to"]
 
 NONE = ("none of these",)
 """In place of terms: something that is not among the candidates."""
 
 DECADES = 30.0
 """Ratio of the ends of a positive range from which on it is laid out in its logarithm."""
+
+
+FAR = 100.0
+"""Difference in log evidence, or distance in noise sd, beyond which a number tells nothing more."""
+
+
+def up_to(value: float) -> str:
+    """A difference in log evidence, or a distance in noise sd.
+
+    >>> up_to(3.14159), up_to(7e73)
+    ('3.1', 'more than 100')
+    """
+    return f"more than {FAR:.0f}" if value > FAR else f"{value:.1f}"
 
 
 def percent(share: float | None) -> str:

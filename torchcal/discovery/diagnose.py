@@ -154,7 +154,7 @@ def diagnose(
             if detected and terms and not search.stop.is_set():
                 refit_several(search)
             decision = decide(search, detected, mask)
-            best = decision.best
+            best = decision.best or (search.physical_leader if decision.verdict == "ambiguous" else None)
             if holdout is None and mask is not None and best and _beyond_prediction(search, best.found, mask):
                 mask = verify.within(recording)
                 decision = decide(search, detected, mask)

@@ -100,6 +100,8 @@ def _distance(model: Model, places: Sequence[int], shapes: Sequence[int], size: 
     if left > OPEN:
         return left
     base = [k for k, i in enumerate(found.free) if i not in candidate.own]
+    if not base:
+        return left
     values = found.values.clone()
     values[candidate.own] = candidate.neutral
     jacobian = found.problem.evaluate(values[None], [found.free[k] for k in base])[1][0]
@@ -159,7 +161,10 @@ def _noise_at_data(search: Search, model: Model) -> Tensor:
     problem = model.found.problem
     if not search.exact:
         return beside(search, model).sd[problem.index]
-    left = model.found.residual.square().mean().sqrt()
+    left = torch.zeros(problem.n, dtype=torch.float64)
+    for output in problem.output_of.unique():
+        mine = problem.output_of == output
+        left[mine] = model.found.residual[mine].square().mean().sqrt()
     return torch.maximum(left, ROUNDING * problem.recording.spread[problem.index])
 
 
@@ -176,7 +181,8 @@ def _reading(
 
     y = torch.linspace(1.0, 2.0, len(next(iter(drivers.values()))), dtype=torch.float64)
     try:
-        same = torch.equal(reading(y), reading(y, len(y) // 2))
+        shown = reading(y)
+        same = all(torch.allclose(shown, reading(y, by), rtol=0, atol=0, equal_nan=True) for by in (1, len(y) // 2))
     except Exception:  # the simulator calls it otherwise, and tells what is wrong
         return None
     return reading if same else None

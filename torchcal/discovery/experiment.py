@@ -158,7 +158,7 @@ def _separations(pairs: Sequence[Pair], recording: Recording, noise: Noise) -> l
             y, jacobian = _predict(model.found, recording)
         except TorchcalError:
             return None
-        if not bool(torch.isfinite(y).all() and torch.isfinite(jacobian).all()) or _explodes(model, y):
+        if not bool(torch.isfinite(y).all() and torch.isfinite(jacobian).all()) or _explodes(model, y, noise):
             return None
         predictions.append(y)
         slopes.append(jacobian)
@@ -187,18 +187,22 @@ def _separations(pairs: Sequence[Pair], recording: Recording, noise: Noise) -> l
     return distances
 
 
-def _explodes(model: Model, y: Tensor) -> bool:
+def _explodes(model: Model, y: Tensor, noise: Noise) -> bool:
     """Whether any output goes far beyond all that was recorded: no model is right there."""
     recording = model.found.problem.recording
-    for old, new in zip(recording.y.chunk(len(recording.outputs)), y.chunk(len(recording.outputs)), strict=True):
-        if float(new.abs().max()) > FAR * float(old[torch.isfinite(old)].abs().max()):
-            return True
-    return False
+    largest = torch.stack([recording.y.abs(), recording.spread, noise.sd]).nan_to_num(nan=0.0).amax(0)
+    outputs = len(recording.outputs)
+    pairs = zip(largest.chunk(outputs), y.chunk(outputs), strict=True)
+    return any(float(new.abs().max()) > FAR * float(old.max()) for old, new in pairs)
 
 
 def _whitening(problem: Problem, recording: Recording, noise: Noise) -> Whitening:
-    """Of noise at new conditions, as correlated from sample to sample as that of the recording."""
-    return Problem.of(problem.simulator, recording).whitening(_sd(recording, noise), noise.correlation)
+    """Of noise at new conditions, which has the memory of that of the recording, however close samples are."""
+    correlation = noise.correlation
+    if problem.recording.runs and recording.runs:
+        usual = [float(runs[0].time.diff().median()) for runs in (recording.runs, problem.recording.runs)]
+        correlation = correlation ** (usual[0] / usual[1])
+    return Problem.of(problem.simulator, recording).whitening(_sd(recording, noise), correlation)
 
 
 def _sd(recording: Recording, noise: Noise) -> Tensor:
@@ -287,20 +291,22 @@ def _in_time(model: Fitted) -> list[Option]:
 def _static(recording: Recording) -> list[Option]:
     x = recording.x if isinstance(recording.x, dict) else {"x": recording.x}
     found: list[Option] = [("the same conditions again", _blank(recording, x), {"x": x})]
+    spans: list[tuple[str, str, float, float]] = []
+    for name, values in x.items():
+        cuts = values.quantile(torch.tensor([0.0, 1 / 3, 2 / 3, 1.0], dtype=values.dtype)).tolist()
+        spans += [(name, f"between {a:.4g} and {b:.4g}", a, b) for a, b in itertools.pairwise(cuts) if b > a]
     for name, values in x.items():
         low, high = float(values.min()), float(values.max())
         width = high - low
-        spans = [(f"above the recorded range, to {high + 0.5 * width:.4g}", high, high + 0.5 * width)]
+        spans.append((name, f"above the recorded range, to {high + 0.5 * width:.4g}", high, high + 0.5 * width))
         below = low / 3 if 0 < low < 0.5 * width else low - 0.5 * width
         below = max(below, ABSOLUTE_ZERO.get(recording.units.get(name, ""), -math.inf))
         if (below >= 0 or low < 0) and below < low:
-            spans.append((f"below the recorded range, to {below:.4g}", below, low))
-        cuts = values.quantile(torch.tensor([0.0, 1 / 3, 2 / 3, 1.0], dtype=values.dtype)).tolist()
-        spans += [(f"between {a:.4g} and {b:.4g}", a, b) for a, b in itertools.pairwise(cuts) if b > a]
-        for text, first, last in spans:
-            moved = {k: v.clone() for k, v in x.items()}
-            moved[name] = torch.linspace(first, last, recording.n, dtype=torch.float64)
-            found.append((f"conditions with {name} {text}", _blank(recording, moved), {"x": moved}))
+            spans.append((name, f"below the recorded range, to {below:.4g}", below, low))
+    for name, text, first, last in spans:
+        moved = {k: v.clone() for k, v in x.items()}
+        moved[name] = torch.linspace(first, last, recording.n, dtype=torch.float64)
+        found.append((f"conditions with {name} {text}", _blank(recording, moved), {"x": moved}))
     return found
 
 

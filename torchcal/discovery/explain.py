@@ -204,8 +204,8 @@ def _one_law(model: Model) -> list[str]:
     for i, j in itertools.combinations(range(len(candidate.terms)), 2):
         alike = float(unit[:, i] @ unit[:, j])
         if alike > ONE_LAW:
-            pair = " and ".join(candidate.terms[k].name for k in (i, j))
-            rows.append(f"{pair} do much the same here (correlation {alike:.3f}): one law between them may look like both")
+            a, b = candidate.terms[i].name, candidate.terms[j].name
+            rows.append(f"{a} and {b} do much the same here (correlation {alike:.2f}): one law may look like both")
     return rows
 
 

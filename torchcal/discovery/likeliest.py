@@ -22,6 +22,8 @@ __all__ = ["Tangents", "alone", "log_likelihood", "log_normal", "settled", "with
 
 #: Places in `GRID` of the coefficients that are tried beside something unknown, and how often for every output.
 TRIED, ROUNDS = (0, 8, 16, 24, 30, 36), 2
+#: Waves that are taken out of what is left, one after another.
+WAVES = 4
 #: Shares of the noise sd beyond smooth curves that are tried where there are several conditions: these curves may not
 #: bend as much there as what is unknown.
 SMALLER = (1.0, 0.75, 0.5, 0.35, 0.25)
@@ -165,17 +167,20 @@ def with_unknown(
     available = [c for c in channels(problem, model) if c.kind in problem.kinds]
     looks = responses_of(problem, available)
 
-    def likeliest(noise: Noise) -> tuple[Noise, float, Tensor | None]:
-        """Beside what is unknown, among the coefficients and sizes near an estimate."""
+    def likeliest(peeled: list[Fitted]) -> tuple[Noise, float, Tensor | None]:
+        """Beside what is unknown and the waves taken out so far, near what is estimated without these."""
+        noise = estimate(problem, peeled[-1].residual, model.jacobian, given, unit)
         found: dict[_Places, tuple[Noise, float, Tensor | None]] = {}
 
         def evidence(at: _Places) -> float:
             if at not in found:
                 tried = _at(model, noise, *at)
-                residual = Residual(weighed(model, tried.whitening(problem)), tried, draws=0)
-                seen, wave = evidences(residual, looks, available)
+                w = tried.whitening(problem)
+                residuals = [Residual(weighed(one, w), tried, draws=0) for one in peeled]
+                seen, wave = evidences(residuals[-1], looks, available)
                 gain = max(seen) - math.log(len(seen)) if seen else -math.inf
-                like = _log_density(residual.found.whitening, residual.e, tried, tangents, problem)
+                gain += sum(max(evidences(one, (), available)[0], default=0.0) for one in residuals[:-1])
+                like = _log_density(w, residuals[0].e, tried, tangents, problem)
                 found[at] = tried, like + gain, wave
             return found[at][1]
 
@@ -193,10 +198,14 @@ def with_unknown(
                 break
         return found[best]
 
-    noise, evidence, wave = likeliest(estimate(problem, model.residual, model.jacobian, given, unit))
-    if wave is not None:  # no noise is estimated from a wave
-        other = likeliest(estimate(problem, model.residual - wave, model.jacobian, given, unit))
-        noise, evidence = max(((noise, evidence), other[:2]), key=lambda one: one[1])
+    peeled = [model]
+    noise, evidence, wave = likeliest(peeled)
+    while wave is not None and len(peeled) <= WAVES:  # no noise is estimated from a wave
+        peeled.append(dataclasses.replace(peeled[-1], y=peeled[-1].y + wave))
+        fresh, more, wave = likeliest(peeled)
+        if more <= evidence:
+            break
+        noise, evidence = fresh, more
     return noise, evidence
 
 

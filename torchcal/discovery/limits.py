@@ -65,7 +65,8 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
         model = fitted.get(i)
         estimate = float(model.found.values[place]) if model else None
         if i not in effects:
-            note = "tangent vanishes: only large effects can tell" if candidate.blind else "already in the base model"
+            blind = "its tangent tells nothing new: only large effects can"
+            note = blind if candidate.blind else "already in the base model"
             rows.append(Limit(candidate.name, q.name, math.inf, q.unit, power, estimate, note))
             continue
         others = [search.candidates[j].name for j in search.aliases.get(i, ())]

@@ -22,8 +22,9 @@ LEAST, LEAST_RUN = 24, 8
 FINER, EVEN = 4, 0.02
 #: Cells of the grid for each datum beyond which the data are too uneven for it.
 MOST_CELLS = 16
-#: Waves that the smooth functions follow, for each function; and their share of the fastest that data can show.
-FOLLOWED, FASTEST = 0.25, 0.98
+#: Waves that smooth functions follow, for each function, in one run; in several, where phases differ and they follow
+#: none, the fewest of the longest run; and the share of the fastest that data can show.
+FOLLOWED, FEWEST, FASTEST = 0.25, 1.5, 0.98
 #: Quantisation step, in noise sd, from which on rounding makes lines of its own.
 COARSE = 1.7
 #: Simulated residuals that are transformed at a time, times cells.
@@ -55,12 +56,13 @@ class Lines:
     step: float
 
     @classmethod
-    def of(cls, problem: Problem, channel: Channel, functions: int) -> "Lines | None":
+    def of(cls, problem: Problem, channel: Channel, driver: str, functions: int) -> "Lines | None":
         """Of an output; None where its data follow in nothing, or are too few or too uneven.
 
         Args:
             problem: The used data.
             channel: Of kind ``"output"``.
+            driver: What its data follow in.
             functions: How many smooth functions are tried along the same.
         """
         if problem.order is None:
@@ -82,9 +84,9 @@ class Lines:
             return None
         parts = [(p, ((along[p] - along[p[0]]) / step).round().long()) for p in runs]
         size = 2 * cells
-        first = max(math.ceil(FOLLOWED * functions * size * step / span), 1)
+        slowest = FOLLOWED * functions if len(runs) == 1 else FEWEST
+        first = max(math.ceil(slowest * size * step / span), 1)
         last = math.floor(FASTEST * 0.5 / usual * size * step) + 1
-        driver = "t" if problem.in_time else next(iter(channel.drivers))
         return None if last <= first else cls(channel, driver, along, parts, size, first, last, step)
 
     @property
@@ -135,6 +137,13 @@ class Lines:
             removed += (1 - (1 / (1 + gain)) ** 2) * float(energy)
         return profile, removed
 
+    def sd(self, sd: Tensor) -> Tensor:
+        """Of a wave at every datum ``(n,)``, for noise of some sd ``(n,)``; infinite where none is sought."""
+        found = torch.full_like(sd, math.inf)
+        for places, _ in self.parts:
+            found[places] = sd[places] * math.sqrt(2.0 / len(places))
+        return found
+
     def _log(self, size: float, energies: Sequence[Tensor]) -> Tensor:
         """Log evidence of a wave of some size, by the χ² that it removes from every run."""
         gains = [self._gain(size, places) for places, _ in self.parts]
@@ -158,6 +167,7 @@ def lines_of(
     available: Sequence[Channel],
     step: Mapping[str, float],
     sd: Tensor,
+    driver: str,
     functions: Callable[[int], int],
 ) -> list[Lines]:
     """Of all outputs but those that are recorded in steps as large as their noise.
@@ -167,7 +177,8 @@ def lines_of(
         available: All channels, of which outputs are taken.
         step: Of quantised outputs.
         sd: Of the used data, ``(n,)``.
-        functions: How many smooth functions are tried along that what data follow in, by the number of data.
+        driver: What data follow in.
+        functions: How many smooth functions are tried along that, by the number of data.
     """
     found = []
     for channel in available:
@@ -176,7 +187,7 @@ def lines_of(
         mine = channel.matrix != 0
         if step.get(channel.target, 0.0) > COARSE * float(sd[mine].median() if bool(mine.any()) else math.inf):
             continue
-        lines = Lines.of(problem, channel, functions(int(mine.sum())))
+        lines = Lines.of(problem, channel, driver, functions(int(mine.sum())))
         if lines is not None:
             found.append(lines)
     return found

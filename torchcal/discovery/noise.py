@@ -16,7 +16,8 @@ from torchcal.discovery.records import NoiseModel
 from torchcal.errors import DomainError
 
 __all__ = [
-    "GRID", "LEAST", "Noise", "estimate", "growth", "least", "log_prior", "mine", "orthonormal", "smooth_columns",
+    "GRID", "LEAST", "Noise", "estimate", "growth", "least", "log_prior", "mine", "orthonormal", "quantisation",
+    "smooth_columns",
 ]  # fmt: skip
 
 #: AR(1) coefficients that are tried.
@@ -224,7 +225,7 @@ def estimate(
                 sd[mask], freedom = scale * unit[mask], min(freedom, usable)
         elif scale > EXCESS * (1 + 2 / math.sqrt(2 * usable)):
             doubted = max(doubted, scale)
-    step = _quantisation(problem) if given is None else {}
+    step = quantisation(problem) if given is None else {}
     if given is None:
         sd = torch.maximum(sd, least(problem, step))
     source = "given" if isinstance(given, Tensor) else "replicates" if replicated is not None else "estimated"
@@ -340,7 +341,7 @@ def _pure_error(problem: Problem) -> tuple[Tensor, Tensor] | None:
     return (square / freedom).sqrt(), freedom
 
 
-def _quantisation(problem: Problem) -> dict[str, float]:
+def quantisation(problem: Problem) -> dict[str, float]:
     """Step of each output whose values are few multiples of one number."""
     found = {}
     for name, values in problem.recording.split(problem.recording.y).items():

@@ -22,6 +22,8 @@ BENT = 3.0
 APART = 0.1
 #: How many times as large the product of the distances to both neighbours must be in places for a table to be uneven.
 UNEVEN = 2.0
+#: Share of the largest sample below which a bend is rounding.
+ROUNDED = 1e-12
 #: Share of supposed outliers with another one as nearest neighbour above which they are no outliers.
 TOGETHER = 0.4
 #: Probability of as many of them at one value of a condition by chance, below which they are no outliers.
@@ -109,13 +111,16 @@ def _bends(at: Tensor, r: Tensor) -> Tensor:
     third = len(size) // 3
     order = reach.argsort()
     near, far = (float(reach[part].median().clamp_min(1e-300)) for part in (order[:third], order[-third:]))
-    usual = size.median()
+    moving = size > ROUNDED * r.abs().max()
+    if not bool(moving.any()):
+        return torch.zeros_like(r)
+    usual = size[moving].median()  # equal readings at equal conditions tell nothing of the others
     power = 0.0
     if far > UNEVEN * near and float(usual) > 0:
         less, more = (float(size[part].median().clamp_min(1e-300)) for part in (order[:third], order[-third:]))
         power = min(max(math.log(more / less) / math.log(far / near), 0.0), 1.0)
     grown = reach.clamp_min(1e-300) ** power
-    found = 1.4826 * torch.maximum(usual, (size / grown).median() * grown)
+    found = 1.4826 * torch.maximum(usual, (size / grown)[moving].median() * grown)
     return torch.cat([found[:1], found, found[-1:]])
 
 

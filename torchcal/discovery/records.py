@@ -288,7 +288,7 @@ class NeededShift:
 
 @dataclass(frozen=True, eq=False)
 class MissingRate:
-    """A non-parametric estimate of what is missing, as a smooth function of one driver.
+    """A non-parametric estimate of what is missing, as a smooth function of one driver or an oscillation along it.
 
     Attributes:
         kind: ``"equation"``: a rate added to an equation; ``"output"``: a shift of an output.

@@ -242,8 +242,9 @@ def _cuts(ordered: Tensor, span: Span) -> list[int]:
     measure = torch.linspace(0, 1, len(ordered) + 1, dtype=torch.float64)
     between = torch.cat([along[:1], 0.5 * (along[1:] + along[:-1]), along[-1:]])
     measure = 0.5 * (measure + (between - along[0]) / (along[-1] - along[0]))
+    apart = torch.cat([torch.ones(1), ordered.diff(), torch.ones(1)]) > 0  # equal values are on one side
     wanted = torch.linspace(0, 1, CUTS, dtype=torch.float64)
-    return sorted({int((measure - share).abs().argmin()) for share in wanted})
+    return sorted({int((measure - share).abs().masked_fill(~apart, math.inf).argmin()) for share in wanted})
 
 
 def _ends(ordered: Tensor, a: int, b: int) -> tuple[float, float]:

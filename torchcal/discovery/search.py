@@ -326,7 +326,8 @@ class Search:
         found = fit(candidate.problem, w, begin, columns, data=same, max_steps=MADE_UP, finish=0)
         if found is None or found.ends is None or found.ends_chi2 is None:
             return None
-        bound = (found.ends[:, columns] <= low[columns]) | (found.ends[:, columns] >= high[columns])
+        free = [i for i, at in zip(columns, self.base.at_bound.tolist(), strict=True) if not at]
+        bound = (found.ends[:, free] <= low[free]) | (found.ends[:, free] >= high[free])
         seen = (found.ends_chi2 > 1.0 + SEEN * self.problem.n) & ~bound.any(-1)  # where the base is not held back
         return found.ends[seen] if bool(seen.any()) else None
 

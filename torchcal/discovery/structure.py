@@ -16,7 +16,7 @@ from torchcal.discovery.channels import Channel, channels
 from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.lines import Lines, lines_of
 from torchcal.discovery.local import Span
-from torchcal.discovery.noise import GRID, Noise, orthonormal
+from torchcal.discovery.noise import GRID, Noise, orthonormal, quantisation
 from torchcal.discovery.problem import Problem
 
 __all__ = ["Place", "Residual", "Structure", "analyse", "evidences", "responses_of"]
@@ -101,7 +101,7 @@ def _noise_draws(found: Fitted, noise: Noise, draws: int, seed: int) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """An unknown smooth change of one channel against one driver.
+    """An unknown change of one channel against one driver: smooth, or an oscillation.
 
     Attributes:
         channel: Where.
@@ -110,7 +110,7 @@ class Place:
         share: Share of the excess misfit that it removes.
         profile: Estimated change at the channel's points, ``(K,)``.
         sd: Its standard deviation there.
-        size: Chosen prior size.
+        size: Chosen prior size; of an oscillation its amplitude.
         period: Of an oscillation, in units of the driver; None of a smooth change.
     """
 
@@ -244,9 +244,10 @@ def _counts(problem: Problem, data: int, driver: str) -> list[int]:
 def _lines(residual: Residual, available: Sequence[Channel]) -> list[Lines]:
     """Oscillations of every output."""
     problem = residual.found.problem
-    driver = "t" if problem.in_time else ""
+    x = problem.recording.x
+    driver = "t" if problem.in_time else next(iter(x)) if isinstance(x, dict) else "x"
     return lines_of(
-        problem, available, residual.noise.step, residual.found.whitening.sd,
+        problem, available, quantisation(problem), residual.found.whitening.sd, driver,
         lambda data: _counts(problem, data, driver)[-1],
     )  # fmt: skip
 
@@ -256,10 +257,11 @@ def _line_place(lines: Lines, residual: Residual, excess: float) -> Place:
     found = residual.found
     evidence, number = lines.evidence(residual.e[:, None], SIZES)
     profile, removed = lines.wave(found.residual, residual.e, number, SIZES)
-    left = max(float(residual.e.square().sum()) - removed - residual.freedom, 0.0)
-    sd = found.whitening.sd * math.sqrt(2.0 / sum(len(places) for places, _ in lines.parts))
+    taken = 2.0 * len(lines.parts) + 1.0  # two amplitudes in every run, and the frequency
+    left = max(float(residual.e.square().sum()) - removed - residual.freedom + taken, 0.0)
     return Place(
-        lines.channel, lines.driver, float(evidence[0]), 1.0 - min(left / excess, 1.0), profile, sd,
+        lines.channel, lines.driver, float(evidence[0]), 1.0 - min(left / excess, 1.0), profile,
+        lines.sd(found.whitening.sd),
         float(profile.abs().max()), 1.0 / float(lines.frequencies[number]),
     )  # fmt: skip
 
@@ -299,7 +301,7 @@ def _changes(residual: Residual, looks: Sequence[_Look], residuals: Tensor) -> I
 
 
 def analyse(residual: Residual, *, every: bool = False) -> Structure:
-    """Look for smooth changes of every channel against every driver.
+    """Look for smooth changes of every channel against every driver, and for oscillations of every output.
 
     Args:
         residual: The fit's.

@@ -168,7 +168,7 @@ def _by_plausibility(search: Search) -> list[Place]:
 
 
 def missing_rate(search: Search) -> MissingRate | None:
-    """The best smooth unknown change of one equation or output, or of one parameter of a static simulator.
+    """The best unknown change, smooth or a wave, of one equation or output, or of one parameter of a static simulator.
 
     A parameter that changes in time and acts in one equation is a missing rate of that equation, in one run: what it
     does to the rate depends on the states too, which differ between runs at the same time.

@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from torchcal.discovery.channels import RUN
-from torchcal.display import DECADES, NONE, percent
+from torchcal.discovery.local import Span
+from torchcal.discovery.verdict import REMOVED, WHITE
+from torchcal.display import NONE, percent, up_to
 
 __all__ = ["paragraph"]
 
@@ -21,17 +23,12 @@ CLOSE = 3.0
 LISTED, PLAINLY = 0.05, 3.0
 #: Hypotheses that hold a named term and more, and detection limits, of which the paragraph lists so many.
 MORE, LIMITS = 4, 6
-#: Differences in log evidence, and distances in noise sd, beyond which a number tells nothing more.
-FAR = 100.0
 #: Share of a driver's range from which on spans say nothing.
 EVERYWHERE = 0.9
 #: Probability of what hypotheses that hold a name have beside it, from which on it is told.
 BESIDE = 0.005
-#: Probability by noise alone below which what is left is structure; and the share of the misfit that something can
-#: remove at most and be no name: all but what is less than that.
-WHITE, NEARLY_ALL = 0.005, 0.999
-#: Share of the misfit of a recording without noise that a name must remove, on held-out data too.
-REMOVED = 0.9
+#: Share of the misfit that something can remove at most and be no name: all but what is less than that.
+NEARLY_ALL = 0.999
 #: A parameter depends on what acts beside it when that moves it by more than this many of its sd.
 MOVED = 2.0
 
@@ -43,11 +40,6 @@ def _share(share: float) -> str:
 
 def _probability(p: float) -> str:
     return f"{p:.2g}" if p >= 0.001 else "< 0.001"
-
-
-def _up_to(value: float) -> str:
-    """A difference in log evidence, or a distance in noise sd."""
-    return f"more than {FAR:.0f}" if value > FAR else f"{value:.1f}"
 
 
 def _and(names: list[str]) -> str:
@@ -214,14 +206,8 @@ def _everywhere(d: Any, place: Any) -> bool:
         values = d.recording.split(d.base.prediction)[own]
     if values is None or not bool(values.isfinite().all()):
         return False
-    ends = (float(values.min()), float(values.max()))
-    decades = ends[0] > 0 and ends[1] >= DECADES * ends[0]
-
-    def length(low: float, high: float) -> float:
-        low, high = max(low, ends[0]), min(high, ends[1])
-        return 0.0 if high <= low else math.log(high / low) if decades else high - low
-
-    return sum(length(low, high) for low, high in place.spans) >= EVERYWHERE * length(*ends)
+    span = Span.of(values)
+    return span.high <= span.low or sum(max(span.share(*ends), 0.0) for ends in place.spans) >= EVERYWHERE
 
 
 def _elsewhere(d: Any) -> str:
@@ -240,7 +226,7 @@ def _embedded(d: Any) -> str:
     first, second = d.embedded[:2]
     return (
         f" Model error embedded in one parameter at a time is likeliest in {first.parameter} (sd {first.sd:.3g}; "
-        f"{_up_to(first.log_likelihood - second.log_likelihood)} in log-likelihood before {second.parameter})."
+        f"{up_to(first.log_likelihood - second.log_likelihood)} in log-likelihood before {second.parameter})."
     )
 
 
@@ -308,7 +294,7 @@ def _rival(d: Any, probability: float) -> list[str]:
     without = "without it" if len(d.terms) == 1 else "without all of them"
     return [
         f"The next best {without}, {_hypothesis(d, rival)}, has a probability of {_probability(share)} "
-        f"({_up_to(behind)} behind the name in log odds)."
+        f"({up_to(behind)} behind the name in log odds)."
     ]
 
 
@@ -352,7 +338,7 @@ def _depends(d: Any, more: Sequence[Any]) -> list[str]:
 def _experiment(d: Any) -> list[str]:
     if d.experiment is None:
         return []
-    distance = f"predicted distance {_up_to(d.experiment.separation)} noise sd"
+    distance = f"predicted distance {up_to(d.experiment.separation)} noise sd"
     text = f"What would tell them apart: {d.experiment.description} ({distance})"
     untold = [f"{a} from {b}" for a, b in d.experiment.untold]
     return [text + (f"; no simple experiment tells {', or '.join(untold)}." if untold else ".")]
@@ -430,7 +416,7 @@ def _no_name(d: Any, best: Any) -> str:
     left = best.p_white is not None and best.p_white < WHITE
     reasons = []
     if unknown > mine:
-        reasons.append(f"something unknown is likelier by {_up_to(_behind(mine, unknown))} in log odds")
+        reasons.append(f"something unknown is likelier by {up_to(_behind(mine, unknown))} in log odds")
     if left:
         reasons.append(f"what it leaves is not noise (probability {_probability(best.p_white)})")
     elif not reasons and d.noise.source == "given":

@@ -9,7 +9,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from torchcal.display import percent
+from torchcal.display import percent, up_to
 from torchcal.files import check_target, replacing
 from torchcal.plots.discovery import FigurePart, figure_parts
 from torchcal.report.markup import (
@@ -28,8 +28,6 @@ from torchcal.report.markup import (
 
 __all__ = ["page", "write"]
 
-#: Distance in noise sd beyond which a number tells nothing more.
-FAR = 100.0
 
 PACKAGES = ("torchcal", "torch", "pyro-ppl", "numpy", "matplotlib")
 
@@ -165,12 +163,19 @@ def _facts(diagnosis: Any) -> str:
     return f'<dl class="facts">{cells}</dl>'
 
 
+def _spans(item: Any) -> str:
+    """Where a location's change is large, or the period of an oscillation."""
+    if item.period is not None:
+        return f"everywhere, with a period of {in_digits(item.period)}"
+    return ", ".join(f"{in_digits(low)} … {in_digits(high)}" for low, high in item.spans) or "everywhere"
+
+
 def _where(diagnosis: Any, units: Mapping[str, str]) -> str:
     rows = [
         {
             "where": f"{item.kind} {item.target}",
             "varies with": "time" if item.driver == "t" and "time" in units else item.driver,
-            "from … to": ", ".join(f"{in_digits(low)} … {in_digits(high)}" for low, high in item.spans) or "everywhere",
+            "from … to": _spans(item),
             "unit": _unit(units, item.driver),
             "share of misfit": Right(percent(item.share)),
             "log evidence": Right(in_digits(item.evidence)),
@@ -281,8 +286,7 @@ def _experiment(diagnosis: Any) -> str:
     if experiment is None:
         return ""
     rows = [{"condition": str(name), "value": in_words(value)} for name, value in experiment.conditions.items()]
-    far = experiment.separation > FAR
-    distance = f"more than {FAR:.0f}" if far else in_digits(experiment.separation, 3)
+    distance = up_to(experiment.separation)
     text = (
         f"<p>{escaped(experiment.description)}</p><p>The two nearest hypotheses that it tells apart would differ there "
         f"by {escaped(distance)} noise sd.</p>"
