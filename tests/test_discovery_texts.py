@@ -114,9 +114,9 @@ def test_a_parameter_that_was_dormant_is_where_its_contribution_is_large(monkeyp
     first = where.locate(search, best, named=True)[0]
     assert (first.kind, first.target, first.driver) == ("parameter", "c", "z")
     assert first.share > 0.95
-    (left, right) = first.spans  # z⁴ exceeds 0.3 where |z| > 0.74
-    assert left == (-1.0, pytest.approx(-0.74, abs=0.06))
-    assert right == (pytest.approx(0.74, abs=0.06), 1.0)
+    # What no constant and slope can do: z⁴ without its mean is large at the end, and small near 0.67.
+    assert first.spans[0] == (-1.0, pytest.approx(-0.85, abs=0.08))
+    assert not any(low < -0.67 < high for low, high in first.spans)
 
 
 @pytest.mark.parametrize(

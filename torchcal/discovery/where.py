@@ -114,12 +114,10 @@ def _is_of(target: str, name: str) -> bool:
 
 
 def _contributed(search: Search, model: Model, drivers: Sequence[str]) -> Location:
-    """What a model adds to the data, along the first of some drivers: where no place of the base stands for its term.
+    """What a model moves that the base could not, along the first of some drivers: where no place stands for its term.
     """
-    found, candidate = model.found, model.candidate
-    without = found.values.clone()
-    without[candidate.own] = candidate.neutral
-    change = found.y - found.problem.evaluate(without[None], [])[0][0]
+    found = model.found
+    change = found.y - search.base.y
     size = (change / search.noise.sd[found.problem.index]).abs().nan_to_num(nan=0.0, posinf=0.0)
     at_data = found.problem.drivers_at_data(found.values[None], found.warm)
     driver = next((name for name in drivers if name in at_data), next(iter(at_data)))
