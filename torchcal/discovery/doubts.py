@@ -52,9 +52,8 @@ def left_open(search: Search, model: Model) -> str:
     """Why the data do not determine what a model adds; empty if they do."""
     names = [q.name for q in model.found.problem.parameters]
     for term in model.candidate.terms:
-        own = {*(term.full(q.name) for q in term.parameters), *term.frees}
-        shapes = [i for i in model.candidate.own if names[i] in own and not is_window(names[i])]
-        places = [i for i in model.candidate.amplitudes if names[i] in own]
+        shapes = [i for i in model.candidate.own if names[i] in term.brings and not is_window(names[i])]
+        places = [i for i in model.candidate.amplitudes if names[i] in term.brings]
         least = OPEN if model.window is None and not search.exact else OPEN_IN_WINDOW
         # Without noise the misfit is what an amplitude is uncertain by.
         if places and _distance(model, places, shapes, misfit_size(model.found) if search.exact else 1.0) <= least:

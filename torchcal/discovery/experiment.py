@@ -75,12 +75,19 @@ def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
         return None
     problem = models[0].found.problem
     options = _in_time(models[0].found) if problem.in_time else _static(problem.recording)
-    tried = []
+    borne: dict[Tried, bool] = {}
+
+    def bears(one: Tried) -> bool:
+        if one not in borne:
+            borne[one] = _bearable(models, one.option[1], noise)
+        return borne[one]
+
+    tried: list[Tried] = []
     for option in options:
         if (found := _separations(pairs, option[1], noise)) is None:
             continue
         tried.append(Tried(option, found))
-        if min(found) >= PLENTY and _bearable(models, option[1], noise):
+        if min(found) >= PLENTY and bears(tried[-1]):
             break
     hopeless: set[int] = set()
     while tried:
@@ -91,7 +98,7 @@ def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
         best = _best(tried, told)
         if best is None:
             break
-        if not _bearable(models, best.option[1], noise):
+        if not bears(best):
             tried = [one for one in tried if one is not best]
             continue
         plain = best.option

@@ -192,9 +192,8 @@ def _one_law(model: Model) -> list[str]:
     names = [q.name for q in found.problem.parameters]
     without = found.values.repeat(len(candidate.terms), 1)
     for row, term in zip(without, candidate.terms, strict=True):
-        own = {*(term.full(q.name) for q in term.parameters), *term.frees}
         for i in candidate.amplitudes:
-            if names[i] in own:
+            if names[i] in term.brings:
                 row[i] = candidate.neutral[candidate.own.index(i)]
     if len(without) < 2:
         return []
@@ -277,9 +276,7 @@ def formulas(model: Model) -> list[str]:
     """The accepted terms' formulas with their estimates."""
     rows = []
     for term in model.candidate.terms:
-        own = [i for i in model.candidate.own
-               if model.found.problem.parameters[i].name in
-               {*(term.full(q.name) for q in term.parameters), *term.frees}]  # fmt: skip
+        own = [i for i in model.candidate.own if model.found.problem.parameters[i].name in term.brings]
         text = term.formula or term.name
         if model.window is not None:
             w = model.window

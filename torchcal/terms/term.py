@@ -161,6 +161,11 @@ class Term:
         """How results call one of its own parameters."""
         return f"{self.name}.{parameter}"
 
+    @property
+    def brings(self) -> set[str]:
+        """What results call the parameters that it adds or frees."""
+        return {*(self.full(q.name) for q in self.parameters), *self.frees}
+
     def own(self, p: Mapping[str, Any]) -> dict[str, Any]:
         """``p`` as the term's functions see it."""
         return _Own(p, {parameter.name: p[self.full(parameter.name)] for parameter in self.parameters})
