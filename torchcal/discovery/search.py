@@ -1,7 +1,6 @@
 """Every surviving candidate is added and refitted with everything else; evidence and what is left decide."""
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
@@ -11,8 +10,9 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.base import calibrate_base
-from torchcal.discovery.candidates import Candidate, base_columns, drivers_scale, prepare
-from torchcal.discovery.fitting import Fitted, fit, follow_slopes, refit, starts, weighed
+from torchcal.discovery.beginnings import beginnings, first_guess, is_far, larger_effects
+from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
+from torchcal.discovery.fitting import Fitted, refit, weighed
 from torchcal.discovery.likeliest import Tangents, settled, with_unknown
 from torchcal.discovery.local import ENDS, is_window
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
@@ -34,16 +34,6 @@ UNPHYSICAL = math.log(1e-3)
 MOST = 40
 #: Refitted in any case: this many, and those with at least this share of the largest score.
 FEW, CHANCE = 6, 0.2
-#: Shapes that a refit begins at, by their tangents; the same where the base misses the data by more than the root of
-#: `FAR` noise sd.
-SHAPES, SHAPES_FAR, FAR = 3, 8, 30.0
-#: Amplitudes tried from first guesses, as shares of the range or of the largest linear estimate.
-GUESSED = (0.1, 0.4, 0.9)
-#: Sizes, in those of the misfit, at which an effect whose tangent is the base's is looked at; steps in which the base
-#: makes up for it; and the χ² a datum that it must leave to be something else.
-LARGER, MADE_UP, SEEN = (1.0, 4.0), 12, 0.01
-#: Shares of the linear estimate from which refits begin.
-STEPS = (0.05, 1.0)
 #: Log evidence by which something unknown must explain the base's residual better than any noise, to be there.
 CLEARLY = 5.0
 #: Share of the best log evidence below which a model is not fitted again when the noise estimate has changed.
@@ -125,7 +115,7 @@ class Search:
         self.screening = screen(self.residual, self.candidates)
         for i, candidate in enumerate(self.candidates):
             if self.screening.best[i] < 0 and not candidate.blind:
-                self.candidates[i] = dataclasses.replace(candidate, bent=self._bent(candidate))
+                self.candidates[i] = dataclasses.replace(candidate, bent=larger_effects(self.residual, candidate))
         self._alike()
         self.structure = analyse(self.residual, every=True)
         self.local, local_null = windows(self.residual, self.candidates, self.screening)
@@ -203,8 +193,10 @@ class Search:
         top = self.screening.score(order[0]) if order else 0.0
         promising = [i for k, i in enumerate(order) if k < FEW or self.screening.score(i) >= CHANCE * top]
         chosen = promising[:MOST] if detected else order[:FEW]
-        guess = self._guess() if self.far else None
-        wanted = [Hypothetical((i,), self.candidates[i], self._starts(i, guess), prior) for i in [*chosen, *blind]]
+        guess = first_guess(self.base, self.fixed, self.seed) if is_far(self.base) else None
+        chances = [*chosen, *blind]
+        begin = (beginnings(self.residual, self.screening, i, self.candidates[i], guess) for i in chances)
+        wanted = [Hypothetical((i,), self.candidates[i], rows, prior) for i, rows in zip(chances, begin, strict=True)]
         found = self.refit_together(wanted)
         none = {one.numbers[0] for one, model in zip(wanted, found, strict=True) if model is None}
         self.left = none if self.stop.is_set() else set()
@@ -228,134 +220,6 @@ class Search:
     def drivers(self) -> dict[str, Tensor]:
         """What effects may depend on, at every datum of the calibrated base."""
         return self.base.problem.drivers(self.base.values[None], self.base.warm)
-
-    @property
-    def far(self) -> bool:
-        """Whether the base misses the data by so much that its estimates say little of the truth's."""
-        return not self.exact and self.base.chi2 > FAR * self.problem.n
-
-    def _starts(self, i: int, guess: Tensor | None) -> Tensor:
-        """Starting values of a candidate's refit, some of them from the base's first guesses where it is far off."""
-        begin = self._begin(i)
-        return begin if guess is None else torch.cat([begin, self._from_guess(i, begin, guess)])
-
-    def _guess(self) -> Tensor:
-        """First guesses of the base's parameters ``(P,)``, its initial states those recorded."""
-        held = base_columns(self.base.problem, self.fixed)[1]
-        return follow_slopes(self.base.problem, starts(self.base.problem, 1, self.seed, held))[0]
-
-    def _from_guess(self, i: int, begin: Tensor, guess: Tensor) -> Tensor:
-        """The base before it was bent, with amplitudes of several sizes."""
-        candidate, base = self.candidates[i], self.base
-        row = begin[0].clone()
-        row[candidate.amplitudes] = torch.tensor(
-            [float(candidate.neutral[candidate.own.index(place)]) for place in candidate.amplitudes], dtype=row.dtype
-        )
-        names = [q.name for q in candidate.problem.parameters]
-        for k in base.free:
-            row[names.index(base.problem.parameters[k].name)] = guess[k]
-        rows = []
-        for place in candidate.amplitudes:
-            q = candidate.problem.parameters[place]
-            neutral = float(candidate.neutral[candidate.own.index(place)])
-            if q.low is not None and q.high is not None:
-                values = [q.low + (q.high - q.low) * share for share in GUESSED]
-            else:
-                step = float((begin[:, place] - neutral).abs().max())
-                values = [neutral + sign * factor * step for factor in GUESSED for sign in (1.0, -1.0)]
-            for value in values:
-                if q.contains(value) and value != neutral:
-                    rows.append(row.clone())
-                    rows[-1][place] = value
-        return torch.stack(rows) if rows else begin[:0]
-
-    def _begin(self, i: int) -> Tensor:
-        """Starting values of a candidate's refit: the linear estimate at its best shapes."""
-        candidate = self.candidates[i]
-        mine = (self.screening.owner == i).nonzero()[:, 0]
-        usable = mine[self.screening.norm[mine] > 0]
-        if len(usable) == 0:
-            return self._blind_begin(candidate)
-        rows, used = [], set()
-        # The tangents of an effect that is far from small say little of which shape it has.
-        far = self.far
-        for column in usable[self.screening.z[usable].argsort(descending=True)].tolist():
-            g = int(self.screening.shape[column])
-            if g in used:
-                continue
-            used.add(g)
-            a = int(self.screening.amplitude[column])
-            signed = float(self.screening.columns[:, column] @ self.residual.e) / float(self.screening.norm[column])
-            for factor in STEPS if len(used) == 1 or far else STEPS[:1]:
-                rows.append(self._step_along(candidate, g, a, factor * signed))
-            if len(used) == (SHAPES_FAR if far else SHAPES):
-                break
-        return torch.stack(rows)
-
-    def _step_along(self, candidate: Candidate, shape: int, amplitude: int, size: float) -> Tensor:
-        """The base's estimate with an amplitude of some size, and the rest moved to make up for it (linearised)."""
-        row = candidate.begin.clone()
-        row[candidate.own] = candidate.shapes[shape]
-        row[candidate.amplitudes[amplitude]] += size
-        change = self.made_up(candidate.tangents[shape, :, amplitude])
-        names = [q.name for q in candidate.problem.parameters]
-        for i, moved in zip(self.base.free, change.tolist(), strict=True):
-            row[names.index(self.base.problem.parameters[i].name)] -= size * moved
-        return row
-
-    def _bent(self, candidate: Candidate) -> Tensor | None:
-        """Larger effects of a candidate whose tangents are the base's, as starts of a refit; None where these are too.
-
-        At each size the base's parameters make up for the effect as far as they can.
-        """
-        names = [q.name for q in candidate.problem.parameters]
-        columns = [names.index(self.base.problem.parameters[i].name) for i in self.base.free]
-        low, high = candidate.problem.limits()
-        w = self.noise.whitening(candidate.problem)
-        least = max(float(self.residual.e.norm()), math.sqrt(self.problem.n))
-        rows = []
-        for g, a in itertools.product(range(len(candidate.shapes)), range(len(candidate.amplitudes))):
-            effect = float(w.vector(candidate.tangents[g, :, a]).norm())
-            side = candidate.one_sided(candidate.amplitudes[a])
-            for share, sign in itertools.product(LARGER if effect > 0 else (), (side,) if side else (1, -1)):
-                rows.append(self._step_along(candidate, g, a, sign * share * least / effect).clamp(low, high))
-        if not rows:
-            return None
-        begin = torch.stack(rows)
-        same = self.base.y.expand(len(begin), -1)
-        found = fit(candidate.problem, w, begin, columns, data=same, max_steps=MADE_UP, finish=0)
-        if found is None or found.ends is None or found.ends_chi2 is None:
-            return None
-        free = [i for i, at in zip(columns, self.base.at_bound.tolist(), strict=True) if not at]
-        bound = (found.ends[:, free] <= low[free]) | (found.ends[:, free] >= high[free])
-        seen = (found.ends_chi2 > 1.0 + SEEN * self.problem.n) & ~bound.any(-1)  # where the base is not held back
-        return found.ends[seen] if bool(seen.any()) else None
-
-    def made_up(self, effect: Tensor) -> Tensor:
-        """The change of the base's free parameters that has most of an effect on the data ``(n,)``, to first order."""
-        w = self.base.whitening
-        slope = w(self.base.jacobian)
-        unit = slope.norm(dim=0).clamp_min(1e-300)
-        # Along directions that move no datum the parameters stay where they are.
-        found = torch.linalg.lstsq(slope / unit, w(effect[:, None]), rcond=1e-7, driver="gelsd")
-        return found.solution[:, 0] / unit
-
-    def _blind_begin(self, candidate: Candidate) -> Tensor:
-        """Amplitudes of all magnitudes, where the tangent says nothing."""
-        if candidate.bent is not None:
-            return candidate.bent
-        rows = []
-        for place in candidate.amplitudes:
-            q = candidate.problem.parameters[place]
-            if q.low is not None and q.high is not None:
-                values = [q.low + (q.high - q.low) * k for k in (0.1, 0.3, 0.5, 0.7, 0.9)]
-            else:
-                values = [sign * 10.0**k for k in range(-4, 3) for sign in (1, -1)]
-            for value in values:
-                row = candidate.begin.clone()
-                row[place] = value
-                rows.append(row)
-        return torch.stack(rows)
 
     def refit_one(
         self, numbers: tuple[int, ...], candidate: Candidate, begin: Tensor, prior: float, window: Window | None = None

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchcal.discovery.beginnings import make_up
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare, replaces
 from torchcal.discovery.explain import removed
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
@@ -154,9 +155,7 @@ def _linear_row(search: Search, candidate: Candidate, columns: tuple[int, int]) 
             row[names.index(single.problem.parameters[i].name)] = value
         row[names.index(single.problem.parameters[place].name)] += float(size)
         effect += size * single.tangents[g, :, int(screening.amplitude[column])]
-    for i, moved in zip(search.base.free, search.made_up(effect).tolist(), strict=True):
-        row[names.index(search.base.problem.parameters[i].name)] -= moved
-    return row
+    return make_up(search.base, candidate, row, effect)
 
 
 def _next_terms(search: Search, model: Model) -> list[int]:

@@ -1,0 +1,173 @@
+"""Where the refits of candidates begin: linear estimates, first guesses, and larger effects than tangents show."""
+
+import itertools
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.candidates import Candidate, base_columns
+from torchcal.discovery.fitting import Fitted, fit, follow_slopes, starts
+from torchcal.discovery.screen import Screening
+from torchcal.discovery.structure import Residual
+
+__all__ = ["beginnings", "first_guess", "is_far", "larger_effects", "make_up"]
+
+#: Shapes that a refit begins at, by their tangents; the same where the base misses the data by more than the root of
+#: `FAR` noise sd.
+SHAPES, SHAPES_FAR, FAR = 3, 8, 30.0
+#: Amplitudes tried from first guesses, as shares of the range or of the largest linear estimate.
+GUESSED = (0.1, 0.4, 0.9)
+#: Amplitudes tried where the tangent says nothing: shares of the range, or powers of ten.
+BLIND, MAGNITUDES = (0.1, 0.3, 0.5, 0.7, 0.9), range(-4, 3)
+#: Sizes, in those of the misfit, at which an effect whose tangent is the base's is looked at; steps in which the base
+#: makes up for it; and the χ² a datum that it must leave to be something else.
+LARGER, MADE_UP, SEEN = (1.0, 4.0), 12, 0.01
+#: Shares of the linear estimate from which refits begin.
+STEPS = (0.05, 1.0)
+
+
+def is_far(base: Fitted) -> bool:
+    """Whether the base misses the data by so much that its estimates say little of the truth's."""
+    return base.problem.recording.noise != "none" and base.chi2 > FAR * base.problem.n
+
+
+def beginnings(
+    residual: Residual, screening: Screening, number: int, candidate: Candidate, guess: Tensor | None
+) -> Tensor:
+    """Starting values ``(B, P)`` of a candidate's refit.
+
+    Args:
+        residual: The base's.
+        screening: In which the candidate has this number.
+        number: The candidate's.
+        candidate: What is refitted.
+        guess: First guesses of the base's parameters, to begin at too where the base is far off.
+    """
+    begin = _linear(residual, screening, number, candidate)
+    return begin if guess is None else torch.cat([begin, _from_guess(residual.found, candidate, begin, guess)])
+
+
+def first_guess(base: Fitted, fixed: Mapping[str, float], seed: int) -> Tensor:
+    """First guesses of the base's parameters ``(P,)``, its initial states those recorded."""
+    held = base_columns(base.problem, fixed)[1]
+    return follow_slopes(base.problem, starts(base.problem, 1, seed, held))[0]
+
+
+def make_up(base: Fitted, candidate: Candidate, row: Tensor, effect: Tensor) -> Tensor:
+    """A candidate's starting values, moved to first order so that the base makes up for an effect ``(n,)``."""
+    w = base.whitening
+    slope = w(base.jacobian)
+    unit = slope.norm(dim=0).clamp_min(1e-300)
+    # Along directions that move no datum the parameters stay where they are.
+    change = torch.linalg.lstsq(slope / unit, w(effect[:, None]), rcond=1e-7, driver="gelsd").solution[:, 0] / unit
+    moved = row.clone()
+    moved[_columns(base, candidate)] -= change
+    return moved
+
+
+def larger_effects(residual: Residual, candidate: Candidate) -> Tensor | None:
+    """Larger effects of a candidate whose tangents are the base's, as starts of a refit; None where these are too.
+
+    At each size the base's parameters make up for the effect as far as they can.
+    """
+    base = residual.found
+    columns = _columns(base, candidate)
+    low, high = candidate.problem.limits()
+    w = residual.noise.whitening(candidate.problem)
+    n = base.problem.n
+    least = max(float(residual.e.norm()), math.sqrt(n))
+    rows = []
+    for g, a in itertools.product(range(len(candidate.shapes)), range(len(candidate.amplitudes))):
+        effect = float(w.vector(candidate.tangents[g, :, a]).norm())
+        side = candidate.one_sided(candidate.amplitudes[a])
+        for share, sign in itertools.product(LARGER if effect > 0 else (), (side,) if side else (1, -1)):
+            rows.append(_step_along(base, candidate, g, a, sign * share * least / effect).clamp(low, high))
+    if not rows:
+        return None
+    same = base.y.expand(len(rows), -1)
+    found = fit(candidate.problem, w, torch.stack(rows), columns, data=same, max_steps=MADE_UP, finish=0)
+    if found is None or found.ends is None or found.ends_chi2 is None:
+        return None
+    free = [i for i, at in zip(columns, base.at_bound.tolist(), strict=True) if not at]
+    bound = (found.ends[:, free] <= low[free]) | (found.ends[:, free] >= high[free])
+    seen = (found.ends_chi2 > 1.0 + SEEN * n) & ~bound.any(-1)  # where the base is not held back
+    return found.ends[seen] if bool(seen.any()) else None
+
+
+def _columns(base: Fitted, candidate: Candidate) -> list[int]:
+    """Places of the base's free parameters among the candidate's."""
+    places = {q.name: i for i, q in enumerate(candidate.problem.parameters)}
+    return [places[base.problem.parameters[i].name] for i in base.free]
+
+
+def _step_along(base: Fitted, candidate: Candidate, shape: int, amplitude: int, size: float) -> Tensor:
+    """The base's estimate with an amplitude of some size, and the rest moved to make up for it."""
+    row = candidate.begin.clone()
+    row[candidate.own] = candidate.shapes[shape]
+    row[candidate.amplitudes[amplitude]] += size
+    return make_up(base, candidate, row, size * candidate.tangents[shape, :, amplitude])
+
+
+def _linear(residual: Residual, screening: Screening, number: int, candidate: Candidate) -> Tensor:
+    """The linear estimate of a candidate at its best shapes."""
+    mine = (screening.owner == number).nonzero()[:, 0]
+    usable = mine[screening.norm[mine] > 0]
+    if len(usable) == 0:
+        return _blind(candidate)
+    rows, used = [], set()
+    # The tangents of an effect that is far from small say little of which shape it has.
+    far = is_far(residual.found)
+    for column in usable[screening.z[usable].argsort(descending=True)].tolist():
+        g = int(screening.shape[column])
+        if g in used:
+            continue
+        used.add(g)
+        a = int(screening.amplitude[column])
+        signed = float(screening.columns[:, column] @ residual.e) / float(screening.norm[column])
+        for factor in STEPS if len(used) == 1 or far else STEPS[:1]:
+            rows.append(_step_along(residual.found, candidate, g, a, factor * signed))
+        if len(used) == (SHAPES_FAR if far else SHAPES):
+            break
+    return torch.stack(rows)
+
+
+def _blind(candidate: Candidate) -> Tensor:
+    """Amplitudes of all magnitudes, where the tangent says nothing."""
+    if candidate.bent is not None:
+        return candidate.bent
+    rows = []
+    for place in candidate.amplitudes:
+        q = candidate.problem.parameters[place]
+        if q.low is not None and q.high is not None:
+            values = [q.low + (q.high - q.low) * k for k in BLIND]
+        else:
+            values = [sign * 10.0**k for k in MAGNITUDES for sign in (1, -1)]
+        for value in values:
+            row = candidate.begin.clone()
+            row[place] = value
+            rows.append(row)
+    return torch.stack(rows)
+
+
+def _from_guess(base: Fitted, candidate: Candidate, begin: Tensor, guess: Tensor) -> Tensor:
+    """The base before it was bent, with amplitudes of several sizes."""
+    neutral = {place: float(candidate.neutral[candidate.own.index(place)]) for place in candidate.amplitudes}
+    row = begin[0].clone()
+    for place, value in neutral.items():
+        row[place] = value
+    row[_columns(base, candidate)] = guess[base.free]
+    rows = []
+    for place in candidate.amplitudes:
+        q = candidate.problem.parameters[place]
+        if q.low is not None and q.high is not None:
+            values = [q.low + (q.high - q.low) * share for share in GUESSED]
+        else:
+            step = float((begin[:, place] - neutral[place]).abs().max())
+            values = [neutral[place] + sign * factor * step for factor in GUESSED for sign in (1.0, -1.0)]
+        for value in values:
+            if q.contains(value) and value != neutral[place]:
+                rows.append(row.clone())
+                rows[-1][place] = value
+    return torch.stack(rows) if rows else begin[:0]
