@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from benchmarks.concealed import generate, ideal, score
+from benchmarks.concealed import generate, ideal, models, score
 from benchmarks.concealed.check import tied_correlation
 from benchmarks.concealed.experiment import planted as planted_of
 from benchmarks.concealed.experiment import repeat
@@ -27,11 +28,14 @@ from benchmarks.concealed.families.base import (
     Setting,
     simulate,
     stacked,
+    truth_vector,
 )
 from benchmarks.concealed.families.inputs import uniform
+from torchcal.terms import extend
 
 SUITE = Path(generate.__file__).parent
 STILL = ("dose response", "solar cell", "spring")
+FRESH = ("infusion", "rolling ship", "heat exchanger")
 
 
 def decay(**changes):
@@ -137,13 +141,16 @@ def test_plan_of_the_published_run():
 
 
 def test_families_of_development_and_test():
-    development, test, newest = (set(generate.families_of(seed)) for seed in (999, 1000, 2000))
+    development, test, newest, fresh = (set(generate.families_of(seed)) for seed in (999, 1000, 2000, 3000))
+    assert test == set(generate.families_of(1999))
+    assert newest == set(generate.families_of(2999))
     assert len(development) >= 10
     assert development < test
     assert len(test - development) >= 3
-    assert len(newest) >= 3
+    assert len(newest) == len(fresh) == 3
     assert not newest & test
-    assert newest | test == set(FAMILIES)
+    assert not fresh & (newest | test)
+    assert fresh | newest | test == set(FAMILIES)
 
 
 @pytest.mark.parametrize("family", FAMILIES.values(), ids=list(FAMILIES))
@@ -161,9 +168,61 @@ def test_families_are_well_formed(family):
     assert len(setting.runs) <= 3
 
 
-@pytest.mark.parametrize("name", ["pendulum", "solar cell", "spring", "thermistor", "cooling body"])
+@pytest.mark.parametrize("name", ["pendulum", "solar cell", "spring", "thermistor", "cooling body", *FRESH])
 def test_every_family_has_a_near_tie(name):
     assert np.median([tied_correlation(FAMILIES[name], seed) for seed in range(3)]) > 0.9
+
+
+@pytest.mark.parametrize("name", FRESH)
+def test_the_tool_is_given_the_same_physics(name):
+    """Base and candidates are written twice: both say the same, with everything known. The saturation has a shape."""
+    family, rng = FAMILIES[name], np.random.default_rng(1)
+    setting = family.draw(rng)
+    runs = tuple(replace(run, known=tuple(family.states)) for run in setting.runs)
+    setting = replace(setting, runs=runs, observed=tuple(family.outputs))
+    parameters = {base.name: uniform(rng, *base.draw) for base in family.parameters}
+    theta = truth_vector(family, setting, parameters)
+
+    def truth(planted):
+        return [trace.outputs for trace in simulate(family, setting, theta, planted)]
+
+    def joined(outputs):
+        return np.concatenate([run[output][:, 0] for run in outputs for output in setting.observed])
+
+    plain = truth([])
+    case = {"id": "", "family": name, "noise": None, "units": dict(family.units) | dict(family.states)}
+    if family.static:
+        case |= {"x": {key: list(values) for key, values in setting.x.items()},
+                 "y": {key: list(values[:, 0]) for key, values in plain[0].items()}}  # fmt: skip
+    else:
+        case["runs"] = [
+            {"time": list(run.time), "inputs": {key: list(values) for key, values in run.inputs.items()},
+             "initial": dict(run.initial), "outputs": {key: list(values[:, 0]) for key, values in found.items()}}
+            for run, found in zip(runs, plain, strict=True)
+        ]  # fmt: skip
+    given = models.problem(case)
+    given.simulator.max_step = 0.1
+    candidates = {candidate.name: candidate for candidate in given.candidates}
+    assert {effect.name for effect in family.library} <= set(candidates)
+    assert not {effect.name for effect in family.outside} & set(candidates)
+    seen = []
+    for effect in (None, *family.library):
+        if effect is not None and effect.shapes:
+            continue
+        simulator, values, planted = given.simulator, dict(parameters), []
+        if effect is not None:
+            (amplitude,) = candidates[effect.name].parameters
+            a = 0.1 * effect.guess * (effect.sign or -1)
+            simulator, planted = extend(simulator, [candidates[effect.name]]), [Planted(effect, a)]
+            values[f"{effect.name}.{amplitude.name}"] = a
+        bound = simulator.bind(given.recording)
+        model = bound.at(given.recording.x, setting.observed) if family.static else bound.at(bound.x)
+        found = model(torch.tensor([values[key] for key in bound.names], dtype=torch.float64))
+        exact = truth(planted)
+        np.testing.assert_allclose(found, joined(exact), atol=1e-5 * np.std(joined(plain)), rtol=0)
+        seen.append(np.std(joined(exact) - joined(plain)) > 1e-3 * np.std(joined(plain)))
+    assert not seen[0]
+    assert all(seen[1:])
 
 
 def test_the_truth_is_integrated_tightly():

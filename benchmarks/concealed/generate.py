@@ -59,6 +59,9 @@ FIRST_TEST_SEED = 1000
 NEWEST_SEED = 2000
 """Seeds from here on hold the newest families alone."""
 
+FRESH_SEED = 3000
+"""Seeds from here on hold the fresh families alone."""
+
 
 @dataclass(frozen=True)
 class Draft:
@@ -589,7 +592,8 @@ def write_case(
 def families_of(seed: int) -> list[str]:
     """Names of the families that a set of this seed holds."""
     if seed >= NEWEST_SEED:
-        return [name for name, family in FAMILIES.items() if family.late == 2]
+        late = 3 if seed >= FRESH_SEED else 2
+        return [name for name, family in FAMILIES.items() if family.late == late]
     return [name for name, family in FAMILIES.items() if family.late <= int(seed >= FIRST_TEST_SEED)]
 
 
@@ -599,7 +603,8 @@ def generate(out: Path, cases: int, seed: int, *, progress: bool = True) -> Path
     Args:
         out: Folder, made if need be.
         cases: Number of cases.
-        seed: Below `FIRST_TEST_SEED` for development; from `NEWEST_SEED` on for the newest families alone.
+        seed: Below `FIRST_TEST_SEED` for development; from `NEWEST_SEED` on for the newest families alone, from
+            `FRESH_SEED` on for the fresh ones.
         progress: Whether to say how far it is.
     """
     families = families_of(seed)

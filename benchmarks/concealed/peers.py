@@ -44,6 +44,7 @@ DERIVED = {
     "falling body": {"v": "z"},
     "two masses": {"v1": "x1", "v2": "x2"},
     "orbit": {"vx": "x", "vy": "y"},
+    "rolling ship": {"w": "q"},
 }
 THRESHOLDS = (0.02, 0.05, 0.1, 0.2, 0.4)
 RIDGES = (0.05, 5.0)

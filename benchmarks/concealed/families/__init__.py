@@ -3,6 +3,7 @@
 from benchmarks.concealed.families import (
     chemical,
     electrical,
+    fresh,
     hydraulic,
     late,
     mechanical,
@@ -15,7 +16,7 @@ from benchmarks.concealed.families.base import Family
 
 FAMILIES: dict[str, Family] = {
     family.name: family
-    for module in (mechanical, thermal, hydraulic, chemical, electrical, orbital, still, late, newest)
+    for module in (mechanical, thermal, hydraulic, chemical, electrical, orbital, still, late, newest, fresh)
     for family in module.FAMILIES
 }
 
