@@ -553,3 +553,26 @@ def test_a_hopeless_base_is_a_misfit_whatever_is_left_looks_like(monkeypatch):
         monkeypatch.setattr(rounds, "base_alone", lambda search, alone=alone: alone)
         monkeypatch.setattr(rounds, "refit_local", lambda search: None)
         assert rounds._refit(search, 0.95) is detected
+
+
+@pytest.mark.parametrize("start", [0.0, 259200.0, 1.7e9])
+def test_the_clock_may_begin_anywhere(start):
+    # A sensor's drift, and a rate constant that falls: both count from the first sample.
+    t, rng = np.linspace(0, 600, 120), np.random.default_rng(5)
+    k, drift, fading = 0.004, 5e-4, 0.003
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"A": -p["k"] * s["A"]}, {"A": "mol"}, [tc.Parameter("k", low=0.0, initial=0.003)]
+    )
+    sensor = tc.terms.sensor(("A",), dynamic=False)
+    kinetic = tc.terms.kinetics("A")
+    for wanted, clean in (
+        ({"drift of A.b": drift}, 2 * np.exp(-k * t) + drift * t),
+        ({"deactivation.r": fading}, 2 * np.exp(-k * (1 - np.exp(-fading * t)) / fading)),
+    ):
+        terms = [term for term in sensor + kinetic if term.name in ("drift of A", "offset of A", "deactivation")]
+        y = clean + 0.004 * rng.standard_normal(len(t))
+        d = diagnose(base, tc.Recording(runs=[tc.Run(time=start + t, outputs={"A": y})]), terms)
+        assert d.terms == [next(iter(wanted)).split(".")[0]], str(d)
+        (found,) = [e for e in d.final.estimates if e.name in wanted]
+        assert abs(found.value - wanted[found.name]) < 4 * found.sd
+        assert ("t from" in d.equations[0]) == (start > 0)

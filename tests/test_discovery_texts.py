@@ -1,6 +1,7 @@
 """What a diagnosis says of its numbers: the place of a name, its rivals, spans, bounds, limits and distances."""
 
 import dataclasses
+import math
 import sys
 from types import SimpleNamespace
 
@@ -8,7 +9,7 @@ import pytest
 import torch
 
 import torchcal as tc
-from torchcal.discovery import explain, where, words
+from torchcal.discovery import explain, local, where, words
 from torchcal.discovery.channels import Channel
 from torchcal.discovery.records import Estimate, Experiment, Hypothesis, Limit, Location
 from torchcal.discovery.structure import Place
@@ -330,3 +331,29 @@ def test_two_terms_that_do_much_the_same_may_stand_for_one_law(second, told):
     )  # fmt: skip
     rows = explain._one_law(model)
     assert [row.startswith("one and two do much the same here (correlation 0.9") for row in rows] == [True] * told
+
+
+def test_places_are_told_to_a_thousandth_of_their_extent():
+    spans = ((1.7e9, 1.7e9 + 120.0), (1.7e9 + 300.0, 1.7e9 + 600.0))
+    assert "largest at 1700000000 to 1700000120, 1700000300 to 1700000600)" in words._where(
+        finding(where=[Location("parameter", "k", "c", spans, 0.5, 20.0)])
+    )
+    span = local.Span(2459000.0, 2459030.0, False)
+    assert local.region_text("t", 2459012.345, math.inf, span) == "t > 2459012.35"
+    assert local.region_text("t", 12.3456, 20.0, None) == "12.35 < t < 20"
+
+
+@pytest.mark.parametrize(("noise", "told"), [(0.01, False), (0.03, True)])
+def test_noise_that_is_given_too_large_is_a_symptom(noise, told, monkeypatch):
+    base, recording, terms = parabola(noise=0.01)
+    search, best = captured(monkeypatch, base, tc.Recording(x=recording.x, y=recording.y, noise=noise), terms)
+    search.base = best.found if best is not None else search.base  # what noise alone leaves
+    assert any("times the noise sd that was given" in line for line in explain.symptoms(search, None)) == told
+
+
+def test_a_term_that_frees_what_is_free_is_told():
+    base = tc.Simulator(lambda x, p: p["a"] + p["k"] * x, [tc.Parameter("a"), tc.Parameter("k")])
+    x = torch.linspace(0, 1, 20, dtype=F64)
+    y = 1 + 2 * x + 0.01 * torch.randn(20, generator=torch.Generator().manual_seed(1), dtype=F64)
+    d = tc.diagnose(base, tc.Recording(x=x, y=y), [tc.Term("slope", frees=("k",))], progress=False)
+    assert "slope frees what is calibrated already, and was no candidate" in d.identifiability

@@ -399,3 +399,18 @@ def test_how_a_term_prints_and_what_it_calls_its_parameters() -> None:
     assert term.full("a") == "drag.a"
     assert not term.is_sensor
     assert term.own({"k": 1.0, "a": 2.0, "drag.a": 3.0}) == {"k": 1.0, "a": 3.0, "drag.a": 3.0}
+
+
+def test_elapsed_time_counts_from_where_it_is_told() -> None:
+    def grows(t: Any, s: Any, p: Any, u: Any) -> Any:
+        return p["q"] * t
+
+    options: dict[str, Any] = {"equation": "x", "rate": grows, "parameters": [tc.Parameter("q")], "formula": "q t"}
+    absolute, elapsed = tc.Term("grows", **options), tc.Term("grows", elapsed=True, **options)
+    assert absolute.since(100.0) is absolute
+    assert elapsed.since(0.0) is elapsed
+    begun = elapsed.since(100.0)
+    assert begun.rates["x"](103.0, {}, {"q": 2.0}, {}) == 6.0
+    assert elapsed.rates["x"](103.0, {}, {"q": 2.0}, {}) == 206.0
+    assert begun.since(100.0) is begun  # once is enough
+    assert begun.formula == "q t, t from 100 on"

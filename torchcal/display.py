@@ -1,8 +1,9 @@
 """What text, tables and figures share: how a share is written, what no term is called, when an axis is logarithmic."""
 
 import math
+from collections.abc import Sequence
 
-__all__ = ["DECADES", "FAR", "NONE", "percent", "up_to"]
+__all__ = ["DECADES", "FAR", "NONE", "between", "percent", "placed", "up_to", "with_unit"]
 
 NONE = ("none of these",)
 """In place of terms: something that is not among the candidates."""
@@ -24,6 +25,15 @@ def up_to(value: float) -> str:
     return f"more than {FAR:.0f}" if value > FAR else f"{value:.1f}"
 
 
+def with_unit(amount: str, unit: str | None) -> str:
+    """An amount with its unit, where it has one.
+
+    >>> with_unit("3.2", "m/s"), with_unit("0.06", "1"), with_unit("0.06", None)
+    ('3.2 m/s', '0.06', '0.06')
+    """
+    return amount if unit in (None, "", "1") else f"{amount} {unit}"
+
+
 def percent(share: float | None) -> str:
     """A share as text.
 
@@ -40,3 +50,27 @@ def percent(share: float | None) -> str:
         return ">99.9 %"
     whole = 0.095 <= share < 0.995 or share == 0 or share >= 1
     return f"{100 * share:.0f} %" if whole else f"{100 * share:.1f} %"
+
+
+def placed(value: float, extent: float) -> str:
+    """A place along something, to a thousandth of the extent that is looked at, wherever that begins.
+
+    >>> placed(12.3456, 60.0), placed(1.7e9 + 612.34, 900.0), placed(0.0, 1.0)
+    ('12.35', '1700000612.3', '0')
+    """
+    far = abs(value) / extent if 0 < extent < math.inf and math.isfinite(value) else 0.0
+    return f"{value:.{4 + (max(0, math.ceil(math.log10(far))) if far > 0 else 0)}g}"
+
+
+def between(spans: Sequence[tuple[float, float]], word: str) -> list[str]:
+    """Ranges along something, in words.
+
+    >>> between([(0.0, 2.5), (7.0, 7.0)], "to"), between([(1.7e9, 1.7e9 + 600.0)], "to")
+    (['0 to 2.5', '7'], ['1700000000 to 1700000600'])
+    """
+    ends = [end for span in spans for end in span if math.isfinite(end)]
+    extent = max(ends) - min(ends) if ends else 0.0
+    return [
+        placed(low, extent) if low == high else f"{placed(low, extent)} {word} {placed(high, extent)}"
+        for low, high in spans
+    ]

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -144,10 +144,7 @@ def _blind(candidate: Candidate) -> Tensor:
             values = [q.low + (q.high - q.low) * k for k in BLIND]
         else:
             values = [sign * 10.0**k for k in MAGNITUDES for sign in (1, -1)]
-        for value in values:
-            row = candidate.begin.clone()
-            row[place] = value
-            rows.append(row)
+        rows += _each(candidate.begin, place, values)
     return torch.stack(rows)
 
 
@@ -166,8 +163,13 @@ def _from_guess(base: Fitted, candidate: Candidate, begin: Tensor, guess: Tensor
         else:
             step = float((begin[:, place] - neutral[place]).abs().max())
             values = [neutral[place] + sign * factor * step for factor in GUESSED for sign in (1.0, -1.0)]
-        for value in values:
-            if q.contains(value) and value != neutral[place]:
-                rows.append(row.clone())
-                rows[-1][place] = value
+        rows += _each(row, place, [value for value in values if q.contains(value) and value != neutral[place]])
     return torch.stack(rows) if rows else begin[:0]
+
+
+def _each(row: Tensor, place: int, values: Sequence[float]) -> list[Tensor]:
+    """A row with each of several values at one place."""
+    rows = [row.clone() for _ in values]
+    for one, value in zip(rows, values, strict=True):
+        one[place] = value
+    return rows

@@ -107,6 +107,9 @@ def diagnose(
     check_executor(executor, diagnose)
     given = terms
     terms = [term for term in given if not _contains(simulator, term)]
+    if recording.runs is not None:  # what goes on from the start does so whatever the clock says
+        start = min(float(run.time[0]) for run in recording.runs)
+        terms = [term.since(start) for term in terms]
     problem = Problem.of(simulator, recording)
     try:
         free, held = base_columns(problem, fixed)
@@ -327,7 +330,12 @@ def _result(
         experiment=propose(decision.tied_models, search.noise) if decision.tied_models else None,
         equations=explain.formulas(best) if best else [],
         identifiability=explain.identifiability(search, best)
-        + ([] if best is None else explain.other_minima(search, best)),
+        + ([] if best is None else explain.other_minima(search, best))
+        + [
+            f"{term.name} frees what is calibrated already, and was no candidate"
+            for term in terms
+            if not term.parameters and _contains(simulator, term)
+        ],
         recording=recording,
         simulator=simulator,
         held_out=mask,

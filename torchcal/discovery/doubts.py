@@ -57,7 +57,12 @@ def left_open(search: Search, model: Model) -> str:
         least = OPEN if model.window is None and not search.exact else OPEN_IN_WINDOW
         # Without noise the misfit is what an amplitude is uncertain by.
         if places and _distance(model, places, shapes, misfit_size(model.found) if search.exact else 1.0) <= least:
-            return "The data leave the size of what it adds open: more conditions would tell."
+            bound = [search.base.problem.parameters[i].name for i, at in
+                     zip(search.base.free, search.base.at_bound.tolist(), strict=True) if at]  # fmt: skip
+            tell = "more conditions would tell" if not bound else (
+                f"{bound[0]} runs to its bound in the base; if that bound is wrong, it may be all that is"
+            )  # fmt: skip
+            return f"The data leave the size of what it adds open: {tell}."
     if model.window is not None and _levels(model) < LEVELS:
         return (
             f"It acts in full, or not at all, at hardly more than one value of {model.window.driver}, where something "

@@ -15,6 +15,7 @@ from torchcal.discovery.model import Model
 from torchcal.discovery.noise import Noise
 from torchcal.discovery.problem import Problem, Whitening
 from torchcal.discovery.records import Experiment
+from torchcal.display import between, placed
 from torchcal.errors import TorchcalError
 from torchcal.simulators import Trajectories
 
@@ -259,6 +260,8 @@ def _in_time(model: Fitted) -> list[Option]:
     known = {
         name: float(states[0, 0, 0, i]) for i, name in enumerate(bound.ode.states) if name not in bound.ode.initial
     }
+    unsaid = [name for name in known if name not in first.initial]
+    ask = f", with initial {', '.join(unsaid)} known from elsewhere" if unsaid else ""
     options: list[tuple[str, dict[str, float], float, float]] = [("the first run again", known, 1.0, 1.0)]
     # Only what has had either sign is mirrored: an absolute temperature or an amount cannot be.
     mirrored = bool(known) and all(bool((states[..., i] < 0).any() and (states[..., i] > 0).any())
@@ -291,7 +294,7 @@ def _in_time(model: Fitted) -> list[Option]:
         time = torch.cat([first.time + k * (span + step) for k in range(copies)])
         inputs = {name: strength * values.repeat(copies) for name, values in first.inputs.items()}
         conditions = {"time": time, "initial": initial, "inputs": inputs}
-        found.append((text, Recording(runs=[_run(recording, conditions)]), conditions))
+        found.append((text + ask, Recording(runs=[_run(recording, conditions)]), conditions))
     return found
 
 
@@ -301,15 +304,17 @@ def _static(recording: Recording) -> list[Option]:
     spans: list[tuple[str, str, float, float]] = []
     for name, values in x.items():
         cuts = values.quantile(torch.tensor([0.0, 1 / 3, 2 / 3, 1.0], dtype=values.dtype)).tolist()
-        spans += [(name, f"between {a:.4g} and {b:.4g}", a, b) for a, b in itertools.pairwise(cuts) if b > a]
+        thirds = [(a, b) for a, b in itertools.pairwise(cuts) if b > a]
+        spans += [(name, f"between {text}", *ends) for text, ends in zip(between(thirds, "and"), thirds, strict=True)]
     for name, values in x.items():
         low, high = float(values.min()), float(values.max())
         width = high - low
-        spans.append((name, f"above the recorded range, to {high + 0.5 * width:.4g}", high, high + 0.5 * width))
+        above = high + 0.5 * width
+        spans.append((name, f"above the recorded range, to {placed(above, width)}", high, above))
         below = low / 3 if 0 < low < 0.5 * width else low - 0.5 * width
         below = max(below, ABSOLUTE_ZERO.get(recording.units.get(name, ""), -math.inf))
         if (below >= 0 or low < 0) and below < low:
-            spans.append((name, f"below the recorded range, to {below:.4g}", below, low))
+            spans.append((name, f"below the recorded range, to {placed(below, width)}", below, low))
     for name, text, first, last in spans:
         moved = {k: v.clone() for k, v in x.items()}
         moved[name] = torch.linspace(first, last, recording.n, dtype=torch.float64)

@@ -8,13 +8,14 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.fitting import Fitted, fit, starts
-from torchcal.discovery.local import ENDS, WIDTH_OF_EDGE, is_window, region_text
+from torchcal.discovery.local import ENDS, WIDTH_OF_EDGE, is_window
 from torchcal.discovery.model import Model
 from torchcal.discovery.noise import estimate
 from torchcal.discovery.records import Estimate, Fit
 from torchcal.discovery.screen import Window
 from torchcal.discovery.search import Search
 from torchcal.discovery.structure import Structure
+from torchcal.display import with_unit
 
 __all__ = [
     "estimates",
@@ -44,6 +45,8 @@ STARTS, AGAIN, RIVAL, ELSEWHERE = 4, 60, 4.0, 4.0
 ONE_LAW = 0.9
 #: A base parameter that moves by this many sd when a term is added was bent by it.
 BENT = 3.0
+#: Share of the noise sd that was given below which a residual is told, and the data to spare from which on.
+SMALLER, ENOUGH = 0.5, 20
 
 
 def estimates(found: Fitted, places: Sequence[int], window: Window | None = None) -> tuple[Estimate, ...]:
@@ -143,7 +146,8 @@ def symptoms(search: Search, best: Model | None) -> list[str]:
         is_bent = moved > max(BENT * max(float(sd), 1e-300), 0.001 * abs(e.value))
         with_terms = f"{then[e.name].amount} with {' and '.join(best.names)}" if best is not None else ""
         if at:
-            text = f"{e.name} runs to its bound, {e.value:.4g}{_unit(e.unit)}, in the calibrated base"
+            bound = with_unit(f"{e.value:.4g}", e.unit)
+            text = f"{e.name} runs to its bound, {bound}, in the calibrated base"
             runs.append(f"{text}; it is {with_terms}" if is_bent else text)
         elif is_bent:
             bent.append(f"{e.name} was bent: {e.amount} in the calibrated base, {with_terms}")
@@ -155,11 +159,15 @@ def symptoms(search: Search, best: Model | None) -> list[str]:
         doubted = estimate(left.problem, left.residual, left.jacobian, search.problem.recording.noise).doubted
         if doubted > 1:
             rows.append(f"the residual's fastest part is {doubted:.1f} times the noise sd that was given")
+    free = search.problem.n - len(base.free)
+    if search.noise.source == "given" and free >= ENOUGH:
+        share = math.sqrt(float((base.residual / base.whitening.sd).square().sum()) / free)
+        if share < SMALLER:
+            rows.append(
+                f"the residual is {share:.2g} times the noise sd that was given: with a smaller one, these data would "
+                "show smaller effects"
+            )
     return rows
-
-
-def _unit(unit: str | None) -> str:
-    return f" {unit}" if unit else ""
 
 
 def identifiability(search: Search, best: Model | None) -> list[str]:
@@ -279,7 +287,6 @@ def formulas(model: Model) -> list[str]:
         own = [i for i in model.candidate.own if model.found.problem.parameters[i].name in term.brings]
         text = term.formula or term.name
         if model.window is not None:
-            w = model.window
-            text = f"{text.split(' where ')[0]} where {region_text(w.driver, w.low, w.high)}"
+            text = f"{text.split(' where ')[0]} where {model.where}"
         rows.append(f"{text}, with " + "; ".join(str(e) for e in estimates(model.found, own, model.window)))
     return rows

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchcal.display import DECADES
+from torchcal.display import DECADES, placed
 from torchcal.simulators import Parameter
 from torchcal.terms import Term
 
@@ -122,7 +122,7 @@ def localised(
         outputs={name: (seeing if static else sensing)(function) for name, function in term.outputs.items()},
         shifts={name: around(function) for name, function in term.shifts.items()},
         parameters=[*term.parameters, *ends],
-        formula=f"{term.formula or term.name} where {region_text(driver, low, high)}",
+        formula=f"{term.formula or term.name} where {region_text(driver, low, high, span)}",
         description=term.description,
         scales=term.scales,
     )
@@ -157,8 +157,9 @@ def beyond(parameter: Parameter) -> float:
     return low if parameter.name.endswith(ENDS["from"]) else high
 
 
-def region_text(driver: str, low: float, high: float) -> str:
-    """A range in words."""
+def region_text(driver: str, low: float, high: float, span: Span | None) -> str:
+    """A range of a driver in words; its ends to a thousandth of the span in a recording, where that is known."""
+    extent = 0.0 if span is None else span.high - span.low
     if math.isfinite(low) and math.isfinite(high):
-        return f"{low:.4g} < {driver} < {high:.4g}"
-    return f"{driver} > {low:.4g}" if math.isfinite(low) else f"{driver} < {high:.4g}"
+        return f"{placed(low, extent)} < {driver} < {placed(high, extent)}"
+    return f"{driver} > {placed(low, extent)}" if math.isfinite(low) else f"{driver} < {placed(high, extent)}"

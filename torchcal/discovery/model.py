@@ -60,7 +60,8 @@ class Model:
     @property
     def where(self) -> str | None:
         """Where it acts, if locally, in words."""
-        return None if self.window is None else region_text(self.window.driver, self.window.low, self.window.high)
+        w = self.window
+        return None if w is None else region_text(w.driver, w.low, w.high, w.span)
 
     @property
     def weight(self) -> float:

@@ -8,6 +8,7 @@ from typing import Any, Generic, TypeVar
 
 from torch import Tensor
 
+from torchcal.display import with_unit
 from torchcal.errors import MissingDependencyError
 
 __all__ = [
@@ -100,8 +101,7 @@ class Estimate:
         """Value, sd and unit in words."""
         spread = f" ± {self.sd:.2g}" if math.isfinite(self.sd) else " (not determined)"
         text = f"{self.value:.4g}{spread}"
-        text += f" {self.unit}" if self.unit else ""
-        return text + (" (at its bound)" if self.at_bound else "")
+        return with_unit(text, self.unit) + (" (at its bound)" if self.at_bound else "")
 
 
 @dataclass(frozen=True)

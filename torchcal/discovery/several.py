@@ -26,6 +26,8 @@ ALL = 0.99999
 FROM_LINEAR, NEARLY_SAME = 8, 0.999
 #: Log weight that a term's refit from where a pair ended must gain to take the place of its own.
 BETTER = 1.0
+#: Log weight behind the leading pair down to which that is tried, and for how many pairs.
+CLOSE, AGAIN = 5.0, 3
 #: Correlation of two tangents from which on a candidate is tried in the other's place beside the leading pair's.
 ALIKE = 0.9
 
@@ -59,7 +61,9 @@ def refit_several(search: Search) -> None:
         twins = _refit_sets(search, [(pair, None) for pair in _swapped(search, best) if pair not in pairs], prior)
         fitted += twins
         search.models += twins
-        _alone_again(search, best)
+        close = [m for m in search.models if m.physical and len(m.numbers) == 2 and m.weight > best.weight - CLOSE]
+        for pair in sorted(close, key=lambda m: -m.weight)[:AGAIN]:
+            _alone_again(search, pair)
     if isinstance(search.problem.recording.noise, Tensor):  # else a smaller noise makes physics of any small misfit
         search.reweigh()
     if search.max_terms < 3 or not fitted:

@@ -8,7 +8,7 @@ from typing import Any
 from torchcal.discovery.channels import RUN
 from torchcal.discovery.local import Span
 from torchcal.discovery.verdict import REMOVED, WHITE
-from torchcal.display import NONE, percent, up_to
+from torchcal.display import NONE, between, percent, up_to, with_unit
 
 __all__ = ["paragraph"]
 
@@ -161,7 +161,7 @@ def _consistent(d: Any) -> list[str]:
             )
     if not limits:
         return [nothing]
-    shown = ", ".join(f"{limit.term} {limit.smallest:.3g} {limit.unit or ''}".rstrip() for limit in limits[:LIMITS])
+    shown = ", ".join(with_unit(f"{limit.term} {limit.smallest:.3g}", limit.unit) for limit in limits[:LIMITS])
     more = len(limits) - LIMITS
     others = f", and {more} other{'s' if more > 1 else ''}" if more > 0 else ""
     return [
@@ -174,7 +174,7 @@ def _where(d: Any) -> str:
     if not d.where:
         return ""
     place = d.where[0]
-    spans = ", ".join(f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}" for low, high in place.spans[:3])
+    spans = ", ".join(between(place.spans[:3], "to"))
     everywhere = _everywhere(d, place)
     if place.driver == RUN:
         largest = "" if everywhere else f" (largest in {spans}, counted from 0)"
@@ -362,12 +362,15 @@ def _ambiguous(d: Any) -> list[str]:
     shares = [sum(row.probability for row in d.ranking if set(row.terms) == set(tied)) for tied in known]
     best = max(range(len(known)), key=lambda k: shares[k])
     if all(shares) and shares[best] > PLAINLY * sorted(shares)[-2]:  # another name of the same model has no share
-        others = f"{len(known) - 1} other{'s' if len(known) > 2 else ''}"
+        others = "the other" if len(known) == 2 else f"the {len(known) - 1} others"
         told = f"{_hypothesis(d, known[best])} explains it best (probability {shares[best]:.2f}); these data cannot "
         told += f"exclude {others}."
     else:
         told = f"{len(known)} hypotheses explain it about as well, and these data cannot exclude any of them."
     parts = [_where(d), told]
+    beside = sum(row.probability for row in d.ranking if any(set(tied) < set(row.terms) for tied in known))
+    if beside >= LISTED and not d.settings.get("doubt"):
+        parts.append(f"That another term acts beside one of them has a probability of {beside:.2f}.")
     base = sum(row.probability for row in d.ranking if not row.terms)
     if base >= LISTED:
         parts.append(f"The base alone has a probability of {base:.2f}.")

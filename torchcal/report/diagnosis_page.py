@@ -9,7 +9,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from torchcal.display import percent, up_to
+from torchcal.display import between, percent, up_to
 from torchcal.files import check_target, replacing
 from torchcal.plots.discovery import FigurePart, figure_parts
 from torchcal.report.markup import (
@@ -167,7 +167,7 @@ def _spans(item: Any) -> str:
     """Where a location's change is large, or the period of an oscillation."""
     if item.period is not None:
         return f"everywhere, with a period of {in_digits(item.period)}"
-    return ", ".join(f"{in_digits(low)} … {in_digits(high)}" for low, high in item.spans) or "everywhere"
+    return ", ".join(between(item.spans, "…")).replace("-", "−") or "everywhere"
 
 
 def _where(diagnosis: Any, units: Mapping[str, str]) -> str:

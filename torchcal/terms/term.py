@@ -53,7 +53,10 @@ class Term:
         formula: One line, as a scientist writes it.
         description: One plain sentence.
         scales: For shape parameters without bounds: the state, input, condition or output (``"t"`` for time) on
-            whose scale they are measured; they are then sought between 0.02 and 1 of its largest magnitude.
+            whose scale they are measured; they are then sought between 0.02 and 1 of its largest magnitude, or of the
+            recording's length for ``"t"``.
+        elapsed: Whether t in its functions counts from the recording's first sample, whatever the clock says: of what
+            begins at 0 and goes on. `diagnose` tells when that is; by itself the term counts from 0.
 
     Raises:
         DomainError: If it does nothing, or its parts do not fit together.
@@ -73,6 +76,7 @@ class Term:
     formula: str
     description: str
     scales: dict[str, str] = field(default_factory=dict)
+    elapsed: bool = False
 
     def __init__(
         self,
@@ -90,6 +94,7 @@ class Term:
         formula: str = "",
         description: str = "",
         scales: Mapping[str, str] | None = None,
+        elapsed: bool = False,
     ) -> None:
         if not isinstance(name, str) or not name:
             raise DomainError(f"Expected a term's name (a non-empty string). Got {name!r}.")
@@ -153,6 +158,7 @@ class Term:
         put(self, "formula", formula)
         put(self, "description", description)
         put(self, "scales", dict(scales or {}))
+        put(self, "elapsed", bool(elapsed))
 
     def __repr__(self) -> str:
         return f"Term({self.name!r}: {', '.join([p.name for p in self.parameters] + list(self.frees))})"
@@ -165,6 +171,18 @@ class Term:
     def brings(self) -> set[str]:
         """What results call the parameters that it adds or frees."""
         return {*(self.full(q.name) for q in self.parameters), *self.frees}
+
+    def since(self, start: float) -> "Term":
+        """The term with t counted from ``start`` on, if it asks for elapsed time; itself otherwise."""
+        if not self.elapsed or start == 0.0:
+            return self
+        begun = copy.copy(self)
+        put = object.__setattr__
+        for kind in ("rates", "outputs", "shifts"):
+            put(begun, kind, {name: _later(function, start) for name, function in getattr(self, kind).items()})
+        put(begun, "elapsed", False)
+        put(begun, "formula", f"{self.formula}, t from {start:.12g} on" if self.formula else "")
+        return begun
 
     def own(self, p: Mapping[str, Any]) -> dict[str, Any]:
         """``p`` as the term's functions see it."""
@@ -187,6 +205,10 @@ class Term:
     def is_sensor(self) -> bool:
         """Whether it changes what is seen and nothing else."""
         return bool(self.outputs) and not (self.rates or self.shifts or self.frees)
+
+
+def _later(function: Function, start: float) -> Function:
+    return lambda t, *given: function(t - start, *given)
 
 
 def extend(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
