@@ -401,16 +401,33 @@ def test_how_a_term_prints_and_what_it_calls_its_parameters() -> None:
     assert term.own({"k": 1.0, "a": 2.0, "drag.a": 3.0}) == {"k": 1.0, "a": 3.0, "drag.a": 3.0}
 
 
-def test_elapsed_time_counts_from_where_it_is_told() -> None:
-    def grows(t: Any, s: Any, p: Any, u: Any) -> Any:
-        return p["q"] * t
+def grows(t: Any, s: Any, p: Any, u: Any) -> Any:
+    return p["q"] * t + 0 * s["x"]
 
-    options: dict[str, Any] = {"equation": "x", "rate": grows, "parameters": [tc.Parameter("q")], "formula": "q t"}
-    absolute, elapsed = tc.Term("grows", **options), tc.Term("grows", elapsed=True, **options)
-    assert absolute.since(100.0) is absolute
-    assert elapsed.since(0.0) is elapsed
-    begun = elapsed.since(100.0)
-    assert begun.rates["x"](103.0, {}, {"q": 2.0}, {}) == 6.0
-    assert elapsed.rates["x"](103.0, {}, {"q": 2.0}, {}) == 206.0
-    assert begun.since(100.0) is begun  # once is enough
-    assert begun.formula == "q t, t from 100 on"
+
+@pytest.mark.parametrize(
+    ("elapsed", "ends"), [(None, (210.0, 310.0)), ("recording", (10.0, 110.0)), ("run", (10.0, 10.0))]
+)
+def test_elapsed_time_counts_from_the_first_sample(elapsed: str | None, ends: tuple[float, float]) -> None:
+    # x = t, and x' = t over ten units of time, by clocks that begin at 200 and 300
+    term = tc.Term("grows", outputs={"x": lambda t, s, p, u, y: grows(t, s, p, u)}, parameters=[tc.Parameter("q")],
+                   elapsed=elapsed)  # fmt: skip
+    rate = tc.Term("rate", equation="x", rate=grows, parameters=[tc.Parameter("q")], elapsed=elapsed)
+    base = tc.ODESimulator(lambda t, s, p, u: {"x": 0 * s["x"]}, ["x"], [tc.Parameter("k")])
+    time = np.linspace(0.0, 10.0, 11)
+    runs = [tc.Run(time=clock + time, outputs={"x": 0 * time}, initial={"x": 0.0}) for clock in (200.0, 300.0)]
+    bound = extend(base, [term]).bind(tc.Recording(runs=runs))
+    seen = bound.at(bound.x)(tensor(0.0, 1.0))
+    assert (float(seen[10]), float(seen[-1])) == pytest.approx(ends)
+    bound = extend(base, [rate]).bind(tc.Recording(runs=runs))
+    seen = bound.linearise(bound.x, tensor(0.0, 1.0)[None]).jacobian[0, :, 1]
+    wanted = [0.5 * (end**2 - (end - 10) ** 2) for end in ends]
+    assert (float(seen[10]), float(seen[-1])) == pytest.approx(tuple(wanted))
+
+
+def test_elapsed_time_is_refused_where_there_is_none() -> None:
+    with pytest.raises(DomainError, match='elapsed="recording", "run" or None'):
+        tc.Term("grows", equation="x", rate=grows, parameters=[tc.Parameter("q")], elapsed=True)  # type: ignore[arg-type]
+    static = tc.Term("bend", outputs={"y": lambda x, p, y: y + p["q"]}, parameters=[tc.Parameter("q")], elapsed="run")
+    with pytest.raises(DomainError, match="static simulator, which has no time"):
+        extend(tc.Simulator(lambda x, p: p["a"] * x, [tc.Parameter("a")]), [static])

@@ -12,6 +12,9 @@ DECADES = 30.0
 """Ratio of the ends of a positive range from which on it is laid out in its logarithm."""
 
 
+MOST_DIGITS = 12
+"""More than four that a number is told with at most."""
+
 FAR = 100.0
 """Difference in log evidence, or distance in noise sd, beyond which a number tells nothing more."""
 
@@ -56,20 +59,23 @@ def placed(value: float, extent: float) -> str:
     """A place along something, to a thousandth of the extent that is looked at, wherever that begins.
 
     >>> placed(12.3456, 60.0), placed(1.7e9 + 612.34, 900.0), placed(0.0, 1.0)
-    ('12.35', '1700000612.3', '0')
+    ('12.35', '1700000612', '0')
     """
     far = abs(value) / extent if 0 < extent < math.inf and math.isfinite(value) else 0.0
-    return f"{value:.{4 + (max(0, math.ceil(math.log10(far))) if far > 0 else 0)}g}"
+    return f"{value:.{4 + (min(math.floor(math.log10(far)), MOST_DIGITS) if 10 <= far < math.inf else 0)}g}"
 
 
-def between(spans: Sequence[tuple[float, float]], word: str) -> list[str]:
-    """Ranges along something, in words.
+def between(spans: Sequence[tuple[float, float]], word: str, extent: float | None = None) -> list[str]:
+    """Ranges along something, in words; by default the extent that is looked at is theirs.
 
     >>> between([(0.0, 2.5), (7.0, 7.0)], "to"), between([(1.7e9, 1.7e9 + 600.0)], "to")
     (['0 to 2.5', '7'], ['1700000000 to 1700000600'])
+    >>> between([(1.7e9 + 60.0, 1.7e9 + 60.0)], "to", 600.0)
+    ['1700000060']
     """
-    ends = [end for span in spans for end in span if math.isfinite(end)]
-    extent = max(ends) - min(ends) if ends else 0.0
+    if extent is None:
+        ends = [end for span in spans for end in span if math.isfinite(end)]
+        extent = max(ends) - min(ends) if ends else 0.0
     return [
         placed(low, extent) if low == high else f"{placed(low, extent)} {word} {placed(high, extent)}"
         for low, high in spans

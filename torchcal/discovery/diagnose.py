@@ -107,9 +107,6 @@ def diagnose(
     check_executor(executor, diagnose)
     given = terms
     terms = [term for term in given if not _contains(simulator, term)]
-    if recording.runs is not None:  # what goes on from the start does so whatever the clock says
-        start = min(float(run.time[0]) for run in recording.runs)
-        terms = [term.since(start) for term in terms]
     problem = Problem.of(simulator, recording)
     try:
         free, held = base_columns(problem, fixed)
@@ -119,12 +116,13 @@ def diagnose(
         raise RecordingError(
             f"Expected more data than parameters to calibrate. Got {problem.n} data and {len(free)} free parameters."
         )
-    for term in terms:
+    for term in given:
         if stuck := [name for name in term.frees if name in (fixed or {})]:
             raise DomainError(
                 f"Expected fixed= without the parameters that candidates free. Got {stuck[0]!r}, which the term "
                 f"{term.name!r} frees (leave one of the two out)."
             )
+    for term in terms:
         unknown = [name for name in term.outputs if name not in (*recording.outputs, "y")]  # what has no name is y
         if unknown and not isinstance(simulator, ODESimulator):  # which knows its outputs' names itself
             raise DomainError(f"Expected the term {term.name!r} on outputs of {recording.outputs}. Got {unknown}.")

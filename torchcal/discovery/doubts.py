@@ -59,10 +59,9 @@ def left_open(search: Search, model: Model) -> str:
         if places and _distance(model, places, shapes, misfit_size(model.found) if search.exact else 1.0) <= least:
             bound = [search.base.problem.parameters[i].name for i, at in
                      zip(search.base.free, search.base.at_bound.tolist(), strict=True) if at]  # fmt: skip
-            tell = "more conditions would tell" if not bound else (
-                f"{bound[0]} runs to its bound in the base; if that bound is wrong, it may be all that is"
-            )  # fmt: skip
-            return f"The data leave the size of what it adds open: {tell}."
+            looks = f" {', '.join(bound)} ran to a bound in the base: a bound that is wrong looks like this too."
+            told = "The data leave the size of what it adds open: more conditions would tell."
+            return told + looks if bound else told
     if model.window is not None and _levels(model) < LEVELS:
         return (
             f"It acts in full, or not at all, at hardly more than one value of {model.window.driver}, where something "

@@ -262,7 +262,7 @@ def _in_time(model: Fitted) -> list[Option]:
     }
     unsaid = [name for name in known if name not in first.initial]
     ask = f", with initial {', '.join(unsaid)} known from elsewhere" if unsaid else ""
-    options: list[tuple[str, dict[str, float], float, float]] = [("the first run again", known, 1.0, 1.0)]
+    options: list[tuple[str, dict[str, float], float, float]] = [("the first run again" + ask, known, 1.0, 1.0)]
     # Only what has had either sign is mirrored: an absolute temperature or an amount cannot be.
     mirrored = bool(known) and all(bool((states[..., i] < 0).any() and (states[..., i] > 0).any())
                    for i, name in enumerate(bound.ode.states) if name in known)  # fmt: skip
@@ -277,8 +277,8 @@ def _in_time(model: Fitted) -> list[Option]:
         )
     if first.inputs:
         for factor in (2.0, 0.5, 3.0):
-            options.append((f"a run with {factor:g} times the inputs of the first", known, factor, 1.0))
-    options.append(("a run three times as long as the first", known, 1.0, 3.0))
+            options.append((f"a run with {factor:g} times the inputs of the first{ask}", known, factor, 1.0))
+    options.append((f"a run three times as long as the first{ask}", known, 1.0, 3.0))
     options.append(
         (
             "a run that starts from 2 times the initial states and is twice as long",
@@ -294,7 +294,7 @@ def _in_time(model: Fitted) -> list[Option]:
         time = torch.cat([first.time + k * (span + step) for k in range(copies)])
         inputs = {name: strength * values.repeat(copies) for name, values in first.inputs.items()}
         conditions = {"time": time, "initial": initial, "inputs": inputs}
-        found.append((text + ask, Recording(runs=[_run(recording, conditions)]), conditions))
+        found.append((text, Recording(runs=[_run(recording, conditions)]), conditions))
     return found
 
 

@@ -45,8 +45,9 @@ STARTS, AGAIN, RIVAL, ELSEWHERE = 4, 60, 4.0, 4.0
 ONE_LAW = 0.9
 #: A base parameter that moves by this many sd when a term is added was bent by it.
 BENT = 3.0
-#: Share of the noise sd that was given below which a residual is told, and the data to spare from which on.
-SMALLER, ENOUGH = 0.5, 20
+#: Share of the noise sd that was given below which a white residual is told; its data, and the correlation of
+#: neighbours up to which it is white.
+SMALLER, ENOUGH, WHITE = 0.5, 20, 0.4
 
 
 def estimates(found: Fitted, places: Sequence[int], window: Window | None = None) -> tuple[Estimate, ...]:
@@ -159,13 +160,25 @@ def symptoms(search: Search, best: Model | None) -> list[str]:
         doubted = estimate(left.problem, left.residual, left.jacobian, search.problem.recording.noise).doubted
         if doubted > 1:
             rows.append(f"the residual's fastest part is {doubted:.1f} times the noise sd that was given")
-    free = search.problem.n - len(base.free)
-    if search.noise.source == "given" and free >= ENOUGH:
-        share = math.sqrt(float((base.residual / base.whitening.sd).square().sum()) / free)
-        if share < SMALLER:
+    if search.noise.source == "given":
+        rows += _too_large(search, base if best is None else best.found)
+    return rows
+
+
+def _too_large(search: Search, found: Fitted) -> list[str]:
+    """Outputs whose noise was given much larger than what is left, where that is white: slow noise a fit takes up."""
+    rows = []
+    problem, outputs = found.problem, search.problem.recording.outputs
+    standard = found.residual / search.noise.sd[problem.index]
+    spare = problem.n - len(found.free)
+    for number, name in enumerate(outputs):
+        mine = standard[problem.output_of == number]
+        size = math.sqrt(float(mine.square().mean()) * problem.n / max(spare, 1)) if len(mine) >= ENOUGH else 1.0
+        if size < SMALLER and float(mine[1:] @ mine[:-1]) < WHITE * float(mine @ mine):
+            of = f" of {name}" if len(outputs) > 1 else ""
             rows.append(
-                f"the residual is {share:.2g} times the noise sd that was given: with a smaller one, these data would "
-                "show smaller effects"
+                f"the residual{of} is white and {size:.2g} times the noise sd that was given: with a smaller one, "
+                "these data would show smaller effects"
             )
     return rows
 
@@ -288,5 +301,7 @@ def formulas(model: Model) -> list[str]:
         text = term.formula or term.name
         if model.window is not None:
             text = f"{text.split(' where ')[0]} where {model.where}"
+        if term.elapsed and any(float(run.time[0]) != 0.0 for run in model.found.problem.recording.runs or ()):
+            text += f", t counted from the first sample of the {term.elapsed}"
         rows.append(f"{text}, with " + "; ".join(str(e) for e in estimates(model.found, own, model.window)))
     return rows

@@ -116,7 +116,7 @@ def localised(
         return lambda x, p, y: y + inside(x[driver] if isinstance(x, Mapping) else x, p) * (function(x, p, y) - y)
 
     around = still if static else moving
-    return Term(
+    found = Term(
         term.name,
         rates={state: moving(function) for state, function in term.rates.items()},
         outputs={name: (seeing if static else sensing)(function) for name, function in term.outputs.items()},
@@ -126,6 +126,8 @@ def localised(
         description=term.description,
         scales=term.scales,
     )
+    object.__setattr__(found, "elapsed", term.elapsed)  # its functions count already; the window is on the clock
+    return found
 
 
 def force(span: Span, d: Tensor, p: Mapping[str, Any]) -> Any:

@@ -8,7 +8,7 @@ from typing import Any, Generic, TypeVar
 
 from torch import Tensor
 
-from torchcal.display import with_unit
+from torchcal.display import between, placed, with_unit
 from torchcal.errors import MissingDependencyError
 
 __all__ = [
@@ -70,6 +70,8 @@ def _text(value: Any) -> str:
         return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.4g}"
+    if isinstance(value, tuple) and value and all(isinstance(item, tuple) for item in value):
+        return ", ".join(between(value, "to"))
     if isinstance(value, tuple | list):
         return ", ".join(_text(item) for item in value)
     return str(value)
@@ -100,7 +102,7 @@ class Estimate:
     def amount(self) -> str:
         """Value, sd and unit in words."""
         spread = f" ± {self.sd:.2g}" if math.isfinite(self.sd) else " (not determined)"
-        text = f"{self.value:.4g}{spread}"
+        text = f"{placed(self.value, 100 * self.sd)}{spread}"  # to where the sd begins at least
         return with_unit(text, self.unit) + (" (at its bound)" if self.at_bound else "")
 
 

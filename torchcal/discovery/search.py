@@ -166,10 +166,10 @@ class Search:
 
     def merge(self) -> None:
         """Candidates whose tangents and refits cannot be told apart become one hypothesis, under the first name."""
-        plain = self.plain
+        plain, before = self.plain, self.merged
         self.aliases, self.merged = {}, {}
         for i, k in self.twins.items():
-            a, b = plain.get(i), plain.get(k)
+            a, b = plain.get(i) or before.get(i), plain.get(k)
             if i in self.failed or (a is not None and b is None):
                 continue
             if a is not None and b is not None and (a.physical != b.physical or abs(a.found.chi2 - b.found.chi2) > 0.5):

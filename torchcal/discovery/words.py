@@ -174,7 +174,8 @@ def _where(d: Any) -> str:
     if not d.where:
         return ""
     place = d.where[0]
-    spans = ", ".join(between(place.spans[:3], "to"))
+    span = None if place.driver == RUN else _span(d, place)
+    spans = ", ".join(between(place.spans[:3], "to", None if span is None else span.high - span.low))
     everywhere = _everywhere(d, place)
     if place.driver == RUN:
         largest = "" if everywhere else f" (largest in {spans}, counted from 0)"
@@ -200,14 +201,19 @@ def _everywhere(d: Any, place: Any) -> bool:
     if place.driver == RUN:
         runs = range(len(d.recording.runs or ()))
         return all(any(round(low) <= run <= round(high) for low, high in place.spans) for run in runs)
+    span = _span(d, place)
+    if span is None:
+        return False
+    return span.high <= span.low or sum(max(span.share(*ends), 0.0) for ends in place.spans) >= EVERYWHERE
+
+
+def _span(d: Any, place: Any) -> Span | None:
+    """The range of a place's driver; None where it is not known."""
     values = d.drivers.get(place.driver)
     own = place.driver.removesuffix(" itself")
     if values is None and own in d.recording.outputs:
         values = d.recording.split(d.base.prediction)[own]
-    if values is None or not bool(values.isfinite().all()):
-        return False
-    span = Span.of(values)
-    return span.high <= span.low or sum(max(span.share(*ends), 0.0) for ends in place.spans) >= EVERYWHERE
+    return None if values is None or not bool(values.isfinite().all()) else Span.of(values)
 
 
 def _elsewhere(d: Any) -> str:
@@ -368,7 +374,12 @@ def _ambiguous(d: Any) -> list[str]:
     else:
         told = f"{len(known)} hypotheses explain it about as well, and these data cannot exclude any of them."
     parts = [_where(d), told]
-    beside = sum(row.probability for row in d.ranking if any(set(tied) < set(row.terms) for tied in known))
+    sets = [set(tied) for tied in known]
+    beside = sum(
+        row.probability for row in d.ranking
+        if row.refitted and row.physical and not row.note and set(row.terms) not in sets
+        and any(tied < set(row.terms) for tied in sets)
+    )  # fmt: skip
     if beside >= LISTED and not d.settings.get("doubt"):
         parts.append(f"That another term acts beside one of them has a probability of {beside:.2f}.")
     base = sum(row.probability for row in d.ranking if not row.terms)

@@ -4,6 +4,7 @@ from torchcal.simulators.build import build_surrogate
 from torchcal.simulators.design import Evaluations
 from torchcal.simulators.external import ExternalSimulator
 from torchcal.simulators.held_out import HeldOutError
+from torchcal.simulators.layout import Values
 from torchcal.simulators.ode import ODESimulator
 from torchcal.simulators.parameter import Parameter, Scaling, free_parameters
 from torchcal.simulators.solution import Solution
@@ -24,6 +25,7 @@ __all__ = [
     "Simulator",
     "Solution",
     "Trajectories",
+    "Values",
     "build_surrogate",
     "check_parameters",
     "free_parameters",

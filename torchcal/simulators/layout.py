@@ -1,7 +1,7 @@
 """What each number is that the trajectories of a recording depend on: parameters, each run's own, initial states."""
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -14,7 +14,24 @@ from torchcal.simulators.parameter import Parameter
 if TYPE_CHECKING:
     from torchcal.simulators.ode import ODESimulator
 
-__all__ = ["Layout"]
+__all__ = ["Layout", "Values"]
+
+
+class Values(dict[str, Any]):
+    """Parameters by name, as the functions of a simulator in time get them, and when what they act on began.
+
+    Attributes:
+        first: Time of the recording's first sample.
+        start: Time of the first sample of the run, ``(R,)``, or of each point's run.
+    """
+
+    def __init__(self, values: Mapping[str, Any], first: float = 0.0, start: Any = 0.0) -> None:
+        super().__init__(values)
+        self.first, self.start = first, start
+
+    def like(self, values: Mapping[str, Any]) -> "Values":
+        """Other values at the same points."""
+        return Values(values, self.first, self.start)
 
 
 class Layout:
@@ -32,6 +49,7 @@ class Layout:
 
     def __init__(self, ode: "ODESimulator", recording: Recording, runs: Sequence[Run]) -> None:
         self._states = tuple(ode.states)
+        self._start = torch.tensor([float(run.time[0]) for run in runs], dtype=torch.float64)
         parameters: list[Parameter] = []
         self._places: dict[str, list[int]] = {}
         for parameter in ode.parameters:
@@ -76,18 +94,21 @@ class Layout:
         own = [i for i, (_, run) in sorted(self._owner.items()) if run is not None]
         return (*(self.parameters[i].name for i in own), *self.initial_names)
 
-    def by_name(self, values: Tensor, run_of: Tensor | None = None) -> dict[str, Tensor]:
+    def _values(self, run_of: Tensor | None) -> Values:
+        return Values({}, float(self._start.min()), self._start if run_of is None else self._start[run_of])
+
+    def by_name(self, values: Tensor, run_of: Tensor | None = None) -> Values:
         """Parameters by name, ``(H, 1)`` or ``(H, R)``; those of runs picked by ``run_of`` ``(M,)`` where given."""
-        found = {}
+        found = self._values(run_of)
         for name, places in self._places.items():
             block = values[..., places]
             found[name] = block if len(places) == 1 or run_of is None else block[..., run_of]
         return found
 
-    def leaves(self, values: Tensor, run_of: Tensor, columns: Sequence[int]) -> dict[str, Tensor]:
+    def leaves(self, values: Tensor, run_of: Tensor, columns: Sequence[int]) -> Values:
         """The same, where those of some columns are spread over points ``(H, M)`` as leaves of a graph."""
         wanted = set(columns)
-        found = {}
+        found = self._values(run_of)
         for name, places in self._places.items():
             block = values[..., places]
             spread = block.expand(-1, len(run_of)) if len(places) == 1 else block[..., run_of]

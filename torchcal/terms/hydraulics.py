@@ -145,5 +145,5 @@ def _outlet(outlet: str, h: str, label: str | None, units: Units) -> list[Term]:
         Term(titled("clogging", label),
              shifts={outlet: lambda t, s, p, u: coefficient(s, p, u) * torch.expm1(-p[r] * t)},
              parameters=[amplitude(r, units(0, 1), low=0.0)], formula=f"{outlet} → {outlet} exp(-{r} t)",
-             description="The outlet narrows with time.", elapsed=True),
+             description="The outlet narrows with time.", elapsed="recording"),
     ]  # fmt: skip

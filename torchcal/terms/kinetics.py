@@ -195,7 +195,7 @@ class _Law:
                       amplitude(big, f"1/({amount})", low=0.0), f"1/(1 + {big} {a})",
                       "Catalyst or enzyme is fully occupied at high concentration (Michaelis-Menten, Langmuir)."),
             self.term("deactivation", lambda t, s, p, u: -p[r] * t, amplitude(r, f"1/{time}", low=0.0),
-                      f"exp(-{r} t)", "The catalyst loses its activity with time.", elapsed=True),
+                      f"exp(-{r} t)", "The catalyst loses its activity with time.", elapsed="run"),
         ]  # fmt: skip
         if b is not None:
             found.append(

@@ -124,7 +124,7 @@ def _drift(output: str, unit: str, condition: str | None) -> Term:
     return Term(
         f"drift of {output}", outputs={output: seen}, parameters=[amplitude("b", unit)],
         formula=f"{output} → {output} + b {condition or 't'}", description="The instrument's zero moves steadily.",
-        elapsed=condition is None,
+        elapsed="recording" if condition is None else None,
     )  # fmt: skip
 
 

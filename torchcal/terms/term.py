@@ -9,18 +9,19 @@ from typing import Any
 from torch import Tensor
 
 from torchcal.errors import DomainError, SimulatorError, TorchcalError
-from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories
+from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories, Values
 
 __all__ = ["Term", "extend", "outer"]
 
 Function = Callable[..., Any]
 
 
-class _Own(dict[str, Any]):
+class _Own(Values):
     """``p`` of a term's functions: its own parameters before the simulator's of the same names."""
 
     def __init__(self, outer: Mapping[str, Any], own: Mapping[str, Any]) -> None:
-        super().__init__({**outer, **own})
+        began = outer if isinstance(outer, Values) else Values({})
+        super().__init__({**outer, **own}, began.first, began.start)
         self.outer = outer
 
 
@@ -55,8 +56,8 @@ class Term:
         scales: For shape parameters without bounds: the state, input, condition or output (``"t"`` for time) on
             whose scale they are measured; they are then sought between 0.02 and 1 of its largest magnitude, or of the
             recording's length for ``"t"``.
-        elapsed: Whether t in its functions counts from the recording's first sample, whatever the clock says: of what
-            begins at 0 and goes on. `diagnose` tells when that is; by itself the term counts from 0.
+        elapsed: For what begins at nothing and goes on, whatever the clock says: t in its functions counts from the
+            first sample of the ``"recording"``, or of each ``"run"``. By default t is the recording's own.
 
     Raises:
         DomainError: If it does nothing, or its parts do not fit together.
@@ -76,7 +77,7 @@ class Term:
     formula: str
     description: str
     scales: dict[str, str] = field(default_factory=dict)
-    elapsed: bool = False
+    elapsed: str | None = None
 
     def __init__(
         self,
@@ -94,7 +95,7 @@ class Term:
         formula: str = "",
         description: str = "",
         scales: Mapping[str, str] | None = None,
-        elapsed: bool = False,
+        elapsed: str | None = None,
     ) -> None:
         if not isinstance(name, str) or not name:
             raise DomainError(f"Expected a term's name (a non-empty string). Got {name!r}.")
@@ -146,6 +147,15 @@ class Term:
         for measured in scales or {}:
             if measured not in names:
                 raise DomainError(f"Expected scales of parameters {names} of the term {name!r}. Got {measured!r}.")
+        if elapsed not in (None, "recording", "run"):
+            raise DomainError(
+                f'Expected elapsed="recording", "run" or None for the term {name!r}. Got {elapsed!r}.'
+            )
+        if elapsed is not None:
+            every, outputs, shifts = (
+                {place: _counted(function, elapsed) for place, function in (part or {}).items()}
+                for part in (every, outputs, shifts)
+            )
         put = object.__setattr__
         put(self, "name", name)
         put(self, "rates", every)
@@ -158,7 +168,7 @@ class Term:
         put(self, "formula", formula)
         put(self, "description", description)
         put(self, "scales", dict(scales or {}))
-        put(self, "elapsed", bool(elapsed))
+        put(self, "elapsed", elapsed)
 
     def __repr__(self) -> str:
         return f"Term({self.name!r}: {', '.join([p.name for p in self.parameters] + list(self.frees))})"
@@ -171,18 +181,6 @@ class Term:
     def brings(self) -> set[str]:
         """What results call the parameters that it adds or frees."""
         return {*(self.full(q.name) for q in self.parameters), *self.frees}
-
-    def since(self, start: float) -> "Term":
-        """The term with t counted from ``start`` on, if it asks for elapsed time; itself otherwise."""
-        if not self.elapsed or start == 0.0:
-            return self
-        begun = copy.copy(self)
-        put = object.__setattr__
-        for kind in ("rates", "outputs", "shifts"):
-            put(begun, kind, {name: _later(function, start) for name, function in getattr(self, kind).items()})
-        put(begun, "elapsed", False)
-        put(begun, "formula", f"{self.formula}, t from {start:.12g} on" if self.formula else "")
-        return begun
 
     def own(self, p: Mapping[str, Any]) -> dict[str, Any]:
         """``p`` as the term's functions see it."""
@@ -207,8 +205,10 @@ class Term:
         return bool(self.outputs) and not (self.rates or self.shifts or self.frees)
 
 
-def _later(function: Function, start: float) -> Function:
-    return lambda t, *given: function(t - start, *given)
+def _counted(function: Function, elapsed: str) -> Function:
+    """A function of time that begins with the recording, or with each run."""
+    begun = "first" if elapsed == "recording" else "start"
+    return lambda t, s, p, *given: function(t - getattr(p, begun, 0.0), s, p, *given)
 
 
 def extend(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
@@ -262,9 +262,9 @@ def _shifted(
     terms: Sequence[Term], p: dict[str, Tensor], given: Callable[[dict[str, Any]], tuple[Any, ...]]
 ) -> dict[str, Tensor]:
     """Parameters as the terms shift them, one after another; ``given`` makes of ``p`` what their functions get."""
-    moved = dict(p)
+    moved = p.like(p) if isinstance(p, Values) else dict(p)
     for term in terms:
-        own = given(term.own(dict(moved)))
+        own = given(term.own(moved.like(moved) if isinstance(moved, Values) else dict(moved)))
         for name, function in term.shifts.items():
             moved[name] = moved[name] + term.call(function, *own)
     return moved
@@ -340,6 +340,10 @@ def _sensed(name: str, function: Function, sensors: Sequence[Term], shifted: Fun
 
 def _extend_static(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
     for term in terms:
+        if term.elapsed:
+            raise DomainError(
+                f"Expected a term without elapsed= for a static simulator, which has no time. Got {term.name!r}."
+            )
         if term.rates or term.states:
             raise DomainError(
                 f"Expected a term without rates for a static simulator. Got {term.name!r} (give shifts=, outputs= or "

@@ -148,14 +148,14 @@ def _drift(T: str, loss: str | None, label: str | None, time: str) -> Term:
         return Term(
             titled("ambient drift", label), equation=T, rate=lambda t, s, p, u: p["b"] * t,
             parameters=[amplitude("b", f"K/{time}^2")], formula=f"d{T}/dt ∋ b t", description=description,
-            elapsed=True,
+            elapsed="recording",
         )  # fmt: skip
     coefficient = quantity(check_name(loss, "loss"), "the coefficient of the heat loss")
     b = own_name("b", loss)
     return Term(
         titled("ambient drift", label), equation=T, rate=lambda t, s, p, u: coefficient(s, p, u) * p[b] * t,
         parameters=[amplitude(b, f"K/{time}")], formula=f"d{T}/dt ∋ {loss} {b} t", description=description,
-        elapsed=True,
+        elapsed="recording",
     )  # fmt: skip
 
 
