@@ -57,8 +57,7 @@ def left_open(search: Search, model: Model) -> str:
         least = OPEN if model.window is None and not search.exact else OPEN_IN_WINDOW
         # Without noise the misfit is what an amplitude is uncertain by.
         if places and _distance(model, places, shapes, misfit_size(model.found) if search.exact else 1.0) <= least:
-            bound = [search.base.problem.parameters[i].name for i, at in
-                     zip(search.base.free, search.base.at_bound.tolist(), strict=True) if at]  # fmt: skip
+            bound = search.base.stuck
             looks = f" {', '.join(bound)} ran to a bound in the base: a bound that is wrong looks like this too."
             told = "The data leave the size of what it adds open: more conditions would tell."
             return told + looks if bound else told

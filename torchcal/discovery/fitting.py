@@ -76,6 +76,12 @@ class Fitted:
         """Values of all parameters, free or not."""
         return dict(zip([q.name for q in self.problem.parameters], self.values.tolist(), strict=True))
 
+    @property
+    def stuck(self) -> list[str]:
+        """Names of the free parameters on a bound that they want to cross."""
+        parameters = self.problem.parameters
+        return [parameters[i].name for i, at in zip(self.free, self.at_bound.tolist(), strict=True) if at]
+
     def sd(self) -> Tensor:
         """Standard deviations ``(P,)``; 0 for those held."""
         found = torch.zeros_like(self.values)

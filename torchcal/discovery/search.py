@@ -263,10 +263,8 @@ class Search:
                 low = float(found.values[i]) if names[i].endswith(ENDS["from"]) else low
                 high = float(found.values[i]) if names[i].endswith(ENDS["to"]) else high
             model.window = dataclasses.replace(model.window, low=low, high=high)
-        stuck = [names[i] for i, at in zip(found.free, found.at_bound.tolist(), strict=True) if at]
-        before = [q.name for q, at in zip([self.base.problem.parameters[i] for i in self.base.free],
-                                          self.base.at_bound.tolist(), strict=True) if at]  # fmt: skip
-        new = [name for name in stuck if name not in before and not is_window(name)]
+        before = self.base.stuck
+        new = [name for name in found.stuck if name not in before and not is_window(name)]
         amplitude = {names[i] for i in candidate.amplitudes}
         off = set()
         for i, at in zip(found.free, found.at_bound.tolist(), strict=True):

@@ -408,12 +408,11 @@ def _unexplained(d: Any) -> list[str]:
             f"{_share(min(best.misfit_removed, NEARLY_ALL))} of the misfit beyond noise{_no_name(d, best)}."
         )
     if d.missing is not None:
-        size = float(d.missing.rate.max() - d.missing.rate.min())
-        unit = f" {d.missing.unit}" if d.missing.unit else ""
+        size = with_unit(f"{float(d.missing.rate.max() - d.missing.rate.min()):.3g}", d.missing.unit)
         along = "from run to run" if d.missing.driver == RUN else f"against {d.missing.driver}"
         parts.append(
-            f"The missing change of {d.missing.target} {along} varies by {size:.3g}{unit}, beside what a change of the "
-            "base's own parameters does."
+            f"The missing change of {d.missing.target} {along} varies by {size}, beside what a change of the base's "
+            "own parameters does."
         )
     return parts
 

@@ -22,16 +22,17 @@ class Values(dict[str, Any]):
 
     Attributes:
         first: Time of the recording's first sample.
-        start: Time of the first sample of the run, ``(R,)``, or of each point's run.
+        start: Time of the first sample of the run: a number where it is the same for all, ``(R,)``, or that of each
+            point's run.
     """
 
     def __init__(self, values: Mapping[str, Any], first: float = 0.0, start: Any = 0.0) -> None:
         super().__init__(values)
         self.first, self.start = first, start
 
-    def like(self, values: Mapping[str, Any]) -> "Values":
-        """Other values at the same points."""
-        return Values(values, self.first, self.start)
+    def copy(self) -> "Values":
+        """The same, to be changed."""
+        return Values(self, self.first, self.start)
 
 
 class Layout:
@@ -49,7 +50,9 @@ class Layout:
 
     def __init__(self, ode: "ODESimulator", recording: Recording, runs: Sequence[Run]) -> None:
         self._states = tuple(ode.states)
-        self._start = torch.tensor([float(run.time[0]) for run in runs], dtype=torch.float64)
+        start = [float(run.time[0]) for run in runs]
+        self._first = min(start)
+        self._start = torch.tensor(start, dtype=torch.float64) if max(start) > self._first else None
         parameters: list[Parameter] = []
         self._places: dict[str, list[int]] = {}
         for parameter in ode.parameters:
@@ -95,7 +98,9 @@ class Layout:
         return (*(self.parameters[i].name for i in own), *self.initial_names)
 
     def _values(self, run_of: Tensor | None) -> Values:
-        return Values({}, float(self._start.min()), self._start if run_of is None else self._start[run_of])
+        if self._start is None:
+            return Values({}, self._first, self._first)
+        return Values({}, self._first, self._start if run_of is None else self._start[run_of])
 
     def by_name(self, values: Tensor, run_of: Tensor | None = None) -> Values:
         """Parameters by name, ``(H, 1)`` or ``(H, R)``; those of runs picked by ``run_of`` ``(M,)`` where given."""

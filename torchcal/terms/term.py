@@ -262,9 +262,9 @@ def _shifted(
     terms: Sequence[Term], p: dict[str, Tensor], given: Callable[[dict[str, Any]], tuple[Any, ...]]
 ) -> dict[str, Tensor]:
     """Parameters as the terms shift them, one after another; ``given`` makes of ``p`` what their functions get."""
-    moved = p.like(p) if isinstance(p, Values) else dict(p)
+    moved = p.copy()
     for term in terms:
-        own = given(term.own(moved.like(moved) if isinstance(moved, Values) else dict(moved)))
+        own = given(term.own(moved.copy()))
         for name, function in term.shifts.items():
             moved[name] = moved[name] + term.call(function, *own)
     return moved
