@@ -158,6 +158,26 @@ def test_only_states_that_have_either_sign_are_mirrored(shift, mirrored):
     assert any("-1 times" in text for text, _, _ in experiment._in_time(Found)) is mirrored
 
 
+@pytest.mark.parametrize("given", [True, False])
+def test_an_experiment_asks_for_the_initial_states_that_were_not_given(given):
+    t = torch.linspace(0, 10, 60, dtype=F64)
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"x": s["v"], "v": u["f"] - p["k"] * s["x"]}, {"x": None, "v": None},
+        [tc.Parameter("k", low=0.0, initial=1.0)], initial={"v": 0.0}, observe=("x",),
+    )  # fmt: skip
+    run = tc.Run(time=t, outputs={"x": t.cos()}, inputs={"f": 0 * t}, initial={"x": 1.0} if given else {})
+    problem = Problem.of(base, tc.Recording(runs=[run], noise=0.1))
+    found = types.SimpleNamespace(
+        problem=problem, values=torch.ones(len(problem.simulator.names), dtype=F64), warm=None
+    )
+    texts = [text for text, _, _ in experiment._in_time(found)]
+    asks = [text for text in texts if text.endswith("with initial x known from elsewhere")]
+    same = [text for text in texts if "the first run again" in text or "the inputs of the first" in text
+            or "as long as the first" in text]  # fmt: skip
+    assert len(same) == 5
+    assert asks == ([] if given else same)
+
+
 def test_no_experiment_is_proposed_that_tells_nothing_apart():
     t, rng = np.linspace(0, 10, 80), np.random.default_rng(3)
     y = solve(lambda t, y: [-0.5 * y[0] + 0.1], [2.0], t)[0] + 0.02 * rng.standard_normal(80)

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 import torchcal as tc
-from torchcal.discovery import explain, local, where, words
+from torchcal.discovery import doubts, explain, local, where, words
 from torchcal.discovery.channels import Channel
 from torchcal.discovery.records import Estimate, Experiment, Hypothesis, Limit, Location
 from torchcal.discovery.structure import Place
@@ -265,6 +265,18 @@ def test_a_parameter_on_its_bound_is_told_once(monkeypatch):
     (line,) = [line for line in explain.symptoms(search, best) if line.startswith("kd")]
     assert line.startswith("kd runs to its bound, 0, in the calibrated base; it is 0.")
     assert line.endswith("with bend")
+
+
+@pytest.mark.parametrize("stuck", [["k"], []])
+def test_a_bound_of_the_base_may_be_why_a_size_is_open(monkeypatch, stuck):
+    problem = SimpleNamespace(parameters=[tc.Parameter("k"), tc.Parameter("drag.a")])
+    candidate = SimpleNamespace(terms=[SimpleNamespace(brings=["drag.a"])], own=[1], amplitudes=[1])
+    model = SimpleNamespace(candidate=candidate, window=None, found=SimpleNamespace(problem=problem))
+    search = SimpleNamespace(exact=False, base=SimpleNamespace(stuck=stuck))
+    monkeypatch.setattr(doubts, "_distance", lambda *given: 0.0)
+    told = doubts.left_open(search, model)
+    assert told.startswith("The data leave the size of what it adds open")
+    assert ("k ran to a bound in the base" in told) is bool(stuck)
 
 
 def test_an_estimate_on_its_bound_says_so():

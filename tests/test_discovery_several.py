@@ -1,0 +1,41 @@
+"""Several terms at once: single terms that their own refit missed are found again from where the pairs ended."""
+
+import dataclasses
+
+import torch
+
+import torchcal as tc
+from torchcal.discovery.problem import Problem
+from torchcal.discovery.rounds import settle
+from torchcal.discovery.search import Search
+from torchcal.discovery.several import refit_several
+
+F64 = torch.float64
+X = torch.linspace(0, 3, 60, dtype=F64)
+SHAPES = {"square": lambda x: x**2, "cube": lambda x: x**3, "root": lambda x: x.sqrt(), "wave": lambda x: (2 * x).sin()}
+
+
+def term(name):
+    return tc.Term(
+        name,
+        outputs={"y": lambda x, p, y: y + p["a"] * SHAPES[name](x["x"])},
+        parameters=[tc.Parameter("a", neutral=0.0)],
+    )
+
+
+def test_terms_of_the_best_pairs_are_refitted_alone_where_they_got_stuck():
+    y = 2 * X + 0.03 * X**2 + 0.02 * torch.randn(60, generator=torch.Generator().manual_seed(3), dtype=F64)
+    base = tc.Simulator(lambda x, p: {"y": p["m"] * x["x"]}, [tc.Parameter("m")])
+    problem = Problem.of(base, tc.Recording(x={"x": X}, y={"y": y}, noise=None))
+    search = Search(problem, [term(name) for name in SHAPES], {}, 0, 3, 2, lambda text: None)
+    search.calibrate_base()
+    search, detected = settle(search, problem, 0.99)
+    assert detected
+    right = {i: model.weight for i, model in search.plain.items()}
+    search.models = [dataclasses.replace(model, log_evidence=model.log_evidence - 100) for model in search.models]
+    refit_several(search)
+    pairs = sorted((m for m in search.models if len(m.numbers) == 2 and m.physical), key=lambda m: -m.weight)
+    found = {i: model.weight for i, model in search.plain.items()}
+    assert len({i for pair in pairs[:3] for i in pair.numbers}) > 2
+    for i in {i for pair in pairs[:3] if pair.weight > pairs[0].weight - 5 for i in pair.numbers}:
+        assert abs(found[i] - right[i]) < 0.1
