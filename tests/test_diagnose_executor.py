@@ -343,3 +343,32 @@ def test_nobody_elses_handler_is_replaced():
         signal.signal(signal.SIGINT, other)
         with stop.listening():
             assert signal.getsignal(signal.SIGINT) is other
+
+
+def test_windows_are_refitted_together_and_are_the_same_from_workers(monkeypatch):
+    pytest.importorskip("cloudpickle")
+    x = torch.linspace(0, 4, 80, dtype=F64)
+    noise = 0.02 * torch.randn(80, generator=torch.Generator().manual_seed(2), dtype=F64)
+    y = 2 * x - 0.3 * (x - 1) ** 2 * (x > 2.5) + noise
+    base = tc.Simulator(lambda x, p: p["m"] * x["x"], [tc.Parameter("m")])
+    terms = [
+        tc.Term(f"power {k}", outputs={"y": lambda x, p, y, k=k: y + p["a"] * (x["x"] - 1) ** k},
+                parameters=[tc.Parameter("a", neutral=0.0)])
+        for k in (2, 3)
+    ]  # fmt: skip
+    data = tc.Recording(x={"x": x}, y=y, noise=0.02)
+    refit, sizes = Search.refit_together, []
+
+    def spy(search, wanted):
+        sizes.append(len([one for one in wanted if one.window is not None]))
+        return refit(search, wanted)
+
+    monkeypatch.setattr(Search, "refit_together", spy)
+    with ThreadPoolExecutor(2) as pool:
+        here, there = (
+            tc.diagnose(base, data, terms, seed=0, progress=False, num_starts=4, executor=one) for one in (None, pool)
+        )
+    assert any(row.region is not None for row in here.ranking)
+    assert [(row.terms, row.region) for row in there.ranking] == [(row.terms, row.region) for row in here.ranking]
+    assert [row.probability for row in there.ranking] == pytest.approx([row.probability for row in here.ranking])
+    assert max(sizes) > 1

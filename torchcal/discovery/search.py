@@ -221,12 +221,6 @@ class Search:
         """What effects may depend on, at every datum of the calibrated base."""
         return self.base.problem.drivers(self.base.values[None], self.base.warm)
 
-    def refit_one(
-        self, numbers: tuple[int, ...], candidate: Candidate, begin: Tensor, prior: float, window: Window | None = None
-    ) -> Model | None:
-        """Refit one hypothesis."""
-        return self.refit_together([Hypothetical(numbers, candidate, begin, prior, window)])[0]
-
     def refit_together(self, wanted: Sequence[Hypothetical]) -> list[Model | None]:
         """Refit several hypotheses, on the executor where there is one; None where no start gives a fit."""
         if self.stop.is_set():

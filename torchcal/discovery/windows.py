@@ -3,13 +3,14 @@
 import dataclasses
 import itertools
 import math
+from collections.abc import Sequence
 
 import torch
 
 from torchcal.discovery.candidates import prepare
 from torchcal.discovery.channels import responses
 from torchcal.discovery.local import EDGE, ENDS, SHORT, WIDTH_OF_EDGE, WIDTHS, Span, beyond, is_window, localised
-from torchcal.discovery.model import PRIOR, Model
+from torchcal.discovery.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.screen import Window, windows_of
 from torchcal.discovery.search import Search
 from torchcal.discovery.structure import Residual
@@ -17,7 +18,7 @@ from torchcal.discovery.verdict import PLAINLY_WHITE
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators import Trajectories
 
-__all__ = ["refit_local", "refit_window"]
+__all__ = ["refit_local"]
 
 #: Refits at most, in windows that promise much and in the leader's; of one candidate; around one refitted term; how
 #: many of those, and how many more of terms that the base has everywhere.
@@ -58,8 +59,7 @@ def refit_local(search: Search) -> None:
     prior = math.log(PRIOR["local"] / max(len(search.candidates), 1))
     spans = {name: Span.of(driver) for name, driver in search.drivers().items()} if promising else {}
     chosen = sorted((w for each in promising.values() for w in _different(each, spans)), key=lambda w: -w.z)
-    for w in chosen[:MOST]:
-        _keep(search, refit_window(search, w, prior))
+    _keep_all(search, [_begun(search, w, prior) for w in chosen[:MOST]])
     search.reweigh()
     seen: set[int] = set()
     for _ in range(ROUNDS):
@@ -70,9 +70,8 @@ def refit_local(search: Search) -> None:
         leading = [*ranked[:LEADING], *(m for m in held[:HELD] if m not in ranked[:LEADING])]
         fresh = [m for m in leading if id(m) not in seen and search.examine(m).p_value < PLAINLY_WHITE]
         seen |= {id(m) for m in fresh}
-        for model in fresh:
-            for w in _around(search, model)[:MOST_AROUND]:
-                _keep(search, refit_window(search, w, prior, model))
+        near = [(model, w) for model in fresh for w in _around(search, model)[:MOST_AROUND]]
+        _keep_all(search, [_begun(search, w, prior, model) for model, w in near])
     search.reweigh()
     if _rivals(search, prior):
         search.reweigh()
@@ -95,7 +94,7 @@ def _turn(search: Search, prior: float) -> None:
     low, high = (-math.inf, w.low) if math.isfinite(w.low) else (w.high, math.inf)
     # Of the amplitude the sign counts, and the order of magnitude: the fit begins near the base.
     other = dataclasses.replace(w, low=low, high=high, amplitude=-_amplitude(search, lead)[2])
-    turned = refit_window(search, other, prior, edge=True, span=w.span)
+    (turned,) = _refit(search, [_begun(search, other, prior, edge=True, span=w.span)])
     if turned is not None:
         turned = _stepped(search, turned, w.driver)
     if turned is not None and turned.physical and turned.weight > lead.weight - AS_GOOD:
@@ -120,8 +119,8 @@ def _rivals(search: Search, prior: float) -> bool:
     for other in sorted(search.local, key=lambda other: -other.z):
         if other.driver == w.driver and other.z > LEAST_SCORE and other.candidate not in {*tried, *search.gone}:
             others.setdefault(other.candidate, other)
-    for other in list(others.values())[:MOST]:
-        _keep(search, refit_window(search, dataclasses.replace(other, low=w.low, high=w.high), prior))
+    there = [dataclasses.replace(other, low=w.low, high=w.high) for other in others.values()]
+    _keep_all(search, [_begun(search, other, prior) for other in there[:MOST]])
     return bool(others)
 
 
@@ -151,7 +150,7 @@ def _refine_edges(search: Search, prior: float) -> None:
         w = dataclasses.replace(model.window, amplitude=_amplitude(search, model)[2])
         span = Span.of(search.drivers()[w.driver])
         scales = [span, dataclasses.replace(span, log=False)] if span.log else [span]
-        found = [refit_window(search, w, prior, model, edge=True, span=scale) for scale in scales]
+        found = _refit(search, [_begun(search, w, prior, model, edge=True, span=scale) for scale in scales])
         other = max((one for one in found if one is not None), key=lambda one: one.weight, default=None)
         if other is not None:
             other = _stepped(search, other, w.driver)
@@ -181,8 +180,8 @@ def _stepped(search: Search, model: Model, driver: str) -> Model:
     begin = torch.cartesian_prod(*choices)
     misfit = search.noise.whitening(problem).vector(problem.y - problem.evaluate(begin, [])[0]).square().sum(-1)
     begin = begin[misfit.nan_to_num(nan=torch.inf).argsort()[:STEPPED]]
-    found = search.refit_one(model.numbers, model.candidate, begin, model.log_prior, window=model.window)
-    return max(filter(None, (model, _long_enough(found))), key=lambda one: one.weight)
+    again = Hypothetical(model.numbers, model.candidate, begin, model.log_prior, model.window)
+    return max(filter(None, (model, *_refit(search, [again]))), key=lambda one: one.weight)
 
 
 def _keep(search: Search, model: Model | None) -> None:
@@ -252,7 +251,7 @@ def _amplitude(search: Search, model: Model) -> tuple[int, str, float]:
     return place, name, float(model.found.values[place] - neutral)
 
 
-def refit_window(
+def _begun(
     search: Search,
     w: Window,
     prior: float,
@@ -260,7 +259,7 @@ def refit_window(
     *,
     edge: bool = False,
     span: Span | None = None,
-) -> Model | None:
+) -> Hypothetical | None:
     """Base and one local term, begun at the window that the screening found, from the base or near a model of it."""
     plain = search.candidates[w.candidate]
     span = span or Span.of(search.drivers()[w.driver])
@@ -295,14 +294,20 @@ def refit_window(
             choices.append([values.get(q.name, start)])
     begin = torch.tensor(list(itertools.product(*choices)), dtype=torch.float64)
     # Windows were searched on a grid of about 12 edges: the best of so many costs its logarithm.
-    model = search.refit_one(
-        (w.candidate,),
-        candidate,
-        begin,
-        prior - math.log(3.0 * len(search.drivers())),
-        window=dataclasses.replace(w, span=span),
-    )
-    return _long_enough(model)
+    price = math.log(3.0 * len(search.drivers()))
+    return Hypothetical((w.candidate,), candidate, begin, prior - price, dataclasses.replace(w, span=span))
+
+
+def _refit(search: Search, wanted: Sequence[Hypothetical | None]) -> list[Model | None]:
+    """Refit local terms, those that can be; no model where a window has closed."""
+    found = iter(search.refit_together([one for one in wanted if one is not None]))
+    return [None if one is None else _long_enough(next(found)) for one in wanted]
+
+
+def _keep_all(search: Search, wanted: Sequence[Hypothetical | None]) -> None:
+    """Refit local terms together and add what is new."""
+    for model in _refit(search, wanted):
+        _keep(search, model)
 
 
 def _long_enough(model: Model | None) -> Model | None:
