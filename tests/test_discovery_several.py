@@ -12,7 +12,13 @@ from torchcal.discovery.several import refit_several
 
 F64 = torch.float64
 X = torch.linspace(0, 3, 60, dtype=F64)
-SHAPES = {"square": lambda x: x**2, "cube": lambda x: x**3, "root": lambda x: x.sqrt(), "wave": lambda x: (2 * x).sin()}
+SHAPES = {
+    "square": lambda x: x**2,
+    "twice the square": lambda x: 2 * x**2,
+    "cube": lambda x: x**3,
+    "root": lambda x: x.sqrt(),
+    "wave": lambda x: (2 * x).sin(),
+}
 
 
 def term(name):
@@ -23,15 +29,21 @@ def term(name):
     )
 
 
-def test_terms_of_the_best_pairs_are_refitted_alone_where_they_got_stuck():
+def searched(names):
     y = 2 * X + 0.03 * X**2 + 0.02 * torch.randn(60, generator=torch.Generator().manual_seed(3), dtype=F64)
     base = tc.Simulator(lambda x, p: {"y": p["m"] * x["x"]}, [tc.Parameter("m")])
     problem = Problem.of(base, tc.Recording(x={"x": X}, y={"y": y}, noise=None))
-    search = Search(problem, [term(name) for name in SHAPES], {}, 0, 3, 2, lambda text: None)
+    search = Search(problem, [term(name) for name in names], {}, 0, 3, 2, lambda text: None)
     search.calibrate_base()
     search, detected = settle(search, problem, 0.99)
     assert detected
+    return search
+
+
+def test_terms_of_the_best_pairs_are_refitted_alone_where_they_got_stuck():
+    search = searched(["square", "cube", "root", "wave"])
     right = {i: model.weight for i, model in search.plain.items()}
+    assert len(right) == 4
     search.models = [dataclasses.replace(model, log_evidence=model.log_evidence - 100) for model in search.models]
     refit_several(search)
     pairs = sorted((m for m in search.models if len(m.numbers) == 2 and m.physical), key=lambda m: -m.weight)
@@ -39,3 +51,25 @@ def test_terms_of_the_best_pairs_are_refitted_alone_where_they_got_stuck():
     assert len({i for pair in pairs[:3] for i in pair.numbers}) > 2
     for i in {i for pair in pairs[:3] if pair.weight > pairs[0].weight - 5 for i in pair.numbers}:
         assert abs(found[i] - right[i]) < 0.1
+
+
+def test_candidates_that_are_one_stay_so_where_only_the_first_is_refitted():
+    search = searched(["square", "twice the square", "wave"])
+    assert search.aliases == {0: [1]}
+    stuck = {i: dataclasses.replace(m, found=dataclasses.replace(m.found, chi2=m.found.chi2 + 200))
+             for i, m in search.merged.items()}  # fmt: skip
+    search.merged = stuck
+    search.merge()
+    search.merge()
+    assert search.aliases == {0: [1]}
+    assert search.merged == stuck
+
+
+def test_what_was_merged_is_weighed_by_the_noise_that_is_found_later(monkeypatch):
+    search = searched(["square", "twice the square", "wave"])
+    louder = dataclasses.replace(search.noise, sd=1.2 * search.noise.sd)
+    monkeypatch.setattr("torchcal.discovery.search.suited", lambda *given: louder)
+    search.reweigh()
+    search.merge()
+    assert search.aliases == {0: [1]}
+    assert abs(search.merged[1].found.chi2 - search.plain[0].found.chi2) < 0.1

@@ -12,7 +12,7 @@ import torch
 import torchcal as tc
 from torchcal.discovery import doubts, explain, local, where, words
 from torchcal.discovery.channels import Channel
-from torchcal.discovery.records import Estimate, Experiment, Hypothesis, Limit, Location
+from torchcal.discovery.records import Estimate, Experiment, Hypothesis, Limit, Location, Table
 from torchcal.discovery.structure import Place
 from torchcal.report import diagnosis_page
 
@@ -352,8 +352,16 @@ def test_places_are_told_to_a_thousandth_of_their_extent():
         finding(where=[Location("parameter", "k", "c", spans, 0.5, 20.0)])
     )
     span = local.Span(2459000.0, 2459030.0, False)
-    assert local.region_text("t", 2459012.345, math.inf, span) == "t > 2459012.3"
+    assert local.region_text("t", 2459012.341, math.inf, span) == "t > 2459012.34"
     assert local.region_text("t", 12.3456, 20.0, None) == "12.35 < t < 20"
+    for extent in (600.0, 3600.0, 86400.0):
+        start = 1.7e9 + 0.412 * extent
+        span = local.Span(1.7e9, 1.7e9 + extent, False)
+        assert abs(float(local.region_text("t", start, math.inf, span).split()[-1]) - start) < 0.002 * extent
+    alone = Location("parameter", "k", "t", ((1.7e9 + 60, 1.7e9 + 60),), 0.5, 20.0, extent=600.0)
+    assert "1700000060" in words._where(finding(where=[alone]))
+    assert "1700000060" in str(Table([alone], ("driver", "spans")))
+    assert diagnosis_page._spans(alone) == "1700000060"
 
 
 @pytest.mark.parametrize(("given", "told"), [((0.01, 0.01), ()), ((0.03, 0.03), ("y", "z")), ((0.01, 0.1), ("z",))])
@@ -369,7 +377,8 @@ def test_noise_that_is_given_too_large_is_a_symptom(given, told):
     assert [line.split(" is white")[0] for line in lines] == [f"the residual of {name}" for name in told]
 
 
-def test_slow_noise_that_a_fit_takes_up_is_not_given_too_large():
+@pytest.mark.parametrize("order", [np.arange(60), np.random.default_rng(0).permutation(60)])
+def test_slow_noise_that_a_fit_takes_up_is_not_given_too_large(order):
     rng, found = np.random.default_rng(3), 0
     base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x + p["c"] * x**2, [tc.Parameter(name) for name in "abc"])
     x = np.linspace(0, 1, 60)
@@ -377,7 +386,7 @@ def test_slow_noise_that_a_fit_takes_up_is_not_given_too_large():
         e = np.zeros(60)
         for i in range(60):
             e[i] = 0.93 * e[i - 1] + np.sqrt(1 - 0.93**2) * rng.standard_normal()
-        d = tc.diagnose(base, tc.Recording(x=x, y=1 + x + 0.05 * e, noise=0.05), [], progress=False)
+        d = tc.diagnose(base, tc.Recording(x=x[order], y=(1 + x + 0.05 * e)[order], noise=0.05), [], progress=False)
         found += any("times the noise sd" in line for line in d.symptoms)
     assert found == 0
 

@@ -261,6 +261,17 @@ def test_constants_beside_parameters_change_no_derivative():
     torch.testing.assert_close(found.jacobian[..., 0], slope, rtol=1e-7, atol=1e-7)
 
 
+def test_powers_of_a_condition_that_is_zero_are_derived():
+    x = torch.linspace(0, 3, 7, dtype=torch.float64)
+    simulator = tc.Simulator(
+        lambda x, p: p["m"] * x["x"] ** p["n"] + p["a"] * x["x"].sqrt(), [tc.Parameter(name) for name in "mna"]
+    )
+    found = simulator.linearise({"x": x}, torch.tensor([[2.0, 0.5, 0.3]], dtype=torch.float64))
+    root = x.sqrt()
+    wanted = torch.stack([root, 2 * root * x.clamp_min(1e-300).log(), root], dim=-1)
+    torch.testing.assert_close(found.jacobian[0], wanted)
+
+
 def test_a_function_that_maps_over_its_conditions_is_derived():
     x = torch.linspace(0, 1, 5, dtype=torch.float64)
     simulator = tc.Simulator(lambda x, p: p["a"] * torch.vmap(lambda t: t * 2.0 + 1.0)(x), [tc.Parameter("a")])

@@ -1,5 +1,6 @@
 """Every way to write a term, in time and for static simulators, and what `extend` makes of it."""
 
+import dataclasses
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,8 @@ import torch
 from torch import Tensor
 
 import torchcal as tc
-from torchcal.errors import DomainError
+from torchcal.discovery.candidates import sized
+from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators import Trajectories
 from torchcal.terms import extend
 
@@ -423,6 +425,32 @@ def test_elapsed_time_counts_from_the_first_sample(elapsed: str | None, ends: tu
     seen = bound.linearise(bound.x, tensor(0.0, 1.0)[None]).jacobian[0, :, 1]
     wanted = [0.5 * (end**2 - (end - 10) ** 2) for end in ends]
     assert (float(seen[10]), float(seen[-1])) == pytest.approx(tuple(wanted))
+
+
+@pytest.mark.parametrize(("elapsed", "length"), [(None, 10.0), ("run", 10.0), ("recording", 1010.0)])
+def test_durations_are_measured_on_what_they_count_in(elapsed: str | None, length: float) -> None:
+    time = np.linspace(0.0, 10.0, 11)
+    runs = [tc.Run(time=clock + time, outputs={"x": 0 * time}) for clock in (200.0, 1200.0)]
+    term = tc.Term("rise", equation="x", rate=grows, parameters=[tc.Parameter("q"), tc.Parameter("tau")],
+                   scales={"tau": "t"}, elapsed=elapsed)  # fmt: skip
+    tau = sized(term, {"t": 10.0}, tc.Recording(runs=runs)).parameters[1]
+    assert (tau.low, tau.high) == pytest.approx((0.02 * length, length))
+
+
+def test_what_a_copy_of_p_knows_of_elapsed_time() -> None:
+    term = tc.Term("grows", equation="x", rate=grows, parameters=[tc.Parameter("q")], elapsed="run")
+    base = tc.ODESimulator(lambda t, s, p, u: {"x": 0 * s["x"]}, ["x"], [tc.Parameter("k")])
+    again = extend(base, [dataclasses.replace(term, description="once more")])
+    run = tc.Run(time=np.linspace(200.0, 210.0, 11), outputs={"x": np.zeros(11)}, initial={"x": 0.0})
+
+    def end(rates: Any) -> float:
+        bound = tc.ODESimulator(rates, ["x"], again.parameters).bind(tc.Recording(runs=[run]))
+        return float(bound.at(bound.x)(tensor(0.0, 1.0))[-1])
+
+    assert end(again.rates) == pytest.approx(50.0)
+    assert end(lambda t, s, p, u: again.rates(t, s, p | {"k": p["k"]}, u)) == pytest.approx(50.0)
+    with pytest.raises(SimulatorError, match=r"'grows', whose time counts from the start of the run\. Got a plain dict"):
+        end(lambda t, s, p, u: again.rates(t, s, dict(p), u))
 
 
 def test_elapsed_time_is_refused_where_there_is_none() -> None:

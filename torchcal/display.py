@@ -12,8 +12,8 @@ DECADES = 30.0
 """Ratio of the ends of a positive range from which on it is laid out in its logarithm."""
 
 
-MOST_DIGITS = 12
-"""More than four that a number is told with at most."""
+MOST_DIGITS = 15
+"""Digits behind its first that a number is told with at most."""
 
 FAR = 100.0
 """Difference in log evidence, or distance in noise sd, beyond which a number tells nothing more."""
@@ -56,13 +56,15 @@ def percent(share: float | None) -> str:
 
 
 def placed(value: float, extent: float) -> str:
-    """A place along something, to a thousandth of the extent that is looked at, wherever that begins.
+    """A place along something, to two thousandths of the extent or less that is looked at, wherever that begins.
 
-    >>> placed(12.3456, 60.0), placed(1.7e9 + 612.34, 900.0), placed(0.0, 1.0)
-    ('12.35', '1700000612', '0')
+    >>> placed(12.3456, 60.0), placed(1.7e9 + 612.34, 3600.0), placed(1.7e9 + 612.34, 20.0), placed(0.0, 1.0)
+    ('12.35', '1700000612', '1700000612.34', '0')
     """
-    far = abs(value) / extent if 0 < extent < math.inf and math.isfinite(value) else 0.0
-    return f"{value:.{4 + (min(math.floor(math.log10(far)), MOST_DIGITS) if 10 <= far < math.inf else 0)}g}"
+    if not (0 < extent < math.inf and math.isfinite(value) and abs(value) >= 10 * extent):
+        return f"{value:.4g}"
+    decimals, before = math.ceil(-math.log10(extent / 500)), math.floor(math.log10(abs(value)))
+    return f"{round(value, decimals):.{min(before + max(decimals, 0), MOST_DIGITS) + 1}g}"
 
 
 def between(spans: Sequence[tuple[float, float]], word: str, extent: float | None = None) -> list[str]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchcal.data import Recording
 from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.problem import Problem
 from torchcal.errors import DomainError, SimulatorError
@@ -134,23 +135,26 @@ def _place(problem: Problem, k: int) -> str:
 
 
 def drivers_scale(problem: Problem, found: Fitted) -> dict[str, float]:
-    """Largest magnitude of every driver and output on the calibrated trajectory."""
+    """Largest magnitude of every driver and output on the calibrated trajectory; of time the longest run's length."""
     scale = {
         name: float(values.abs().max())
         for name, values in problem.drivers(found.values[None], found.warm).items()
         if bool(torch.isfinite(values).all())
     }
-    if "t" in scale and problem.order is not None:
-        scale["t"] = float(problem.order.max() - problem.order.min())
+    if "t" in scale and problem.recording.runs:
+        scale["t"] = max(float(run.time[-1] - run.time[0]) for run in problem.recording.runs)
     for number, name in enumerate(problem.recording.outputs):
         scale.setdefault(name, float(found.y[problem.output_of == number].abs().max()))
     return scale
 
 
-def sized(term: Term, scale: Mapping[str, float]) -> Term:
+def sized(term: Term, scale: Mapping[str, float], recording: Recording) -> Term:
     """The term with bounds for the shape parameters that it measures on a driver's scale."""
     if not term.scales:
         return term
+    if "t" in scale and term.elapsed == "recording":
+        times = [run.time for run in recording.runs or ()]
+        scale = {**scale, "t": float(max(time[-1] for time in times) - min(time[0] for time in times))}
     parameters = []
     for parameter in term.parameters:
         driver = term.scales.get(parameter.name)
@@ -165,11 +169,7 @@ def sized(term: Term, scale: Mapping[str, float]) -> Term:
         size = scale[driver] or 1.0
         low, high = (part * size for part in SCALE_RANGE)
         parameters.append(dataclasses.replace(parameter, low=low, high=high, initial=None, neutral=None))
-    sizedterm = object.__new__(Term)
-    for field in dataclasses.fields(Term):
-        object.__setattr__(sizedterm, field.name, getattr(term, field.name))
-    object.__setattr__(sizedterm, "parameters", tuple(parameters))
-    return sizedterm
+    return dataclasses.replace(term, parameters=tuple(parameters))
 
 
 def spread_values(target: Problem, names: Sequence[str], values: Tensor) -> Tensor:
@@ -199,7 +199,7 @@ def prepare(
     Raises:
         SimulatorError: If the terms change the simulator at their neutral values, or give no finite outputs there.
     """
-    terms = tuple(sized(term, scale) for term in terms)
+    terms = tuple(sized(term, scale, base.recording) for term in terms)
     extended = base.with_simulator(extend(base.simulator, terms))
     problem = dataclasses.replace(extended, keep=base.keep)
     begin = spread_values(problem, [q.name for q in base.parameters], found.values)

@@ -174,7 +174,11 @@ def _too_large(search: Search, found: Fitted) -> list[str]:
     for number, name in enumerate(outputs):
         mine = standard[problem.output_of == number]
         size = math.sqrt(float(mine.square().mean()) * problem.n / max(spare, 1)) if len(mine) >= ENOUGH else 1.0
-        if size < SMALLER and float(mine[1:] @ mine[:-1]) < WHITE * float(mine @ mine):
+        slow = max(  # along the rows, and along the condition or time: rows may be in random order
+            sum(float(standard[at[1:]] @ standard[at[:-1]]) for at in along if int(problem.output_of[at[0]]) == number)
+            for along in (problem.sequences, problem.recorded)
+        )
+        if size < SMALLER and slow < WHITE * float(mine @ mine):
             of = f" of {name}" if len(outputs) > 1 else ""
             rows.append(
                 f"the residual{of} is white and {size:.2g} times the noise sd that was given: with a smaller one, "
@@ -300,8 +304,10 @@ def formulas(model: Model) -> list[str]:
         own = [i for i in model.candidate.own if model.found.problem.parameters[i].name in term.brings]
         text = term.formula or term.name
         if model.window is not None:
-            text = f"{text.split(' where ')[0]} where {model.where}"
+            text = text.split(" where ")[0]
         if term.elapsed and any(float(run.time[0]) != 0.0 for run in model.found.problem.recording.runs or ()):
-            text += f", t counted from the first sample of the {term.elapsed}"
+            text += f" (its t counted from the first sample of the {term.elapsed})"
+        if model.window is not None:
+            text += f" where {model.where}"
         rows.append(f"{text}, with " + "; ".join(str(e) for e in estimates(model.found, own, model.window)))
     return rows

@@ -97,15 +97,16 @@ def localised(
     def inside(d: Tensor, p: Mapping[str, Any]) -> Any:
         return force(span, d, p)
 
+    def now(t: Any, s: Any, p: Any, u: Any) -> Any:
+        d = t + term.began(p) if driver == "t" else s[driver] if driver in s else u[driver]  # windows are on the clock
+        return inside(d, p)
+
     def moving(function: Callable[..., Any]) -> Callable[..., Any]:
-        return lambda t, s, p, u: (
-            inside(t if driver == "t" else s[driver] if driver in s else u[driver], p) * function(t, s, p, u)
-        )
+        return lambda t, s, p, u: now(t, s, p, u) * function(t, s, p, u)
 
     def sensing(function: Callable[..., Any]) -> Callable[..., Any]:
         def observe(t: Any, s: Any, p: Any, u: Any, y: Any) -> Any:
-            w = inside(t if driver == "t" else s[driver] if driver in s else u[driver], p)
-            return y + w * (function(t, s, p, u, y) - y)
+            return y + now(t, s, p, u) * (function(t, s, p, u, y) - y)
 
         return observe
 
@@ -116,7 +117,7 @@ def localised(
         return lambda x, p, y: y + inside(x[driver] if isinstance(x, Mapping) else x, p) * (function(x, p, y) - y)
 
     around = still if static else moving
-    found = Term(
+    return Term(
         term.name,
         rates={state: moving(function) for state, function in term.rates.items()},
         outputs={name: (seeing if static else sensing)(function) for name, function in term.outputs.items()},
@@ -125,9 +126,8 @@ def localised(
         formula=f"{term.formula or term.name} where {region_text(driver, low, high, span)}",
         description=term.description,
         scales=term.scales,
+        elapsed=term.elapsed,
     )
-    object.__setattr__(found, "elapsed", term.elapsed)  # its functions count already; the window is on the clock
-    return found
 
 
 def force(span: Span, d: Tensor, p: Mapping[str, Any]) -> Any:

@@ -53,7 +53,10 @@ class Table(list[Record], Generic[Record]):
     def __str__(self) -> str:
         if not self:
             return "(empty)"
-        cells = [[_text(value) for value in row.values()] for row in self.rows()]
+        cells = [
+            [_text(value, getattr(record, "extent", None)) for value in row.values()]
+            for record, row in zip(self, self.rows(), strict=True)
+        ]
         heads = [name.replace("_", " ") for name in self.columns]
         widths = [max(len(head), *(len(row[i]) for row in cells)) for i, head in enumerate(heads)]
         lines = ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip()
@@ -63,7 +66,7 @@ class Table(list[Record], Generic[Record]):
     __repr__ = __str__
 
 
-def _text(value: Any) -> str:
+def _text(value: Any, extent: float | None = None) -> str:
     if value is None:
         return "-"
     if isinstance(value, bool):
@@ -71,7 +74,7 @@ def _text(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, tuple) and value and all(isinstance(item, tuple) for item in value):
-        return ", ".join(between(value, "to"))
+        return ", ".join(between(value, "to", extent))
     if isinstance(value, tuple | list):
         return ", ".join(_text(item) for item in value)
     return str(value)
@@ -196,6 +199,7 @@ class Location:
         share: Share of the misfit beyond noise that a change there, varying with the driver, can remove.
         evidence: Log evidence of an unknown change there, smooth or an oscillation, against none.
         period: Of an oscillation, in units of the driver; None of a smooth change.
+        extent: How far the driver extends in the recording; None where nobody knows.
     """
 
     kind: str
@@ -205,6 +209,7 @@ class Location:
     share: float
     evidence: float
     period: float | None = None
+    extent: float | None = None
 
 
 @dataclass(frozen=True)

@@ -169,13 +169,14 @@ class Search:
         plain, before = self.plain, self.merged
         self.aliases, self.merged = {}, {}
         for i, k in self.twins.items():
-            a, b = plain.get(i) or before.get(i), plain.get(k)
-            if i in self.failed or (a is not None and b is None):
+            a, b = plain.get(i), plain.get(k)
+            own = a or before.get(i)  # once merged it is refitted no more, so that its fit says nothing against it
+            if i in self.failed or (own is not None and b is None):
                 continue
             if a is not None and b is not None and (a.physical != b.physical or abs(a.found.chi2 - b.found.chi2) > 0.5):
                 continue
             self.aliases.setdefault(k, []).append(i)
-            self.merged |= {i: a} if a is not None else {}
+            self.merged |= {i: own} if own is not None else {}
         self.gone = {i for alike in self.aliases.values() for i in alike}
         self.models = [m for m in self.models if not self.gone & set(m.numbers)]
 
@@ -294,7 +295,7 @@ class Search:
         best = self.leader
         if self.exact or best is None or best.log_evidence < 3.0:
             return
-        hopeful = [m for m in self.models if m.log_evidence > HOPELESS * best.log_evidence]
+        hopeful = [m for m in (*self.models, *self.merged.values()) if m.log_evidence > HOPELESS * best.log_evidence]
         fresh = suited(self, hopeful)
         old = self.noise
         change = float((fresh.sd / old.sd).log().abs().max()) + float((fresh.correlation - old.correlation).abs().max())
@@ -302,8 +303,8 @@ class Search:
             return
         self.noise = fresh
         self.base = refit(self.base, fresh.whitening(self.base.problem))
-        for model in self.models:
-            if model in hopeful:
+        for model in (*self.models, *self.merged.values()):
+            if any(model is one for one in hopeful):
                 model.found = refit(model.found, fresh.whitening(model.found.problem))
             else:
                 model.found = weighed(model.found, fresh.whitening(model.found.problem))

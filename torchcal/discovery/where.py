@@ -22,6 +22,11 @@ SPAN_LEVEL = 0.3
 LEAST_EVIDENCE, LISTED = 2.0, 8
 
 
+def _extent(values: Tensor) -> float:
+    """How far the values of a driver extend."""
+    return float(values.max() - values.min())
+
+
 def _spans(place: Place) -> tuple[tuple[float, float], ...]:
     """Ranges of the driver where the change is large; of an oscillation all of it."""
     values = place.channel.drivers[place.driver]
@@ -65,7 +70,8 @@ def locate(search: Search, best: Model | None, *, named: bool = False) -> Table[
         low = w.low if math.isfinite(w.low) else float(drivers.min())
         high = w.high if math.isfinite(w.high) else float(drivers.max())
         kind, target = _acts_on(best)
-        rows.append(Location(kind, target, w.driver, ((low, high),), removed(search, best), best.log_evidence))
+        share, evidence, extent = removed(search, best), best.log_evidence, _extent(drivers)
+        rows.append(Location(kind, target, w.driver, ((low, high),), share, evidence, extent=extent))
     sensor = best is not None and _acts_on(best)[0] == "output"  # then it has been shown to be the output
     places = [
         place
@@ -83,7 +89,8 @@ def locate(search: Search, best: Model | None, *, named: bool = False) -> Table[
         if key in seen:
             continue
         seen.add(key)
-        rows.append(Location(*key, place.driver, _spans(place), place.share, place.evidence, place.period))
+        extent = _extent(place.channel.drivers[place.driver])
+        rows.append(Location(*key, place.driver, _spans(place), place.share, place.evidence, place.period, extent))
         if len(seen) >= LISTED:
             break
     return Table(rows[:LISTED], ("kind", "target", "driver", "spans", "share", "evidence"))
@@ -124,7 +131,8 @@ def _contributed(search: Search, model: Model, drivers: Sequence[str]) -> Locati
     values, which = at_data[driver].unique(return_inverse=True)
     largest = torch.zeros_like(values).scatter_reduce(0, which, size.to(values), "amax")
     kind, target = _acts_on(model)
-    return Location(kind, target, driver, _ranges(values, largest), removed(search, model), model.log_evidence)
+    spans, share, evidence = _ranges(values, largest), removed(search, model), model.log_evidence
+    return Location(kind, target, driver, spans, share, evidence, extent=_extent(values))
 
 
 def _acts_on(model: Model) -> tuple[str, str]:

@@ -174,8 +174,7 @@ def _where(d: Any) -> str:
     if not d.where:
         return ""
     place = d.where[0]
-    span = None if place.driver == RUN else _span(d, place)
-    spans = ", ".join(between(place.spans[:3], "to", None if span is None else span.high - span.low))
+    spans = ", ".join(between(place.spans[:3], "to", place.extent))
     everywhere = _everywhere(d, place)
     if place.driver == RUN:
         largest = "" if everywhere else f" (largest in {spans}, counted from 0)"

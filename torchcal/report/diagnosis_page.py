@@ -167,7 +167,7 @@ def _spans(item: Any) -> str:
     """Where a location's change is large, or the period of an oscillation."""
     if item.period is not None:
         return f"everywhere, with a period of {in_digits(item.period)}"
-    return ", ".join(between(item.spans, "…")).replace("-", "−") or "everywhere"
+    return ", ".join(between(item.spans, "…", item.extent)).replace("-", "−") or "everywhere"
 
 
 def _where(diagnosis: Any, units: Mapping[str, str]) -> str:

@@ -21,18 +21,22 @@ class Values(dict[str, Any]):
     """Parameters by name, as the functions of a simulator in time get them, and when what they act on began.
 
     Attributes:
-        first: Time of the recording's first sample.
+        first: Time of the recording's first sample; None where nobody knows any more.
         start: Time of the first sample of the run: a number where it is the same for all, ``(R,)``, or that of each
             point's run.
     """
 
-    def __init__(self, values: Mapping[str, Any], first: float = 0.0, start: Any = 0.0) -> None:
+    def __init__(self, values: Mapping[str, Any], first: float | None, start: Any) -> None:
         super().__init__(values)
         self.first, self.start = first, start
 
     def copy(self) -> "Values":
         """The same, to be changed."""
         return Values(self, self.first, self.start)
+
+    def __or__(self, other: Mapping[str, Any]) -> "Values":  # type: ignore[override]
+        """The same with others beside or in place of them."""
+        return Values({**self, **other}, self.first, self.start)
 
 
 class Layout:

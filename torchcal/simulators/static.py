@@ -181,9 +181,11 @@ class Simulator:
         with _DUAL, torch.no_grad(), forward_ad.dual_level(), Still():
             dual = forward_ad.make_dual(values.expand(len(columns), *values.shape).contiguous(), tangent)
             fixed = {k: still(v) for k, v in x.items()} if isinstance(x, Mapping) else still(x)
-            found = forward_ad.unpack_dual(self.at(fixed, outputs)(dual))
-            derivative = torch.zeros_like(found.primal) if found.tangent is None else found.tangent
-        return Linearisation(found.primal[0], derivative.permute(1, 2, 0))
+            y, derivative = _unpacked(self.at(fixed, outputs)(dual))
+            if bool((torch.isfinite(y) & ~torch.isfinite(derivative)).any()):
+                # The root of a condition that is 0: it does not move, but 0 times an infinite slope is no number.
+                y, derivative = _unpacked(self.at(x, outputs)(dual))
+        return Linearisation(y[0], derivative.permute(1, 2, 0))
 
     def _flatten(self, result: Any, values: Tensor, n: int, outputs: Sequence[str] | None) -> Tensor:
         if not isinstance(result, Mapping):
@@ -251,6 +253,12 @@ class Simulator:
     def _raised(self, x: Conditions, values: Tensor, column: int) -> Exception | None:
         """What a simulator raised where NaN stands for it, at parameters ``(d,)`` and an output; None where nothing."""
         return None
+
+
+def _unpacked(dual: Tensor) -> tuple[Tensor, Tensor]:
+    """A dual tensor's value and derivative, which is 0 where it has none."""
+    found = forward_ad.unpack_dual(dual)
+    return found.primal, torch.zeros_like(found.primal) if found.tangent is None else found.tangent
 
 
 def _length(x: Conditions) -> int:

@@ -20,7 +20,7 @@ class _Own(Values):
     """``p`` of a term's functions: its own parameters before the simulator's of the same names."""
 
     def __init__(self, outer: Mapping[str, Any], own: Mapping[str, Any]) -> None:
-        began = outer if isinstance(outer, Values) else Values({})
+        began = outer if isinstance(outer, Values) else Values({}, None, None)
         super().__init__({**outer, **own}, began.first, began.start)
         self.outer = outer
 
@@ -54,8 +54,9 @@ class Term:
         formula: One line, as a scientist writes it.
         description: One plain sentence.
         scales: For shape parameters without bounds: the state, input, condition or output (``"t"`` for time) on
-            whose scale they are measured; they are then sought between 0.02 and 1 of its largest magnitude, or of the
-            recording's length for ``"t"``.
+            whose scale they are measured; they are then sought between 0.02 and 1 of its largest magnitude,
+            durations (``"t"``) of the longest run's length, of the whole recording's where ``elapsed`` is that. A
+            moment on the recording's clock needs bounds of its own, or ``elapsed``.
         elapsed: For what begins at nothing and goes on, whatever the clock says: t in its functions counts from the
             first sample of the ``"recording"``, or of each ``"run"``. By default t is the recording's own.
 
@@ -151,11 +152,6 @@ class Term:
             raise DomainError(
                 f'Expected elapsed="recording", "run" or None for the term {name!r}. Got {elapsed!r}.'
             )
-        if elapsed is not None:
-            every, outputs, shifts = (
-                {place: _counted(function, elapsed) for place, function in (part or {}).items()}
-                for part in (every, outputs, shifts)
-            )
         put = object.__setattr__
         put(self, "name", name)
         put(self, "rates", every)
@@ -186,8 +182,29 @@ class Term:
         """``p`` as the term's functions see it."""
         return _Own(p, {parameter.name: p[self.full(parameter.name)] for parameter in self.parameters})
 
+    def began(self, p: Mapping[str, Any]) -> Any:
+        """When t began from which its functions count, on the recording's clock: 0 unless ``elapsed`` says otherwise.
+
+        Raises:
+            SimulatorError: If ``p`` no longer knows.
+        """
+        if self.elapsed is None:
+            return 0.0
+        known = p if isinstance(p, Values) else Values({}, None, None)
+        began = known.first if self.elapsed == "recording" else known.start
+        if began is None:
+            raise SimulatorError(
+                f"Expected p as the simulator gives it for the term {self.name!r}, whose time counts from the start of "
+                f"the {self.elapsed}. Got a plain dict, which does not know when that was (p.copy() and p | {{...}} "
+                "do; dict(p) and {**p} do not)."
+            )
+        return began
+
     def call(self, function: Function, *given: Any) -> Any:
-        """One of its functions on what it is given; an error in it is told as this term's."""
+        """One of its functions on what it is given, t the recording's; an error in it is told as this term's."""
+        if self.elapsed is not None:
+            t, s, p, *more = given
+            given = (t - self.began(p), s, p, *more)
         try:
             return function(*given)
         except TorchcalError:
@@ -203,12 +220,6 @@ class Term:
     def is_sensor(self) -> bool:
         """Whether it changes what is seen and nothing else."""
         return bool(self.outputs) and not (self.rates or self.shifts or self.frees)
-
-
-def _counted(function: Function, elapsed: str) -> Function:
-    """A function of time that begins with the recording, or with each run."""
-    begun = "first" if elapsed == "recording" else "start"
-    return lambda t, s, p, *given: function(t - getattr(p, begun, 0.0), s, p, *given)
 
 
 def extend(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
@@ -342,7 +353,9 @@ def _extend_static(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
     for term in terms:
         if term.elapsed:
             raise DomainError(
-                f"Expected a term without elapsed= for a static simulator, which has no time. Got {term.name!r}."
+                f"Expected a term without elapsed= for a static simulator, which has no time. Got {term.name!r} (give "
+                "shifts=, outputs= or frees= that depend on a condition; of the library's sensors "
+                "terms.sensor(static=True, drift=condition))."
             )
         if term.rates or term.states:
             raise DomainError(
