@@ -7,7 +7,7 @@ import torch
 
 from torchcal import Parameter
 from torchcal.errors import DomainError
-from torchcal.simulators import ODESimulator
+from torchcal.simulators import ODESimulator, Values
 from torchcal.terms import (
     electrical,
     extend,
@@ -230,7 +230,7 @@ def test_the_whole_library_extends_a_base_model_and_changes_nothing(case):
     generator = torch.Generator().manual_seed(0)
     s = {name: draw(generator, 3, 2) for name in wide.states}
     u = {name: draw(generator, 2) for name in inputs}
-    p = {parameter.name: draw(generator, 3, 1) for parameter in wide.parameters}
+    p = Values({parameter.name: draw(generator, 3, 1) for parameter in wide.parameters}, 0.0, 0.0)
     for term in terms:
         for parameter in term.parameters:
             if is_amplitude(parameter):

@@ -196,7 +196,8 @@ class Term:
             raise SimulatorError(
                 f"Expected p as the simulator gives it for the term {self.name!r}, whose time counts from the start of "
                 f"the {self.elapsed}. Got a plain dict, which does not know when that was (p.copy() and p | {{...}} "
-                "do; dict(p) and {**p} do not)."
+                "do; by hand, torchcal.simulators.Values(p, first, start) with the first times of the recording and of "
+                "the run)."
             )
         return began
 
