@@ -1,4 +1,4 @@
-"""Several terms at once: single terms that their own refit missed are found again from where the pairs ended."""
+"""A search with several candidates: terms that their own refit missed, terms that are one, and rivals in a window."""
 
 import dataclasses
 
@@ -9,6 +9,7 @@ from torchcal.discovery.problem import Problem
 from torchcal.discovery.rounds import settle
 from torchcal.discovery.search import Search
 from torchcal.discovery.several import refit_several
+from torchcal.discovery.windows import _rivals
 
 F64 = torch.float64
 X = torch.linspace(0, 3, 60, dtype=F64)
@@ -65,11 +66,33 @@ def test_candidates_that_are_one_stay_so_where_only_the_first_is_refitted():
     assert search.merged == stuck
 
 
-def test_what_was_merged_is_weighed_by_the_noise_that_is_found_later(monkeypatch):
+def test_everything_is_weighed_by_the_noise_that_is_found_later(monkeypatch):
     search = searched(["square", "twice the square", "wave"])
+    before = {(w.candidate, w.driver, w.low, w.high): w.z for w in search.local}
     louder = dataclasses.replace(search.noise, sd=1.2 * search.noise.sd)
     monkeypatch.setattr("torchcal.discovery.search.suited", lambda *given: louder)
     search.reweigh()
     search.merge()
     assert search.aliases == {0: [1]}
     assert abs(search.merged[1].found.chi2 - search.plain[0].found.chi2) < 0.1
+    same = [before[key] / w.z for w in search.local if (key := (w.candidate, w.driver, w.low, w.high)) in before]
+    assert same
+    assert all(abs(ratio - 1.2) < 0.01 for ratio in same)
+
+
+def test_what_leads_in_a_window_is_held_against_others_there_though_it_is_no_physics():
+    x = torch.linspace(0, 3, 60, dtype=F64)
+    y = 2 * x + 0.4 * (x - 1.8).relu().sign() * x**2
+    y = y + 0.02 * torch.randn(60, generator=torch.Generator().manual_seed(3), dtype=F64)
+    base = tc.Simulator(lambda x, p: {"y": p["m"] * x["x"]}, [tc.Parameter("m")])
+    problem = Problem.of(base, tc.Recording(x={"x": x}, y={"y": y}, noise=0.02))
+    search = Search(problem, [term(name) for name in ("square", "cube", "wave")], {}, 0, 3, 2, lambda text: None)
+    search.calibrate_base()
+    search, _ = settle(search, problem, 0.99)
+    wrong = max((m for m in search.models if m.names == ("cube",) and m.window is not None), key=lambda m: m.weight)
+    wrong.physical = False
+    search.models = [wrong, *search.plain.values()]
+    _rivals(search, wrong.log_prior)
+    best = max(search.models, key=lambda m: m.weight)
+    assert (best.names, best.physical) == (("square",), True)
+    assert abs(best.window.low - 1.8) < 0.05

@@ -311,6 +311,7 @@ class Search:
             self._judge(model)
         self.residual = Residual(self.base, self.noise, seed=self.seed)
         self.screening = screen(self.residual, self.candidates)
+        self.local, _ = windows(self.residual, self.candidates, self.screening)
         self.structure = analyse(self.residual, every=True)
 
     def with_unknown(self, found: Fitted) -> tuple[Noise, float]:

@@ -23,8 +23,9 @@ __all__ = ["refit_local"]
 #: Refits at most, in windows that promise much and in the leader's; of one candidate; around one refitted term; how
 #: many of those, and how many more of terms that the base has everywhere.
 MOST, MOST_EACH, MOST_AROUND, LEADING, HELD = 10, 2, 2, 3, 1
-#: Score below which a window promises nothing.
-LEAST_SCORE = 3.5
+#: Score below which a window promises nothing, and the share that it may lack of what the best term removes: its edges
+#: are taken from a coarse grid, and its effect for linear.
+LEAST_SCORE, LACKING = 3.5, 0.1
 #: How often windows are sought anew around the leading terms.
 ROUNDS = 2
 #: Log evidence below the best up to which a local model's edges are made sharp; log odds up to which a candidate counts
@@ -54,7 +55,8 @@ def refit_local(search: Search) -> None:
     promising: dict[int, list[Window]] = {}
     for w in sorted(search.local, key=lambda w: -w.z):
         plain = max(gains.get(w.candidate, 0.0), search.screening.score(w.candidate) ** 2)
-        if w.candidate not in same and w.z > LEAST_SCORE and w.z**2 > max(plain + 6.0, highest - 10.0):
+        enough = max(plain + 6.0, highest - max(10.0, LACKING * highest))
+        if w.candidate not in same and w.z > LEAST_SCORE and w.z**2 > enough:
             promising.setdefault(w.candidate, []).append(w)
     prior = math.log(PRIOR["local"] / max(len(search.candidates), 1))
     spans = {name: Span.of(driver) for name, driver in search.drivers().items()} if promising else {}
@@ -105,10 +107,17 @@ def _turn(search: Search, prior: float) -> None:
 def _rivals(search: Search, prior: float) -> bool:
     """Hold what leads in a window against the other candidates in that window: in a short one many do the same.
 
+    A term that is no physics may lead too, where the range is right and the term is not.
+
     Returns whether there was any.
     """
-    lead = search.physical_leader
-    if lead is None or lead.window is None:
+    leads = {id(model): model for model in (search.leader, search.physical_leader) if model is not None}
+    return any([_rivals_of(search, prior, lead) for lead in leads.values()])
+
+
+def _rivals_of(search: Search, prior: float, lead: Model) -> bool:
+    """The other candidates in the window of one."""
+    if lead.window is None:
         return False
     w = lead.window
     tried = {
