@@ -187,7 +187,7 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
         run = torch.arange(len(bins), dtype=torch.float64)[:, None].expand(bins.shape)
         drivers = _by_run(problem, drivers, _bin_means(bins, count, run))
         labels = [
-            ("equation", state, _rate_unit(unit, problem.recording.units.get("time", "s")))
+            ("equation", state, _rate_unit(unit, problem.recording.units.get("time", "[time]")))
             for state, unit in bound.ode.states.items()
         ]
         labels += [("parameter", names[i], problem.parameters[i].unit) for i in own]

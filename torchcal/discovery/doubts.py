@@ -36,6 +36,8 @@ LEVELS, NEARLY = 3, 0.2
 #: Noise sd by which an instrument's reading must fall while the true value rises to be no instrument's: a hard limit is
 #: one. And the least sd, in the data's spread.
 FALL, ROUNDING = 2.0, 1e-3
+#: Variation that an instrument may add, in that of what it measures: with more it is another model of the thing.
+ADDED = 1.0
 #: Share of the range of the true values by which it is looked at beyond them.
 BEYOND = 0.2
 #: Share of the largest effect of the base's parameters below which a direction of them moves no datum.
@@ -44,7 +46,7 @@ UNSEEN = 1e-7
 
 def doubt(search: Search, model: Model) -> str:
     """Why a model is no name, however probable, in a sentence; empty if it may be one."""
-    found = left_open(search, model) or _falling(search, model)
+    found = left_open(search, model) or _no_instrument(search, model)
     return found or ("" if search.exact else _noise_or_physics(search, model))
 
 
@@ -125,8 +127,9 @@ def _beside(columns: Tensor, moved: Tensor) -> float:
     return float(left.norm())
 
 
-def _falling(search: Search, model: Model) -> str:
-    """Why a model's instruments are none: the reading of one falls where the true value rises."""
+def _no_instrument(search: Search, model: Model) -> str:
+    """Why a model's instruments are none: the reading of one falls where the true value rises, or shows more of the
+    instrument than of what it measures."""
     problem = model.found.problem
     instruments = [term for term in model.candidate.terms if term.is_sensor and not term.states]
     if not instruments:
@@ -154,7 +157,10 @@ def _falling(search: Search, model: Model) -> str:
                     f"By it the reading of {name} falls where the true value rises, at the recorded values or just "
                     "beyond them, as that of no instrument does."
                 )
-            true[here] = reading(true[here])
+            shown = reading(true[here])
+            if float((shown - true[here]).std()) > ADDED * float(true[here].std()):
+                return f"By it the reading of {name} varies more by the instrument's error than by the true value."
+            true[here] = shown
     return ""
 
 

@@ -201,7 +201,9 @@ def identifiability(search: Search, best: Model | None) -> list[str]:
     screening = search.screening
     for i, candidate in enumerate(search.candidates):
         if screening.best[i] < 0 and not candidate.blind:
-            rows.append(f"{candidate.name} cannot be told from the parameters of the base")
+            own = best is not None and best.window is not None and i in best.numbers
+            everywhere = ", where it acts everywhere," if own else ""
+            rows.append(f"{candidate.name}{everywhere} cannot be told from the parameters of the base")
         for j in range(i):
             c = abs(screening.correlation(i, j))
             if c > 0.99 and not _told_apart(search, i, j):

@@ -174,7 +174,7 @@ def estimate(
         return Noise(sd, correlation, math.inf, posterior, "none", table, unit=torch.ones_like(sd))
     unit = torch.ones_like(recording.y) if unit is None else unit
     known = given if isinstance(given, Tensor) else unit
-    replicated = _pure_error(problem) if given is None else None
+    replicated = _replicates(problem) if given is None else None
     sd = known.clone()
     freedom, doubted = math.inf, 1.0
     for output in range(outputs):
@@ -220,7 +220,8 @@ def estimate(
         table[output, : len(sizes)] = torch.tensor(sizes, dtype=torch.float64).sqrt()
         if given is None:
             if replicated is not None:
-                sd[mask], freedom = replicated[0][output], min(freedom, float(replicated[1][output]))
+                sd[mask] = replicated[output].sd(problem, unit) * unit[mask]
+                freedom = min(freedom, replicated[output].freedom)
             else:
                 sd[mask], freedom = scale * unit[mask], min(freedom, usable)
         elif scale > EXCESS * (1 + 2 / math.sqrt(2 * usable)):
@@ -245,27 +246,30 @@ def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor) -> Ten
     """Noise sd in units of its median, ``(n_total,)``: 1, or growing with the model's output where the scatter does.
 
     An sd of a + |f| / max |f| is taken for the best of a few a where it makes the fastest part of the residual much
-    likelier (by `GROWS`; Laplace's distribution, whose scale a few outliers move little). It is for noise of unknown
-    size, and 1 where replicates tell it. Outputs ``f`` are those of all data, used or not, ``(n_total,)``.
+    likelier (by `GROWS`; Laplace's distribution, whose scale a few outliers move little). Where there are replicates,
+    how far they are off their means takes the place of the residual. It is for noise of unknown size. Outputs ``f`` are
+    those of all data, used or not, ``(n_total,)``.
     """
     unit = torch.ones_like(problem.recording.y)
-    if _pure_error(problem) is not None:
-        return unit
-    f = f.abs()
+    f, replicated = f.abs(), _replicates(problem)
     for output in range(len(problem.recording.outputs)):
         parts = [places for places in problem.recorded if int(problem.output_of[places[0]]) == output]
         if not parts:
             continue
         used = f[problem.index[torch.cat(parts)]]
-        left, size = [], []
-        for places in parts:
-            kept, inside = _fastest(problem, places, residual, design)
-            left.append(kept)
-            size.append(f[problem.index[places]][inside] / used.max())
-        e, size_of = torch.cat(left).abs(), torch.cat(size)
+        if replicated is not None:
+            e, told = replicated[output].off.abs(), float(replicated[output].freedom)
+            size_of = f[problem.index[replicated[output].places]] / used.max()
+        else:
+            left, size = [], []
+            for places in parts:
+                kept, inside = _fastest(problem, places, residual, design)
+                left.append(kept)
+                size.append(f[problem.index[places]][inside] / used.max())
+            e, size_of = torch.cat(left).abs(), torch.cat(size)
+            told = (INDEPENDENT if problem.order is not None else 1.0) * len(e)
         if len(e) < FEWEST or not float(used.max()) > 0 or not float(e.sum()) > 0:
             continue
-        told = INDEPENDENT * len(e) if problem.order is not None else len(e)
         best = GROWS - told * math.log(float(e.sum()))
         for offset in OFFSETS:
             shape = offset + size_of
@@ -318,8 +322,28 @@ def _decorrelate(values: Tensor, rho: Tensor) -> Tensor:
     return torch.cat([values[:1], rest])
 
 
-def _pure_error(problem: Problem) -> tuple[Tensor, Tensor] | None:
-    """Noise sd and degrees of freedom by output from data at identical conditions; None without any."""
+@dataclass(frozen=True)
+class _Replicates:
+    """What data of one output at identical conditions tell of its noise.
+
+    Attributes:
+        places: Of the used data that are not alone at their conditions.
+        off: How far each is from the mean of its conditions, in what makes its variance that of the noise.
+        freedom: Degrees of freedom.
+    """
+
+    places: Tensor
+    off: Tensor
+    freedom: int
+
+    def sd(self, problem: Problem, unit: Tensor) -> float:
+        """Noise sd in a unit ``(n_total,)``, which is the same at identical conditions."""
+        off, count = self.off / unit[problem.index[self.places]], len(self.places)
+        return math.sqrt(float(off.square().mean())) if count else 0.0
+
+
+def _replicates(problem: Problem) -> list[_Replicates] | None:
+    """Replicates of every output; None without any, or with too few of one."""
     x = problem.recording.x
     if problem.in_time:
         return None
@@ -327,18 +351,16 @@ def _pure_error(problem: Problem) -> tuple[Tensor, Tensor] | None:
     _, group = columns.unique(dim=0, return_inverse=True)
     if int(group.max()) + 1 == len(columns):
         return None
-    outputs = len(problem.recording.outputs)
-    square, freedom = torch.zeros(outputs, dtype=torch.float64), torch.zeros(outputs, dtype=torch.float64)
-    for output in range(outputs):
-        mine = problem.output_of == output
-        y, g = problem.y[mine], group[problem.condition_of[mine]]
+    found = []
+    for output in range(len(problem.recording.outputs)):
+        places = (problem.output_of == output).nonzero()[:, 0]
+        y, g = problem.y[places], group[problem.condition_of[places]]
         count = torch.zeros(int(group.max()) + 1, dtype=torch.float64).index_add_(0, g, torch.ones_like(y))
         total = torch.zeros_like(count).index_add_(0, g, y)
-        square[output] = (y - (total / count.clamp_min(1))[g]).square().sum()
-        freedom[output] = float((count - 1).clamp_min(0).sum())
-    if float(freedom.min()) < 3:
-        return None
-    return (square / freedom).sqrt(), freedom
+        many = count[g] > 1
+        off = (y - total[g] / count[g]) * (count[g] / (count[g] - 1).clamp_min(1)).sqrt()
+        found.append(_Replicates(places[many], off[many], int((count - 1).clamp_min(0).sum())))
+    return found if min(one.freedom for one in found) >= 3 else None
 
 
 def quantisation(problem: Problem) -> dict[str, float]:

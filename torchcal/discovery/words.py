@@ -371,7 +371,8 @@ def _ambiguous(d: Any) -> list[str]:
         told = f"{_hypothesis(d, known[best])} explains it best (probability {shares[best]:.2f}); these data cannot "
         told += f"exclude {others}."
     else:
-        told = f"{len(known)} hypotheses explain it about as well, and these data cannot exclude any of them."
+        which = "either" if len(known) == 2 else "any"
+        told = f"{len(known)} hypotheses explain it about as well, and these data cannot exclude {which} of them."
     parts = [_where(d), told]
     sets = [set(tied) for tied in known]
     beside = sum(
@@ -409,8 +410,9 @@ def _unexplained(d: Any) -> list[str]:
     if d.missing is not None:
         size = with_unit(f"{float(d.missing.rate.max() - d.missing.rate.min()):.3g}", d.missing.unit)
         along = "from run to run" if d.missing.driver == RUN else f"against {d.missing.driver}"
+        what = "part of the rate of" if d.missing.kind == "equation" else "change of"
         parts.append(
-            f"The missing change of {d.missing.target} {along} varies by {size}, beside what a change of the base's "
+            f"The missing {what} {d.missing.target} {along} varies by {size}, beside what a change of the base's "
             "own parameters does."
         )
     return parts
