@@ -12,7 +12,7 @@ from torchcal.discovery.fitting import Fitted, fit, follow_slopes, starts
 from torchcal.discovery.screen import Screening
 from torchcal.discovery.structure import Residual
 
-__all__ = ["beginnings", "first_guess", "is_far", "larger_effects", "make_up"]
+__all__ = ["beginnings", "first_guess", "is_far", "larger_effects", "learned", "make_up"]
 
 #: Shapes that a refit begins at, by their tangents; the same where the base misses the data by more than the root of
 #: `FAR` noise sd.
@@ -24,8 +24,8 @@ BLIND, MAGNITUDES = (0.1, 0.3, 0.5, 0.7, 0.9), range(-4, 3)
 #: Sizes, in those of the misfit, at which an effect whose tangent is the base's is looked at; steps in which the base
 #: makes up for it; and the χ² a datum that it must leave to be something else.
 LARGER, MADE_UP, SEEN = (1.0, 4.0), 12, 0.01
-#: Shares of the linear estimate from which refits begin.
-STEPS = (0.05, 1.0)
+#: Shares of the linear estimate from which refits begin; of it at the base of another fit, those that are tried.
+STEPS, LADDER = (0.05, 1.0), tuple(4.0**k for k in range(-2, 6))
 
 
 def is_far(base: Fitted) -> bool:
@@ -94,6 +94,32 @@ def larger_effects(residual: Residual, candidate: Candidate) -> Tensor | None:
     bound = (found.ends[:, free] <= low[free]) | (found.ends[:, free] >= high[free])
     seen = (found.ends_chi2 > 1.0 + SEEN * n) & ~bound.any(-1)  # where the base is not held back
     return found.ends[seen] if bool(seen.any()) else None
+
+
+def learned(other: Fitted, base: Fitted, candidate: Candidate) -> Tensor:
+    """A candidate's starting values ``(B, P)`` at what another fit has found of the base's parameters.
+
+    Its amplitudes are tried one at a time, at sizes from far below what is best there to first order to far above; the
+    best of each stays.
+    """
+    known, problem, w = other.by_name, candidate.problem, base.whitening
+    low, high = problem.limits()
+    row = candidate.begin.clone()
+    row[_columns(base, candidate)] = row.new_tensor([known[base.problem.parameters[i].name] for i in base.free])
+    begin = row.repeat(min(len(candidate.shapes), SHAPES), 1)
+    begin[:, candidate.own] = candidate.shapes[: len(begin)]
+    y, slope = problem.evaluate(begin, candidate.amplitudes)[:2]
+    left, effects = w.vector(problem.y - y), torch.stack([w(one) for one in slope])
+    sizes = (effects * left[..., None]).sum(1).abs() / effects.square().sum(1)
+    rows = []
+    for a, place in enumerate(candidate.amplitudes):
+        size = float(sizes[:, a].nan_to_num(posinf=0.0).max())
+        for start in begin if size > 0 else ():
+            tried = _each(start, place, [float(start[place]) + sign * size * k for k in LADDER for sign in (1.0, -1.0)])
+            each = torch.stack(tried).clamp(low, high)
+            chi2 = w.vector(problem.y - problem.evaluate(each, [])[0]).square().sum(-1)
+            rows.append(each[int(chi2.nan_to_num(nan=torch.inf).argmin())])
+    return torch.stack(rows) if rows else begin[:0]
 
 
 def _columns(base: Fitted, candidate: Candidate) -> list[int]:

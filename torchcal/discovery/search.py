@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.base import calibrate_base
-from torchcal.discovery.beginnings import beginnings, first_guess, is_far, larger_effects
+from torchcal.discovery.beginnings import beginnings, first_guess, is_far, larger_effects, learned
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
 from torchcal.discovery.fitting import Fitted, refit, weighed
 from torchcal.discovery.likeliest import Tangents, settled, with_unknown
@@ -38,6 +38,11 @@ FEW, CHANCE = 6, 0.2
 CLEARLY = 5.0
 #: Share of the best log evidence below which a model is not fitted again when the noise estimate has changed.
 HOPELESS = 0.5
+#: Log weight that a term's refit from another start must gain to take the place of the first.
+BETTER = 1.0
+#: χ² a datum from which on a base is bent far; share of it that the best term then leaves at most, and the probability
+#: of as much structure in noise below which it leaves something, for others to be tried from its base.
+BENT, MOSTLY, PLAINLY = 5.0, 0.5, 0.01
 #: Correlation of projected tangents above which two candidates are one.
 SAME = 0.9999
 
@@ -204,7 +209,31 @@ class Search:
         self.failed = none - self.left
         self.models += [model for model in found if model is not None]
         self.reweigh()
+        self._learn()
         self.merge()
+
+    def _learn(self) -> None:
+        """Where the best term explains most of a large misfit, but not all, the others begin again at its base.
+
+        A base that is bent far may show the right term with the wrong sign.
+        """
+        lead = self.leader
+        if self.exact or lead is None or self.base.chi2 < BENT * self.problem.n:
+            return
+        if lead.found.chi2 > MOSTLY * self.base.chi2 or self.examine(lead).p_value >= PLAINLY:
+            return
+        others = [i for i, c in enumerate(self.candidates) if self.screening.best[i] >= 0 and i not in lead.numbers]
+        begin = ((i, learned(lead.found, self.base, self.candidates[i])) for i in others)
+        self.improve([Hypothetical((i,), self.candidates[i], rows, self.prior) for i, rows in begin if len(rows)])
+        self.reweigh()
+
+    def improve(self, wanted: Sequence[Hypothetical]) -> None:
+        """Refit single terms from other starts, and keep what is better than what was found before."""
+        for one, model in zip(wanted, self.refit_together(wanted), strict=True):
+            old = self.plain.get(one.numbers[0])
+            if model is not None and (old is None or model.weight > old.weight + BETTER):
+                self.models = [m for m in self.models if m is not old] + [model]
+                self.failed -= {*one.numbers}
 
     def held_out(self, found: Fitted, mask: Tensor) -> HeldOut | None:
         """A model of this search fitted without the data in ``mask``; computed once."""

@@ -24,8 +24,6 @@ MOST, FEWER = 14, 10
 ALL = 0.99999
 #: Of them from the linear search; and the correlation of two tangents from which on they are one.
 FROM_LINEAR, NEARLY_SAME = 8, 0.999
-#: Log weight that a term's refit from where a pair ended must gain to take the place of its own.
-BETTER = 1.0
 #: Log weight behind the leading pair down to which that is tried, and for how many pairs.
 CLOSE, AGAIN = 5.0, 3
 #: Correlation of two tangents from which on a candidate is tried in the other's place beside the leading pair's.
@@ -87,11 +85,8 @@ def _alone_again(search: Search, pair: Model) -> None:
         for k in candidate.free:  # what the other term frees stays neutral here
             row[k] = known[names[k]]
         wanted.append(Hypothetical((i,), candidate, row[None], search.prior))
-    for i, model in zip(numbers, search.refit_together(wanted), strict=True):
-        old = search.plain.get(i)
-        if model is not None and (old is None or model.weight > old.weight + BETTER):
-            search.models = [m for m in search.models if m is not old] + [model]
-            search.merge()
+    search.improve(wanted)
+    search.merge()
 
 
 def _enough(search: Search) -> bool:
