@@ -380,3 +380,30 @@ def test_a_lone_outlier_is_one_beside_a_residual_of_the_other_sign_and_a_bump_or
     residual[40:43] = torch.tensor([0.5, 0.6, 0.5], dtype=F64)  # something that lasts
     assert lone(problem, residual, recording.noise).nonzero()[:, 0].tolist() == [20, 51]
     assert lone(problem, residual, None).nonzero()[:, 0].tolist() == [20, 51]
+
+
+def test_replicates_tell_noise_that_grows():
+    """As many false alarms at 1 % as a binomial of 20 allows, where small values looked too well fitted before."""
+    x = np.tile(np.geomspace(0.2, 20, 20), 2)
+    parameters = [tc.Parameter("a", low=0.0), tc.Parameter("b", low=0.0)]
+    base = tc.Simulator(lambda x, p: p["a"] * x / (p["b"] + x), parameters)
+    terms = [tc.Term("leak", outputs={"y": lambda x, p, y: y + p["g"] * x}, parameters=[tc.Parameter("g")]),
+             *tc.terms.sensor(("y",), static=True)]  # fmt: skip
+    alarms = 0
+    for seed in range(20):
+        y = 12 * x / (1.5 + x) * (1 + 0.05 * np.random.default_rng(seed).standard_normal(40))
+        d = tc.diagnose(base, tc.Recording(x=x, y=y), terms, seed=0, progress=False)
+        alarms += d.verdict != "consistent"
+        assert d.noise.source == "replicates"
+    assert alarms <= 2
+
+
+@pytest.mark.parametrize(("size", "verdict"), [(0.2, "named"), (4.0, "ambiguous")])
+def test_an_instrument_that_adds_more_than_it_measures_is_no_name(size, verdict):
+    x = np.linspace(0, 3, 80)
+    y = 3 * x + size * x**2 + 0.02 * np.random.default_rng(0).standard_normal(80)
+    base = tc.Simulator(lambda x, p: p["m"] * x, [tc.Parameter("m")])
+    terms = [term for term in tc.terms.sensor(("y",), static=True) if term.name == "non-linearity of y"]
+    d = tc.diagnose(base, tc.Recording(x=x, y=y), terms, seed=0, progress=False)
+    assert d.verdict == verdict
+    assert ("varies more by the instrument's error than by the true value" in str(d)) == (verdict != "named")

@@ -2,7 +2,9 @@
 
 import dataclasses
 
+import numpy as np
 import torch
+from scipy.integrate import solve_ivp
 
 import torchcal as tc
 from torchcal.discovery.problem import Problem
@@ -96,3 +98,28 @@ def test_what_leads_in_a_window_is_held_against_others_there_though_it_is_no_phy
     best = max(search.models, key=lambda m: m.weight)
     assert (best.names, best.physical) == (("square",), True)
     assert abs(best.window.low - 1.8) < 0.05
+
+
+def test_a_term_that_a_far_bent_base_hides_is_found_from_the_base_of_another():
+    """A spring on what is modelled as a mass without one: its tangent there has the wrong sign."""
+    t = np.linspace(0, 60, 181)
+    torque = 0.004 * np.sin(0.35 * t) + 0.003 * np.sin(0.13 * t)
+
+    def rate(s, z):
+        return [z[1], (np.interp(s, t, torque) - 0.01 * z[1] - 0.02 * z[0]) / 0.02]
+
+    true = solve_ivp(rate, (0, 60), [0.3, 0.0], t_eval=t, rtol=1e-9, atol=1e-11, max_step=0.05).y[0]
+    q = true + 0.08 * np.random.default_rng(0).standard_normal(181)
+    body = tc.ODESimulator(
+        lambda t, s, p, u: {"q": s["w"], "w": (u["M"] - p["d"] * s["w"]) / p["J"]},
+        {"q": "rad", "w": "rad/s"},
+        [tc.Parameter("J", low=1e-4, initial=0.02), tc.Parameter("d", low=0.0, initial=0.01)],
+        observe=("q",),
+    )
+    recording = tc.Recording(runs=[tc.Run(time=t, outputs={"q": q}, inputs={"M": torque})], noise=0.08)
+    names = ("linear spring", "cubic stiffness", "quadratic drag")
+    terms = [term for term in tc.terms.mechanics(position="q", velocity="w") if term.name in names]
+    d = tc.diagnose(body, recording, terms, seed=0, progress=False)
+    assert list(d.ranking[0].terms) == ["linear spring"]
+    stiffness = d.ranking[0].estimates[0]  # by the moment of inertia
+    assert abs(stiffness.value - 1.0) < 4 * stiffness.sd < 0.1

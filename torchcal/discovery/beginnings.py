@@ -12,11 +12,13 @@ from torchcal.discovery.fitting import Fitted, fit, follow_slopes, starts
 from torchcal.discovery.screen import Screening
 from torchcal.discovery.structure import Residual
 
-__all__ = ["beginnings", "first_guess", "is_far", "larger_effects", "learned", "make_up"]
+__all__ = ["BENT", "beginnings", "first_guess", "is_far", "larger_effects", "learned", "make_up"]
 
-#: Shapes that a refit begins at, by their tangents; the same where the base misses the data by more than the root of
-#: `FAR` noise sd.
-SHAPES, SHAPES_FAR, FAR = 3, 8, 30.0
+#: Shapes that a refit begins at, by their tangents; the same where the base is far off.
+SHAPES, SHAPES_FAR = 3, 8
+#: χ² a datum from which on a base is far off, whatever the data vary by; from which on it is bent; and the share of the
+#: data's spread that it then misses where it is far off too.
+FAR, BENT, LOST = 30.0, 5.0, 0.5
 #: Amplitudes tried from first guesses, as shares of the range or of the largest linear estimate.
 GUESSED = (0.1, 0.4, 0.9)
 #: Amplitudes tried where the tangent says nothing: shares of the range, or powers of ten.
@@ -29,8 +31,13 @@ STEPS, LADDER = (0.05, 1.0), tuple(4.0**k for k in range(-2, 6))
 
 
 def is_far(base: Fitted) -> bool:
-    """Whether the base misses the data by so much that its estimates say little of the truth's."""
-    return base.problem.recording.noise != "none" and base.chi2 > FAR * base.problem.n
+    """Whether the base misses the data by so much that its estimates say little of the truth's: by many noise sd, or by
+    more than noise and most of what the data vary by."""
+    problem = base.problem
+    if problem.recording.noise == "none":
+        return False
+    missed = base.residual / problem.recording.spread[problem.index]
+    return base.chi2 > FAR * problem.n or (base.chi2 > BENT * problem.n and float(missed.square().mean()) > LOST**2)
 
 
 def beginnings(

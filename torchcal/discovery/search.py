@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.base import calibrate_base
-from torchcal.discovery.beginnings import beginnings, first_guess, is_far, larger_effects, learned
+from torchcal.discovery.beginnings import BENT, beginnings, first_guess, is_far, larger_effects, learned
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
 from torchcal.discovery.fitting import Fitted, refit, weighed
 from torchcal.discovery.likeliest import Tangents, settled, with_unknown
@@ -40,9 +40,9 @@ CLEARLY = 5.0
 HOPELESS = 0.5
 #: Log weight that a term's refit from another start must gain to take the place of the first.
 BETTER = 1.0
-#: χ² a datum from which on a base is bent far; share of it that the best term then leaves at most, and the probability
-#: of as much structure in noise below which it leaves something, for others to be tried from its base.
-BENT, MOSTLY, PLAINLY = 5.0, 0.5, 0.01
+#: Share of the misfit of a bent base that the best term leaves at most, and the probability of as much structure in
+#: noise below which it leaves something, for others to be tried from its base.
+MOSTLY, PLAINLY = 0.5, 0.01
 #: Correlation of projected tangents above which two candidates are one.
 SAME = 0.9999
 
