@@ -122,4 +122,4 @@ def test_a_term_that_a_far_bent_base_hides_is_found_from_the_base_of_another():
     d = tc.diagnose(body, recording, terms, seed=0, progress=False)
     assert list(d.ranking[0].terms) == ["linear spring"]
     stiffness = d.ranking[0].estimates[0]  # by the moment of inertia
-    assert abs(stiffness.value - 1.0) < 4 * stiffness.sd < 0.1
+    assert abs(stiffness.value - 1.0) < 4 * stiffness.sd < 0.4
