@@ -41,7 +41,8 @@ def sensor(
 
     Args:
         outputs: Names of the outputs. Lag and delay follow the state of the same name; for an output that is a
-            function of the states, give ``{output: f(t, s, p, u)}``.
+            function of the states, give ``{output: f(t, s, p, u)}``. They begin at its first value, which must follow
+            from states and parameters alone; where it depends on t or an input, say ``dynamic=False``.
         static: Whether they are outputs of a static simulator: then there is neither lag nor delay, and a drift only
             against a condition.
         drift: Condition against which the instrument of a static simulator drifts.
