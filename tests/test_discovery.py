@@ -235,7 +235,7 @@ def test_a_parameter_that_changes_in_time_is_a_missing_rate_of_its_equation():
     motion = tc.Recording(runs=[tc.Run(time=t, outputs={"x": x + draw(300, 0.01, 0)}, initial=start)], noise=0.01)
     d = quiet(body, motion, [])
     assert d.verdict == "unexplained"
-    assert (d.missing.kind, d.missing.target, d.missing.unit) == ("equation", "v", "m/s/s")
+    assert (d.missing.kind, d.missing.target, d.missing.unit) == ("equation", "v", "m/s/[time]")
     there = np.interp(d.missing.time, t, x)
     wanted = torch.as_tensor(-0.3 * np.sin(1.3 * d.missing.time.numpy()) * there)
     assert float((d.missing.along - wanted).norm() / wanted.norm()) < 0.5

@@ -111,7 +111,7 @@ def test_what_the_base_has_everywhere_may_be_missing_in_a_window():
     assert float(best.estimates[0].value) == pytest.approx(-0.4, abs=0.08)
     assert f"offset, where {best.region}" in str(d).splitlines()[0]
     # Everywhere it is in the base, and said to be.
-    assert "offset cannot be told from the parameters of the base" in d.identifiability
+    assert "offset, where it acts everywhere, cannot be told from the parameters of the base" in d.identifiability
     # The sentence is about what was accepted.
     words = " ".join(str(d).split())
     assert f"offset, where {best.region}" in words
@@ -356,7 +356,7 @@ def test_what_one_run_has_and_others_lack_is_said_to_differ_between_runs(noise):
     assert (d.where[0].driver, d.where[0].spans) == ("run", ((1.0, 1.0),))
     words = " ".join(str(d).split())
     assert "differs from run to run (largest in 1, counted from 0)" in words
-    assert "change of A from run to run" in words
+    assert "part of the rate of A from run to run" in words
     assert diagnose(*decays(offset=0.0, **noise), terms).verdict == "consistent"
 
 

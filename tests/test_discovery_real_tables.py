@@ -79,7 +79,7 @@ def falling(base, recording, term, values, sd=0.01):
         exact=False,
         noise=SimpleNamespace(open=False, sd=torch.full((recording.n,), sd, dtype=F64)),
     )
-    return bool(doubts._falling(search, SimpleNamespace(found=found, candidate=candidate)))
+    return bool(doubts._no_instrument(search, SimpleNamespace(found=found, candidate=candidate)))
 
 
 SHOWN = {
