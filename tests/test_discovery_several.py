@@ -100,6 +100,20 @@ def test_what_leads_in_a_window_is_held_against_others_there_though_it_is_no_phy
     assert abs(best.window.low - 1.8) < 0.05
 
 
+def test_a_term_that_raises_at_sizes_far_off_keeps_its_first_fit():
+    def wave(x, p, y):
+        if bool((p["a"].abs() > 50).any()):
+            raise ValueError("too large")
+        return y + p["a"] * (5 * x["x"]).sin()
+
+    noise = 0.02 * torch.randn(60, generator=torch.Generator().manual_seed(3), dtype=F64)
+    y = 2 * X + 3 * X**2 + 2 * (5 * X).sin() + noise
+    base = tc.Simulator(lambda x, p: {"y": p["m"] * x["x"]}, [tc.Parameter("m")])
+    picky = tc.Term("picky wave", outputs={"y": wave}, parameters=[tc.Parameter("a")])
+    d = tc.diagnose(base, tc.Recording(x={"x": X}, y={"y": y}), [picky, term("square"), term("cube")], progress=False)
+    assert sorted(d.terms) == ["picky wave", "square"]
+
+
 def test_a_term_that_a_far_bent_base_hides_is_found_from_the_base_of_another():
     """A spring on what is modelled as a mass without one: its tangent there has the wrong sign."""
     t = np.linspace(0, 60, 181)

@@ -24,6 +24,7 @@ from torchcal.discovery.screen import Screening, Window, screen, windows
 from torchcal.discovery.stop import Stop
 from torchcal.discovery.structure import Residual, Structure, analyse
 from torchcal.discovery.verify import HeldOut, held_out_fit
+from torchcal.errors import SimulatorError
 from torchcal.terms import Term
 
 __all__ = ["Search"]
@@ -218,13 +219,20 @@ class Search:
         A base that is bent far may show the right term with the wrong sign.
         """
         lead = self.leader
-        if self.exact or lead is None or self.base.chi2 < BENT * self.problem.n:
+        if self.exact or self.stop.is_set() or lead is None or self.base.chi2 < BENT * self.problem.n:
             return
         if lead.found.chi2 > MOSTLY * self.base.chi2 or self.examine(lead).p_value >= PLAINLY:
             return
         others = [i for i, c in enumerate(self.candidates) if self.screening.best[i] >= 0 and i not in lead.numbers]
-        begin = ((i, learned(lead.found, self.base, self.candidates[i])) for i in others)
-        self.improve([Hypothetical((i,), self.candidates[i], rows, self.prior) for i, rows in begin if len(rows)])
+        wanted = []
+        for i in others:
+            try:
+                rows = learned(lead.found, self.base, self.candidates[i])
+            except SimulatorError:  # a function may raise at sizes that are far off: its first fit stays
+                continue
+            if len(rows):
+                wanted.append(Hypothetical((i,), self.candidates[i], rows, self.prior))
+        self.improve(wanted)
         self.reweigh()
 
     def improve(self, wanted: Sequence[Hypothetical]) -> None:
