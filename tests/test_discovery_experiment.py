@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import torchcal as tc
-from torchcal.discovery import experiment
+from torchcal.discovery import conditions, experiment
 from torchcal.discovery.problem import Problem
 from torchcal.simulators import Trajectories
 
@@ -19,31 +19,31 @@ def test_denser_samples_lie_between_the_others_and_inputs_hold_as_they_did(hold)
     u = torch.tensor([1.0, 3.0, 5.0], dtype=F64)
     run = tc.Run(time=t, outputs={"x": torch.zeros(3, dtype=F64)}, inputs={"f": u}, hold=hold)
     proposed = ("a run", tc.Recording(runs=[run]), {"time": t, "initial": {"x": 2.0}, "inputs": {"f": u}})
-    text, recording, conditions = experiment._denser(proposed, tc.Recording(runs=[run]), 4)
+    text, recording, dense = conditions.denser(proposed, tc.Recording(runs=[run]), 4)
     assert text == "a run, sampled 4 times as densely"
     wanted = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0], dtype=F64)
-    assert torch.equal(conditions["time"], wanted)
+    assert torch.equal(dense["time"], wanted)
     assert recording.runs[0].initial == {"x": 2.0}
     between = [1.5, 2.0, 2.5] if hold == "linear" else [1.0, 1.0, 1.0]
-    assert conditions["inputs"]["f"][1:4].tolist() == between
-    assert torch.equal(conditions["inputs"]["f"][::4], u)
+    assert dense["inputs"]["f"][1:4].tolist() == between
+    assert torch.equal(dense["inputs"]["f"][::4], u)
 
 
 def test_static_options_keep_to_what_they_say_and_to_positive_conditions():
     x = {"dose": torch.logspace(-2, 2, 30, dtype=F64), "shift": torch.linspace(-1, 1, 30, dtype=F64)}
-    options = experiment._static(tc.Recording(x=x, y=torch.zeros(30, dtype=F64)))
+    options = conditions._static(tc.Recording(x=x, y=torch.zeros(30, dtype=F64)))
     texts = [text for text, _, _ in options]
     assert texts[0] == "the same conditions again"
     assert len(texts) == len(set(texts)) == 11
-    for text, recording, conditions in options:
+    for text, recording, chosen in options:
         assert recording.n == 30
-        assert bool((conditions["x"]["dose"] > 0).all())
+        assert bool((chosen["x"]["dose"] > 0).all())
         if "dose above" in text:
-            assert float(conditions["x"]["dose"].min()) == pytest.approx(100.0)
+            assert float(chosen["x"]["dose"].min()) == pytest.approx(100.0)
         if "dose below" in text:
-            assert float(conditions["x"]["dose"].max()) == pytest.approx(0.01)
+            assert float(chosen["x"]["dose"].max()) == pytest.approx(0.01)
         if "shift below" in text:
-            assert float(conditions["x"]["shift"].min()) == pytest.approx(-2.0)
+            assert float(chosen["x"]["shift"].min()) == pytest.approx(-2.0)
 
 
 def rivals():
@@ -185,3 +185,81 @@ def test_an_output_that_was_zero_may_move_but_not_explode():
     noise = SimpleNamespace(sd=torch.full((50,), 0.1, dtype=F64))
     assert not experiment._explodes(model, torch.full((50,), 1.0, dtype=F64), noise)
     assert experiment._explodes(model, torch.full((50,), 1e6, dtype=F64), noise)
+
+
+def driven(begin: dict[str, float]) -> SimpleNamespace:
+    """Fit of a spring that a force drives, from known initial states."""
+    ode = tc.ODESimulator(
+        lambda t, s, p, u: {"x": s["v"], "v": u["f"] - p["k"] * s["x"]},
+        {"x": "m", "v": "m/s"},
+        [tc.Parameter("k", initial=4.0)],
+        observe=("x",),
+    )
+    t = torch.linspace(0, 6, 40, dtype=F64)
+    force = 1.0 + 0.5 * torch.sin(t)
+    run = tc.Run(time=t, outputs={"x": torch.zeros_like(t)}, inputs={"f": force}, initial=begin)
+    problem = Problem.of(ode, tc.Recording(runs=[run]))
+    return SimpleNamespace(problem=problem, values=torch.tensor([4.0], dtype=F64), warm=None)
+
+
+def test_bolder_runs_are_what_their_texts_say():
+    model = driven({"x": 0.5, "v": 0.0})
+    first = model.problem.recording.runs[0]
+    options = {text: chosen for text, _, chosen in conditions.bolder(model)}
+    assert len(options) == len(conditions.bolder(model))
+    far = options["a run that starts from 5 times the initial states of the first"]
+    assert far["initial"] == {"x": 2.5, "v": 0.0}
+    assert torch.equal(far["inputs"]["f"], first.inputs["f"])
+    both = options["a run with 5 times the inputs and initial states of the first"]
+    assert both["initial"] == far["initial"]
+    assert torch.equal(both["inputs"]["f"], 5 * first.inputs["f"])
+    assert options["a run that starts from 3 times the initial x of the first, all else as there"]["initial"] == {
+        "x": 1.5, "v": 0.0,
+    }  # fmt: skip
+    (moved,) = [chosen for text, chosen in options.items() if "starts from v = " in text]
+    assert moved["initial"]["x"] == 0.5
+    assert abs(moved["initial"]["v"]) > 0.1
+    steady = options["a run with the inputs held at their largest"]
+    assert steady["inputs"]["f"].unique().tolist() == [float(first.inputs["f"].max())]
+    slow = options["a run with the inputs of the first twice as slowly"]
+    assert float(slow["time"][-1]) == pytest.approx(12.0)
+    assert torch.equal(slow["inputs"]["f"], first.inputs["f"])
+
+
+def test_multiples_of_a_state_of_rest_are_no_experiments():
+    model = driven({"x": 0.0, "v": 0.0})
+    texts = [text for text, _, _ in (*conditions.simple(model), *conditions.bolder(model))]
+    assert not [text for text in texts if "times the initial" in text or "initial states" in text]
+    assert "a run with 2 times the inputs of the first" in texts
+
+
+def test_bolder_conditions_go_further_and_two_move_together_without_going_together():
+    x = {"dose": torch.logspace(-2, 2, 30, dtype=F64), "shift": torch.linspace(-1, 1, 30, dtype=F64)}
+    options = conditions._static_bolder(tc.Recording(x=x, y=torch.zeros(30, dtype=F64)))
+    assert len({text for text, _, _ in options}) == len(options) == 8
+    (far,) = [chosen["x"] for text, _, chosen in options if text.startswith("conditions with shift above")]
+    assert float(far["shift"].max()) == pytest.approx(4.0)
+    (corner,) = [chosen["x"] for text, _, chosen in options if "dose below" in text and "shift above" in text]
+    assert bool((corner["dose"] > 0).all())
+    assert float(corner["dose"].max()) == pytest.approx(0.01)
+    assert float(corner["shift"].min()) == pytest.approx(1.0)
+    assert float(corner["shift"].max()) == pytest.approx(2.0)
+    assert abs(float(torch.corrcoef(torch.stack([corner["dose"], corner["shift"]]))[0, 1])) < 0.2
+
+
+def test_bolder_experiments_are_tried_where_no_simple_one_tells_enough(monkeypatch):
+    models, _ = models_of("ab")
+    tried = []
+
+    def separations(pairs, new, noise):
+        far = float(new.x["x"].max())
+        tried.append(far)
+        return [9.0 if far > 3 else simple]
+
+    monkeypatch.setattr(experiment, "_separations", separations)
+    simple = 7.0
+    assert experiment.propose(models, SimpleNamespace()).separation == 7.0
+    assert max(tried) < 3
+    simple = 3.0
+    found = experiment.propose(models, SimpleNamespace())
+    assert (found.separation, found.description) == (9.0, "conditions with x above the recorded range, to 4")

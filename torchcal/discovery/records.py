@@ -330,7 +330,7 @@ class Experiment:
         separation: Predicted distance of the two nearest tied models of those that it tells apart, in noise sd (root
             of the expected χ² difference).
         conditions: Ready for a new recording: in time ``{"time": (T,), "initial": {state: value}, "inputs":
-            {input: (T,)}}``, otherwise ``{"x": {condition: (n,)}}``. Found for the first four tied models.
+            {input: (T,)}}``, otherwise ``{"x": {condition: (n,)}}``. Found for the first eight tied models.
         untold: Pairs of hypotheses that no simple experiment tells apart.
     """
 
