@@ -22,6 +22,7 @@ from torchcal.discovery.fitting import Fitted, starts
 from torchcal.discovery.likeliest import settled
 from torchcal.discovery.limits import limits
 from torchcal.discovery.model import Model
+from torchcal.discovery.nameless import refit_nameless
 from torchcal.discovery.noise import Noise
 from torchcal.discovery.own_noise import beside, explains
 from torchcal.discovery.problem import Problem
@@ -154,6 +155,7 @@ def diagnose(
                     search, detected = every, True
             if detected and terms and not search.stop.is_set():
                 refit_several(search)
+                refit_nameless(search)
             decision = decide(search, detected, mask)
             best = decision.best or (search.physical_leader if decision.verdict == "ambiguous" else None)
             if holdout is None and mask is not None and best and _beyond_prediction(search, best.found, mask):

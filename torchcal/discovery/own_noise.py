@@ -81,10 +81,11 @@ def weigh_alone(search: "Search") -> tuple[float, float]:
     """
     base = settled(search.base, search.noise, search.tangents)[1]
     here = log_likelihood(search.base, search.noise, search.tangents) - base
-    own = {id(m): alone(m.found, search.noise, search.tangents)[1] - base for m in search.models}
-    near = max((own[id(m)] + m.prior for m in search.models), default=0.0) - BEHIND
-    leading = sorted(search.models, key=lambda m: -m.weight)[:SETTLED]
-    for model in search.models:
+    every = [*search.models, *search.nameless]
+    own = {id(m): alone(m.found, search.noise, search.tangents)[1] - base for m in every}
+    near = max((own[id(m)] + m.prior for m in every), default=0.0) - BEHIND
+    leading = sorted(every, key=lambda m: -m.weight)[:SETTLED]
+    for model in every:
         found = own[id(model)]
         if model in leading and found + model.prior > near:  # fitted again with its noise, as the base is
             found = settled(model.found, search.noise, search.tangents)[1] - base

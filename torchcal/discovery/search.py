@@ -27,7 +27,7 @@ from torchcal.discovery.verify import HeldOut, held_out_fit
 from torchcal.errors import SimulatorError
 from torchcal.terms import Term
 
-__all__ = ["Search"]
+__all__ = ["Search", "alike"]
 
 #: Prior odds against an estimate on a physical bound that it wants to cross.
 UNPHYSICAL = math.log(1e-3)
@@ -75,6 +75,7 @@ class Search:
     screening: Screening = field(init=False)
     local: list[Window] = field(init=False, default_factory=list)
     models: list[Model] = field(init=False, default_factory=list)
+    nameless: list[Model] = field(init=False, default_factory=list)
     aliases: dict[int, list[int]] = field(init=False, default_factory=dict)
     merged: dict[int, Model] = field(init=False, default_factory=dict)
     twins: dict[int, int] = field(init=False, default_factory=dict)
@@ -189,7 +190,7 @@ class Search:
     def duplicate(self, i: int, j: int) -> bool:
         """Whether two candidates do the same whatever is calibrated beside them, to first order."""
         u, v = (self.candidates[k].tangents[0, :, 0] for k in (i, j))
-        return float((u @ v).abs()) >= (1 - 1e-9) * float(u.norm() * v.norm())
+        return alike(u, v)
 
     def refit_singles(self, *, detected: bool = True) -> None:
         """Every candidate that the screening leaves a chance; where nothing was detected only the leading few."""
@@ -364,6 +365,11 @@ class Search:
             model.residual = Residual(model.found, self.noise, seed=self.seed, draws=500)
             model.structure = analyse(model.residual)
         return model.structure
+
+
+def alike(u: Tensor, v: Tensor) -> bool:
+    """Whether two effects ``(n,)`` are one but for their sizes."""
+    return float((u @ v).abs()) >= (1 - 1e-9) * float(u.norm() * v.norm())
 
 
 def _joint(nulls: Sequence[Tensor], seen: Sequence[float]) -> tuple[float, Tensor]:

@@ -141,7 +141,8 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     if detected:
         unknown, here = weigh_alone(search)
         ranked.sort(key=lambda m: -m.weight)
-        decision.none_evidence = max(_none_evidence(search, ranked, here), unknown + decision.none_evidence)
+        unnamed = max((m.weight for m in search.nameless), default=-math.inf)
+        decision.none_evidence = max(_none_evidence(search, ranked, here), unknown + decision.none_evidence, unnamed)
     _weigh(search, decision)
     if not detected or decision.base >= max(decision.none, *decision.probability.values(), 0.0):
         decision.verdict = "consistent"

@@ -1,0 +1,141 @@
+"""What has no name and acts where a term in a window does.
+
+Something that is in no list may act in a part of a range too, and in a short window many terms do much the same. A term
+is named for its own work there: a constant change in the same place, with the same ends to choose, must do worse.
+"""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.candidates import Candidate, prepare
+from torchcal.discovery.channels import channels
+from torchcal.discovery.local import EDGE, WIDTH_OF_EDGE, WIDTHS, Span, is_window, localised
+from torchcal.discovery.model import PRIOR, Hypothetical, Model
+from torchcal.discovery.search import Search, alike
+from torchcal.errors import DomainError, SimulatorError
+from torchcal.simulators import Parameter
+from torchcal.terms import Term
+
+__all__ = ["refit_nameless"]
+
+#: Log weight behind the leader down to which a term in a window is held against a nameless change, and of how many.
+CLOSE, MOST = 3.0, 3
+#: Where in an open window a nameless change may end, as shares of the data within; and starts that are refitted.
+ENDING, STARTS = (0.1, 0.3, 0.5, 0.7, 0.9), 3
+
+
+def refit_nameless(search: Search) -> None:
+    """Constant changes in the windows of the leading terms, where a term in a window leads."""
+    lead = search.physical_leader
+    if search.exact or search.stop.is_set() or lead is None or lead.window is None:
+        return
+    near = [m for m in search.models if m.physical and m.window is not None and m.weight > lead.weight - CLOSE]
+    found = search.base
+    count = len({(c.kind, c.target) for c in channels(found.problem, found) if c.kind in found.problem.kinds})
+    prior = math.log(PRIOR["none"] / max(count, 1)) - math.log(3.0 * len(search.drivers()))
+    wanted: dict[tuple[tuple[str, ...], str], list[Hypothetical]] = {}
+    for model in sorted(near, key=lambda m: -m.weight)[:MOST]:
+        where, window = _place(model), model.window
+        if where is None or window is None or _is_constant(search, model):
+            continue
+        if (where, window.driver) not in wanted:
+            wanted[where, window.driver] = _wanted(search, model, prior)
+    every = [one for each in wanted.values() for one in each]
+    search.nameless = [model for model in search.refit_together(every) if model is not None and model.physical]
+
+
+def _place(model: Model) -> tuple[str, ...] | None:
+    """Where a term acts, if in one place."""
+    (term,) = model.candidate.terms
+    places = [(kind, name) for kind in ("rates", "outputs", "shifts") for name in getattr(term, kind)]
+    return places[0] if len(places) == 1 and not term.states and not term.frees else None
+
+
+def _is_constant(search: Search, model: Model) -> bool:
+    """Whether a model's term adds the same wherever it acts, so that nothing else is known of it."""
+    plain = search.candidates[model.numbers[0]]
+    if plain.tangents.shape[0] != 1 or plain.tangents.shape[2] != 1:
+        return False
+    constant = _constant(plain.terms[0], search.problem.in_time)
+    try:
+        same = prepare(search.base.problem, search.base, [constant], search.fixed, {}).tangents[0, :, 0]
+    except (SimulatorError, DomainError):
+        return False
+    return alike(plain.tangents[0, :, 0], same)
+
+
+def _wanted(search: Search, model: Model, prior: float) -> list[Hypothetical]:
+    """A constant in a model's window, with steep edges and with edges to fit; an open window closed as well."""
+    w, (term,) = model.window, model.candidate.terms
+    if w is None:
+        return []
+    driver = search.drivers()[w.driver]
+    inside = driver[(driver >= w.low) & (driver <= w.high)]
+    span = Span.of(driver)
+    ends = [([w.low], [w.high])]
+    if not (math.isfinite(w.low) and math.isfinite(w.high)) and len(inside):
+        other = inside.double().quantile(torch.tensor(ENDING, dtype=torch.float64)).tolist()
+        ends.append(([w.low], other) if math.isfinite(w.low) else (other, [w.high]))
+    found = []
+    for (lows, highs), edge in itertools.product(ends, (False, True)):
+        local = localised(
+            _constant(term, search.problem.in_time), w.driver, lows[0], highs[0], span,
+            static=not search.problem.in_time, edge=edge,
+        )  # fmt: skip
+        try:
+            candidate = prepare(search.base.problem, search.base, [local], search.fixed, {})
+            begin = _begin(search, model, candidate, list(itertools.product(lows, highs)), span)
+        except (SimulatorError, DomainError):
+            continue
+        window = dataclasses.replace(w, low=lows[0], high=highs[0], span=span)
+        found.append(Hypothetical((), candidate, begin, prior, window))
+    return found
+
+
+def _constant(term: Term, in_time: bool) -> Term:
+    """A constant change in the place where a term acts."""
+
+    def added(*given: object) -> object:
+        return given[2 if in_time else 1]["c"]  # type: ignore[index]
+
+    def shown(*given: object) -> object:
+        return given[-1] + added(*given)  # type: ignore[operator]
+
+    return Term(
+        "something unknown",
+        rates={name: added for name in term.rates},
+        outputs={name: shown for name in term.outputs},
+        shifts={name: added for name in term.shifts},
+        parameters=[Parameter("c")],
+    )
+
+
+def _begin(
+    search: Search, model: Model, candidate: Candidate, ends: Sequence[tuple[float, float]], span: Span
+) -> Tensor:
+    """Starting values at a model's base, of the best size each; those of the best few."""
+    known, problem = model.found.by_name, candidate.problem
+    names = [q.name for q in problem.parameters]
+    (place,) = candidate.amplitudes
+    rows = []
+    for (low, high), width in itertools.product(ends, [share * span.size for share in (EDGE, *WIDTHS)]):
+        row = candidate.begin.clone()
+        for i, name in enumerate(names):
+            if is_window(name):
+                row[i] = width if name.endswith(WIDTH_OF_EDGE) else low if name.endswith("from") else high
+            elif i not in candidate.own:
+                row[i] = known[name]
+        rows.append(row)
+    begin = torch.stack(rows).unique(dim=0)
+    y, slope, _ = problem.evaluate(begin, [place])
+    w = search.noise.whitening(problem)
+    left, effect = w.vector(problem.y - y), torch.stack([w(one)[:, 0] for one in slope])
+    size = (left * effect).sum(-1) / effect.square().sum(-1).clamp_min(1e-300)
+    begin[:, place] += size
+    chi2 = (left - size[:, None] * effect).square().sum(-1)
+    return begin[chi2.nan_to_num(nan=torch.inf).argsort()[:STARTS]]
