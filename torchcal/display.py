@@ -15,6 +15,9 @@ DECADES = 30.0
 MOST_DIGITS = 15
 """Digits behind its first that a number is told with at most."""
 
+ROUNDING = 1e-15
+"""Share of what is looked at below which a place is where that begins to count."""
+
 FAR = 100.0
 """Difference in log evidence, or distance in noise sd, beyond which a number tells nothing more."""
 
@@ -58,9 +61,11 @@ def percent(share: float | None) -> str:
 def placed(value: float, extent: float) -> str:
     """A place along something, to two thousandths of the extent or less that is looked at, wherever that begins.
 
-    >>> placed(12.3456, 60.0), placed(1.7e9 + 612.34, 3600.0), placed(1.7e9 + 612.34, 20.0), placed(0.0, 1.0)
+    >>> placed(12.3456, 60.0), placed(1.7e9 + 612.34, 3600.0), placed(1.7e9 + 612.34, 20.0), placed(-4e-320, 1.0)
     ('12.35', '1700000612', '1700000612.34', '0')
     """
+    if 0 < extent < math.inf and abs(value) < ROUNDING * extent:
+        return "0"
     if not (0 < extent < math.inf and math.isfinite(value) and abs(value) >= 10 * extent):
         return f"{value:.4g}"
     decimals, before = math.ceil(-math.log10(extent / 500)), math.floor(math.log10(abs(value)))

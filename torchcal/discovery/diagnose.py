@@ -288,7 +288,8 @@ def _result(
         search.examine(shown)
     base = explain.fit_record(search.base, search.structure, ())
     final = base if best is None else explain.fit_record(best.found, best.structure, best.names, best.window)
-    _warn(search, decision.verdict)
+    lost = decision.verdict == "unexplained" and _explains_nothing(search)
+    _warn(search, lost)
     before = _scores(search, search.base, mask)
     after = None if best is None else _scores(search, best.found, mask)
     if best is None:
@@ -348,6 +349,7 @@ def _result(
             "withdrawn": decision.withdrawn,
             "doubt": decision.doubt,
             "nearly": decision.nearly,
+            "lost": lost,
             "set_aside": suspect,
             "interrupted": interrupted,
             "region": None if best is None else best.where,
@@ -394,7 +396,20 @@ def _improved(simulator: Simulator, best: Model) -> Simulator:
     return improved
 
 
-def _warn(search: Search, verdict: str) -> None:
+def _explains_nothing(search: Search) -> bool:
+    """Whether the calibrated base explains no more than a constant would."""
+    recording, found = search.problem.recording, search.base
+    constant = recording.y[found.problem.index].mean()
+    return _size(search) > NO_BETTER and not torch.allclose(found.y, constant)
+
+
+def _size(search: Search) -> float:
+    """RMSE of the calibrated base, in the spread of the data."""
+    found = search.base
+    return float((found.residual / search.problem.recording.spread[found.problem.index]).square().mean().sqrt())
+
+
+def _warn(search: Search, lost: bool) -> None:
     if search.base.agreeing < 0.2:
         warnings.warn(
             f"Only {search.base.agreeing:.0%} of the base's starting values came to the best fit. Give initial= or "
@@ -402,13 +417,10 @@ def _warn(search: Search, verdict: str) -> None:
             ConvergenceWarning,
             stacklevel=4,
         )
-    recording, found = search.problem.recording, search.base
-    size = float((found.residual / recording.spread[found.problem.index]).square().mean().sqrt())
-    best = recording.y[found.problem.index].mean()
-    if verdict == "unexplained" and size > NO_BETTER and not torch.allclose(found.y, best):
+    if lost:
         warnings.warn(
-            f"The calibrated base explains no more than a constant would (its RMSE is {size:.2g} of the data's "
-            "spread). Check the units and the simulator, and give initial= or bounds to its parameters.",
+            f"The calibrated base explains no more than a constant would (its RMSE is {_size(search):.2g} of the "
+            "data's spread). Check the units and the simulator, and give initial= or bounds to its parameters.",
             ConvergenceWarning,
             stacklevel=4,
         )

@@ -53,7 +53,7 @@ def ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[Hy
     )
     if not search.exact:
         evidence = decision.none_evidence - math.log(PRIOR["none"])
-        rows.append(Hypothesis(NONE, evidence, decision.none, note="something unknown and smooth"))
+        rows.append(Hypothesis(NONE, evidence, decision.none, note=decision.none_note))
     rows.sort(key=lambda row: (-row.probability, -row.log_evidence))
     return Table(rows, COLUMNS)
 

@@ -24,6 +24,8 @@ __all__ = ["Screening", "Window", "contributions", "screen", "windows", "windows
 
 #: A tangent whose projection keeps less than this share of it says nothing new.
 VANISHED = 1e-5
+#: Correlation from which on an effect is that of a parameter of the base that comes off its bound, up to this.
+SAME = 1e-9
 #: Places at which windows may begin or end, both ends of the driver among them.
 CUTS = 13
 
@@ -66,8 +68,11 @@ class Screening:
         return float(self.columns[:, self.best[i]] @ self.columns[:, self.best[j]])
 
 
-def screen(residual: Residual, candidates: Sequence[Candidate]) -> Screening:
-    """Score every candidate against the residual of a fit."""
+def screen(residual: Residual, candidates: Sequence[Candidate], before: Screening | None = None) -> Screening:
+    """Score every candidate against the residual of a fit.
+
+    What said nothing new ``before``, at the fit that the tangents were taken at, says nothing new at one close to it.
+    """
     blocks, owner, shape, amplitude, sign = [], [], [], [], []
     for i, candidate in enumerate(candidates):
         for g in range(len(candidate.shapes)):
@@ -82,6 +87,8 @@ def screen(residual: Residual, candidates: Sequence[Candidate]) -> Screening:
     columns = residual.project(whole)
     norm = columns.norm(dim=0)
     good = norm > VANISHED * whole.norm(dim=0).clamp_min(1e-300)
+    good &= ~_inward(residual, columns, torch.tensor(sign))
+    good &= True if before is None else before.norm > 0
     norm = torch.where(good, norm, torch.zeros_like(norm))
     columns = torch.where(good, columns / norm.clamp_min(1e-300), torch.zeros_like(columns))
     direction = torch.tensor(sign, dtype=torch.float64)
@@ -101,6 +108,21 @@ def screen(residual: Residual, candidates: Sequence[Candidate]) -> Screening:
         acting.append(best[-1] if len(usable) or not len(moving) else int(moving[0]))
     null = scores(residual.null).amax(0) if columns.shape[1] else torch.zeros(residual.null.shape[1])
     return Screening(columns, owners, torch.tensor(shape), torch.tensor(amplitude), norm, z, best, acting, null)
+
+
+def _inward(residual: Residual, columns: Tensor, sides: Tensor) -> Tensor:
+    """Which effects, to the one side that they may act to, are those of a base's parameter that comes off its bound.
+
+    A bound that the base wants to cross leaves its tangent out of what is projected off, but holds it back to one side
+    only.
+    """
+    found = residual.found
+    stuck = [i for i, at in zip(found.free, found.at_bound.tolist(), strict=True) if at]
+    low, high = (end[stuck] - found.values[stuck] for end in found.problem.limits())
+    away = torch.where(low.abs() <= high.abs(), 1.0, -1.0)
+    moved = residual.tangent(found.jacobian[:, found.at_bound]) * away
+    along = columns.T @ moved / (columns.norm(dim=0)[:, None] * moved.norm(dim=0)).clamp_min(1e-300)
+    return (sides[:, None] * along > 1 - SAME).any(1)
 
 
 @dataclass(frozen=True)

@@ -348,7 +348,7 @@ class Search:
                 model.found = weighed(model.found, fresh.whitening(model.found.problem))
             self._judge(model)
         self.residual = Residual(self.base, self.noise, seed=self.seed)
-        self.screening = screen(self.residual, self.candidates)
+        self.screening = screen(self.residual, self.candidates, self.screening)
         self.local, _ = windows(self.residual, self.candidates, self.screening)
         self.structure = analyse(self.residual, every=True)
 

@@ -66,6 +66,7 @@ class Decision:
         none: Probability of something that is not in the library.
         base: Probability of the base alone.
         none_evidence: Log weight of something that is not in the library.
+        none_note: What that is, in words.
         withdrawn: Why a name was withdrawn, in words.
         doubt: Why the best explanation is no name, though probable, in words.
         nearly: Whether what is left is not white, and the name rests on the share of the misfit that it removes.
@@ -80,6 +81,7 @@ class Decision:
         self.none = 0.0
         self.base = 1.0
         self.none_evidence = 0.0
+        self.none_note = ""
         self.withdrawn = ""
         self.doubt = ""
         self.nearly = False
@@ -141,8 +143,14 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     if detected:
         unknown, here = weigh_alone(search)
         ranked.sort(key=lambda m: -m.weight)
-        unnamed = max((m.weight for m in search.nameless), default=-math.inf)
-        decision.none_evidence = max(_none_evidence(search, ranked, here), unknown + decision.none_evidence, unnamed)
+        decision.none_evidence = max(_none_evidence(search, ranked, here), unknown + decision.none_evidence)
+        nameless = max(search.nameless, key=lambda m: m.weight, default=None)
+        leading = next((p for p in search.structure.places if p.channel.kind in search.problem.kinds), None)
+        decision.none_note = "something unknown and smooth"
+        if nameless is not None and nameless.weight > decision.none_evidence:
+            decision.none_evidence, decision.none_note = nameless.weight, f"something unknown where {nameless.where}"
+        elif leading is not None and leading.period is not None:
+            decision.none_note = "an unknown oscillation"
     _weigh(search, decision)
     if not detected or decision.base >= max(decision.none, *decision.probability.values(), 0.0):
         decision.verdict = "consistent"

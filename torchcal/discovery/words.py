@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from torchcal.discovery.channels import RUN
-from torchcal.discovery.local import Span
-from torchcal.discovery.verdict import REMOVED, WHITE
-from torchcal.display import NONE, between, percent, up_to, with_unit
+from torchcal.discovery.verdict import PLAINLY_WHITE, REMOVED, WHITE
+from torchcal.discovery.where_in_words import share_in_words, where_in_words
+from torchcal.display import NONE, up_to, with_unit
 
 __all__ = ["paragraph"]
 
@@ -16,26 +16,17 @@ __all__ = ["paragraph"]
 SLOW = 0.3
 #: Share of the misfit beyond noise below which there is hardly any to remove.
 LITTLE = 0.005
-#: Log evidence below the best place's down to which another one is told beside it.
-CLOSE = 3.0
 #: Probability from which on the base, or something unknown, is told beside tied hypotheses; and how many times as
 #: likely as the next one of these is plainly the best.
 LISTED, PLAINLY = 0.05, 3.0
 #: Hypotheses that hold a named term and more, and detection limits, of which the paragraph lists so many.
 MORE, LIMITS = 4, 6
-#: Share of a driver's range from which on spans say nothing.
-EVERYWHERE = 0.9
 #: Probability of what hypotheses that hold a name have beside it, from which on it is told.
 BESIDE = 0.005
 #: Share of the misfit that something can remove at most and be no name: all but what is less than that.
 NEARLY_ALL = 0.999
 #: A parameter depends on what acts beside it when that moves it by more than this many of its sd.
 MOVED = 2.0
-
-
-def _share(share: float) -> str:
-    """A share in a sentence."""
-    return percent(share) if math.isfinite(share) else "an unknown share"
 
 
 def _probability(p: float) -> str:
@@ -151,7 +142,7 @@ def _rmse_unit(d: Any) -> str:
 
 def _consistent(d: Any) -> list[str]:
     limits = [limit for limit in d.detection_limit if math.isfinite(limit.smallest)]
-    nothing = "There is no sign of missing physics."
+    nothing = "There is no sign of missing physics." + _yet(d)
     if d.p_detect < 1 - d.confidence:
         nothing = "Yet the base alone remains likelier than all that was tried beside it."
         if d.noise.source == "estimated" and max(d.noise.correlation.values(), default=0.0) >= SLOW:
@@ -170,68 +161,15 @@ def _consistent(d: Any) -> list[str]:
     ]
 
 
-def _where(d: Any) -> str:
-    if not d.where:
+def _yet(d: Any) -> str:
+    """What is likelier than the base, though chance may have done as much."""
+    base = sum(row.probability for row in d.ranking if not row.terms)
+    best = max(d.ranking, key=lambda row: row.probability)
+    if not best.terms or best.probability <= base:
         return ""
-    place = d.where[0]
-    spans = ", ".join(between(place.spans[:3], "to", place.extent))
-    everywhere = _everywhere(d, place)
-    if place.driver == RUN:
-        largest = "" if everywhere else f" (largest in {spans}, counted from 0)"
-        advice = " A parameter of the simulator with per_run=True would take it up." if not d.terms else ""
-        return (
-            f"The mismatch sits in the {place.kind} {place.target} and differs from run to run{largest}: one change "
-            f"for each run removes {_share(place.share)} of the misfit beyond noise.{advice}{_embedded(d)}"
-        )
-    largest = "" if everywhere else f" (largest at {spans})"
-    if place.period is not None:
-        return (
-            f"The mismatch sits in the {place.kind} {place.target} and oscillates with {place.driver} (period "
-            f"{place.period:.3g}): a wave there removes {_share(place.share)} of the misfit beyond noise.{_embedded(d)}"
-        )
     return (
-        f"The mismatch sits in the {place.kind} {place.target} and varies with {place.driver}{largest}: a smooth "
-        f"change there removes {_share(place.share)} of the misfit beyond noise{_elsewhere(d)}.{_embedded(d)}"
-    )
-
-
-def _everywhere(d: Any, place: Any) -> bool:
-    """Whether a place's spans are all of its driver's range, or nearly: they say nothing then."""
-    if place.driver == RUN:
-        runs = range(len(d.recording.runs or ()))
-        return all(any(round(low) <= run <= round(high) for low, high in place.spans) for run in runs)
-    span = _span(d, place)
-    if span is None:
-        return False
-    return span.high <= span.low or sum(max(span.share(*ends), 0.0) for ends in place.spans) >= EVERYWHERE
-
-
-def _span(d: Any, place: Any) -> Span | None:
-    """The range of a place's driver; None where it is not known."""
-    values = d.drivers.get(place.driver)
-    own = place.driver.removesuffix(" itself")
-    if values is None and own in d.recording.outputs:
-        values = d.recording.split(d.base.prediction)[own]
-    return None if values is None or not bool(values.isfinite().all()) else Span.of(values)
-
-
-def _elsewhere(d: Any) -> str:
-    """Where else a change would remove about as much; a name says where it is."""
-    if d.terms:
-        return ""
-    first = d.where[0]
-    close = [place for place in d.where[1:] if place.evidence > first.evidence - CLOSE and place.driver != RUN]
-    other = next((place for place in close if (place.kind, place.target) != (first.kind, first.target)), None)
-    return "" if other is None else f", and one of the {other.kind} {other.target} with {other.driver} about as much"
-
-
-def _embedded(d: Any) -> str:
-    if len(d.embedded) < 2 or d.embedded[0].sd <= 0:
-        return ""
-    first, second = d.embedded[:2]
-    return (
-        f" Model error embedded in one parameter at a time is likeliest in {first.parameter} (sd {first.sd:.3g}; "
-        f"{up_to(first.log_likelihood - second.log_likelihood)} in log-likelihood before {second.parameter})."
+        f" Yet {_hypothesis(d, best.terms)} is likelier than the base alone (probability {best.probability:.2f} and "
+        f"{_probability(base)}), which chance may have done; more data, or a known noise sd, would tell."
     )
 
 
@@ -243,7 +181,7 @@ def _proof(d: Any) -> str:
         b, a = d.before.held_out, d.after.held_out
         text += (
             f"; on {b.n} data kept from both fits from {b.rmse:.4g} to {a.rmse:.4g} (log score {b.log_score:.3g} to "
-            f"{a.log_score:.3g}, 95 % intervals hold {_share(b.coverage)}, then {_share(a.coverage)})"
+            f"{a.log_score:.3g}, 95 % intervals hold {share_in_words(b.coverage)}, then {share_in_words(a.coverage)})"
         )
         if a.rmse > b.rmse:
             text += ", where the effect does not show beyond chance"
@@ -261,11 +199,11 @@ def _named(d: Any) -> list[str]:
     alone = sum(row.probability for row in d.ranking if _holds(d, row) and set(row.terms) == set(d.terms))
     with_others = " alone or with others" if d.tied or probability - alone >= BESIDE else ""
     likely = "" if d.settings.get("nearly") else f"probability{with_others} {probability:.3f}; "
-    does = f"removes {_share(min(top.misfit_removed, 1.0 - d.remaining))} of the misfit beyond noise"
+    does = f"removes {share_in_words(min(top.misfit_removed, 1.0 - d.remaining))} of the misfit beyond noise"
     if top.misfit_removed < LITTLE:  # the base's misfit is as large as noise, and has a shape
         does = f"lowers χ² from {d.base.chi2:.4g} to {d.final.chi2:.4g}"
     parts = [
-        _where(d),
+        where_in_words(d),
         f"Adding {_and([_with_region(d, name) for name in d.terms])} and refitting everything {does} "
         f"({likely}{estimates}).",
     ]
@@ -281,7 +219,7 @@ def _named(d: Any) -> list[str]:
     if d.tied:
         parts += _larger(d)
     if d.remaining > LITTLE:
-        parts.append(f"{_share(d.remaining)} of the misfit remains unexplained.")
+        parts.append(f"{share_in_words(d.remaining)} of the misfit remains unexplained.")
     return parts
 
 
@@ -354,15 +292,15 @@ def _ambiguous(d: Any) -> list[str]:
     known = [tied for tied in d.tied if tuple(tied) != NONE]
     if len(known) == 1:
         if d.settings.get("withdrawn"):
-            return [_where(d), d.settings["withdrawn"]]
+            return [where_in_words(d), d.settings["withdrawn"]]
         if d.settings.get("doubt"):
-            return [_where(d), f"{_hypothesis(d, known[0])} explains it best. {d.settings['doubt']}"]
+            return [where_in_words(d), f"{_hypothesis(d, known[0])} explains it best. {d.settings['doubt']}"]
         sure = sum(row.probability for row in d.ranking if set(known[0]) <= set(row.terms))
         return [
-            _where(d),
+            where_in_words(d),
             f"{_and(known[0])}, the best explanation in the library, has a probability of {sure:.2f}, which is too "
             f"little for a name: something that is not in the library has {unknown:.2f}, other terms and the base "
-            f"alone have {max(1 - sure - unknown, 0.0):.2f} together. More data, or less noise, would tell.",
+            f"alone have {max(1 - sure - unknown, 0.0):.2f} together. {_would_tell(d, known[0])}",
         ]
     shares = [sum(row.probability for row in d.ranking if set(row.terms) == set(tied)) for tied in known]
     best = max(range(len(known)), key=lambda k: shares[k])
@@ -373,7 +311,7 @@ def _ambiguous(d: Any) -> list[str]:
     else:
         which = "either" if len(known) == 2 else "any"
         told = f"{len(known)} hypotheses explain it about as well, and these data cannot exclude {which} of them."
-    parts = [_where(d), told]
+    parts = [where_in_words(d), told]
     sets = [set(tied) for tied in known]
     beside = sum(
         row.probability for row in d.ranking
@@ -399,21 +337,38 @@ def _ambiguous(d: Any) -> list[str]:
     return parts
 
 
+def _would_tell(d: Any, terms: Sequence[str]) -> str:
+    """What would make a name of the best explanation, or unmake it."""
+    row = next((row for row in d.ranking if row.refitted and set(row.terms) == set(terms)), None)
+    if row is None or row.p_white is None or row.p_white >= PLAINLY_WHITE:
+        return "More data, or less noise, would tell."
+    return (
+        f"What it leaves has a structure that noise gives with a probability of {_probability(row.p_white)}: whether "
+        "that is chance a repeated recording would tell."
+    )
+
+
 def _unexplained(d: Any) -> list[str]:
-    parts = [_where(d)]
+    parts = [where_in_words(d)]
+    if d.settings.get("lost"):
+        parts.insert(
+            0,
+            "The calibrated base explains no more than a constant would: before anything is called missing, look at "
+            "its units, and give initial= or bounds to its parameters, as its best fit may not have been found.",
+        )
     best = next((row for row in d.ranking if row.terms and row.refitted), None)
     if best is not None:
         parts.append(
             f"The best of the library, {_hypothesis(d, best.terms)}, removes "
-            f"{_share(min(best.misfit_removed, NEARLY_ALL))} of the misfit beyond noise{_no_name(d, best)}."
+            f"{share_in_words(min(best.misfit_removed, NEARLY_ALL))} of the misfit beyond noise{_no_name(d, best)}."
         )
     if d.missing is not None:
         size = with_unit(f"{float(d.missing.rate.max() - d.missing.rate.min()):.3g}", d.missing.unit)
         along = "from run to run" if d.missing.driver == RUN else f"against {d.missing.driver}"
         what = "part of the rate of" if d.missing.kind == "equation" else "change of"
         parts.append(
-            f"The missing {what} {d.missing.target} {along} varies by {size}, beside what a change of the base's "
-            "own parameters does."
+            f"The missing {what} {d.missing.target} {along} spans {size} from its lowest to its highest value, beside "
+            "what a change of the base's own parameters does."
         )
     return parts
 
