@@ -11,9 +11,11 @@ import torch
 
 import torchcal as tc
 from torchcal.discovery import doubts, explain, local, where, words
+from torchcal.discovery import where_in_words as where_text
 from torchcal.discovery.channels import Channel
 from torchcal.discovery.records import Estimate, Experiment, Hypothesis, Limit, Location, Table
 from torchcal.discovery.structure import Place
+from torchcal.discovery.where_in_words import where_in_words
 from torchcal.report import diagnosis_page
 
 F64 = torch.float64
@@ -133,7 +135,7 @@ def test_a_parameter_that_was_dormant_is_where_its_contribution_is_large(monkeyp
 )  # fmt: skip
 def test_spans_are_told_where_they_are_not_everywhere(driver, spans, told):
     for verdict in ("named", "unexplained"):
-        text = words._where(finding(verdict, where=[Location("parameter", "k", driver, spans, 0.5, 20.0)]))
+        text = where_in_words(finding(verdict, where=[Location("parameter", "k", driver, spans, 0.5, 20.0)]))
         verb = "differs from run to run" if driver == "run" else f"varies with {driver}"
         assert f"{verb}{told}: " in text
         assert ("per_run=True" in text) == (driver == "run" and verdict != "named")
@@ -141,13 +143,13 @@ def test_spans_are_told_where_they_are_not_everywhere(driver, spans, told):
 
 def test_spans_over_decades_are_measured_in_decades():
     place = Location("parameter", "k", "c", ((1e3, 1e6),), 0.5, 20.0)
-    assert not words._everywhere(finding(drivers={"c": torch.logspace(0, 6, 13, dtype=F64)}), place)
+    assert not where_text._everywhere(finding(drivers={"c": torch.logspace(0, 6, 13, dtype=F64)}), place)
 
 
 def test_a_name_is_in_one_place():
     places = [Location("equation", "R", "t", PART, 0.5, 20.0), Location("parameter", "kd", "t", PART, 0.6, 40.0)]
-    assert "kd" not in words._where(finding(where=places))
-    assert "kd" in words._where(finding("ambiguous", where=places))
+    assert "kd" not in where_in_words(finding(where=places))
+    assert "kd" in where_in_words(finding("ambiguous", where=places))
 
 
 # --- a name and its rivals -------------------------------------------------------------------------------------
@@ -184,9 +186,9 @@ def test_what_has_a_part_of_a_name_is_a_rival():
 
 def test_an_embedded_error_is_not_told_by_thousands():
     errors = [SimpleNamespace(parameter=name, sd=0.1, log_likelihood=value) for name, value in (("a", 4e5), ("b", 1.0))]
-    assert "(sd 0.1; more than 100 in log-likelihood before b)" in words._embedded(finding(embedded=errors))
+    assert "(sd 0.1; more than 100 in log-likelihood before b)" in where_text._embedded(finding(embedded=errors))
     errors[0].log_likelihood = 21.0
-    assert "20.0 in log-likelihood before b" in words._embedded(finding(embedded=errors))
+    assert "20.0 in log-likelihood before b" in where_text._embedded(finding(embedded=errors))
 
 
 def test_what_is_removed_and_what_remains_are_all():
@@ -348,7 +350,7 @@ def test_two_terms_that_do_much_the_same_may_stand_for_one_law(second, told):
 
 def test_places_are_told_to_a_thousandth_of_their_extent():
     spans = ((1.7e9, 1.7e9 + 120.0), (1.7e9 + 300.0, 1.7e9 + 600.0))
-    assert "largest at 1700000000 to 1700000120, 1700000300 to 1700000600)" in words._where(
+    assert "largest at 1700000000 to 1700000120, 1700000300 to 1700000600)" in where_in_words(
         finding(where=[Location("parameter", "k", "c", spans, 0.5, 20.0)])
     )
     span = local.Span(2459000.0, 2459030.0, False)
@@ -359,7 +361,7 @@ def test_places_are_told_to_a_thousandth_of_their_extent():
         span = local.Span(1.7e9, 1.7e9 + extent, False)
         assert abs(float(local.region_text("t", start, math.inf, span).split()[-1]) - start) < 0.002 * extent
     alone = Location("parameter", "k", "t", ((1.7e9 + 60, 1.7e9 + 60),), 0.5, 20.0, extent=600.0)
-    assert "1700000060" in words._where(finding(where=[alone]))
+    assert "1700000060" in where_in_words(finding(where=[alone]))
     assert "1700000060" in str(Table([alone], ("driver", "spans")))
     assert diagnosis_page._spans(alone) == "1700000060"
 

@@ -272,3 +272,62 @@ def test_the_sd_of_a_steps_place_says_how_far_it_may_be_off():
         nearest = min(ends, key=lambda e: abs(e.value - 0.3))
         z.append((nearest.value - 0.3) / nearest.sd)
     assert max(abs(one) for one in z) < 5
+
+
+def dip(seed):
+    """A dip of a current at 1.2 V, in no list: a saturation that ends by itself draws a triangle there."""
+    v = np.tile(np.linspace(0.05, 2, 30), 4)
+    rng = np.random.default_rng([14, seed])
+    y = 3 * v + 0.05 - 0.3 * np.exp(-(((v - 1.2) / 0.12) ** 2)) + 0.05 * rng.standard_normal(120)
+    temperature = np.repeat([0.0, 20.0, 40.0, 60.0], 30)
+    base = tc.Simulator(lambda x, p: p["G"] * x["V"] + p["o"], [tc.Parameter("G", low=0.0), tc.Parameter("o")])
+    terms = [
+        tc.Term("cubic", outputs={"y": lambda x, p, y: y + p["q"] * x["V"] ** 3}, parameters=[tc.Parameter("q")]),
+        *tc.terms.sensor(outputs=("y",), static=True),
+    ]
+    return base, tc.Recording(x={"V": v, "T": temperature}, y=y), terms
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_term_that_bends_to_a_dip_is_no_name(seed):
+    d = diagnose(*dip(seed))
+    assert d.verdict == "unexplained" or ["none of these"] in d.tied
+    (row,) = [row for row in d.ranking if row.terms == ("none of these",)]
+    assert row.note.startswith("something unknown where ")
+    low, high = (float(end) for end in row.note.removeprefix("something unknown where ").split(" < V < "))
+    assert 1.0 < low < 1.2 < high < 1.4
+
+
+def test_where_many_terms_do_the_same_in_a_window_none_of_them_may_be_there():
+    """A second band beside the one that is modelled: each of several terms draws it, in the same window."""
+    nu, rng = np.linspace(15, 95, 240), np.random.default_rng(3)
+    band = 10 * np.exp(-(((nu - 50) / 6) ** 2) / 2)
+    y = band + 1 + 0.6 * np.exp(-(((nu - 68) / 3) ** 2) / 2) + 0.09 * rng.standard_normal(240)
+    base = tc.Simulator(
+        lambda x, p: p["h"] * torch.exp(-(((x - p["c"]) / p["w"]) ** 2) / 2) + p["b"],
+        [tc.Parameter("h", initial=10.0), tc.Parameter("c", initial=50.0), tc.Parameter("w", low=1.0, initial=6.0),
+         tc.Parameter("b", initial=1.0)],
+    )  # fmt: skip
+
+    def added(name, function):
+        return tc.Term(name, outputs={"y": lambda x, p, y: y + p["a"] * function(x)}, parameters=[tc.Parameter("a")])
+
+    terms = [
+        added("sloping baseline", lambda x: (x - 50) / 40),
+        added("curved baseline", lambda x: ((x - 50) / 40) ** 2),
+        added("Lorentzian wings", lambda x: 1 / (1 + ((x - 50) / 6) ** 2)),
+        *tc.terms.sensor(outputs=("y",), static=True),
+    ]
+    d = diagnose(base, tc.Recording(x=nu, y=y), terms)
+    assert d.verdict == "unexplained" or ["none of these"] in d.tied
+    assert not d.terms
+
+
+def test_a_local_term_whose_shape_shows_is_named_all_the_same():
+    """Drag that acts from a speed of 1 on: a constant force there would not do."""
+    recording = recorded(lambda t, x, v: -0.5 * abs(v) * v if v > 1 else 0.0)
+    near = ("linear drag", "linear spring")  # in so narrow a window one drag is like another
+    terms = [t for t in tc.terms.mechanics(position="x", velocity="v", angle=False) if t.name not in near]
+    d = diagnose(oscillator(), recording, [t for t in terms if t.name != "bias force"])
+    assert (d.verdict, d.terms) == ("named", ["quadratic drag"])
+    assert "v > " in d.settings["region"]

@@ -20,7 +20,7 @@ CREEPING, STEPS, TAKEN = 0.02, 20, 5
 #: More steps of the best alone, where it has not converged in those: along a bent valley they are short.
 FINISH = 240
 #: Samples that the slope at the beginning is taken from.
-SLOPES = (12, 6, 24, 48)
+SLOPES = (12, 5, 24, 48)
 #: How many times longer or shorter than 1 a run must be for rates to be guessed from it.
 LONG = 30.0
 

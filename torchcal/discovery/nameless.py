@@ -25,8 +25,9 @@ __all__ = ["refit_nameless"]
 
 #: Log weight behind the leader down to which a term in a window is held against a nameless change, and of how many.
 CLOSE, MOST = 3.0, 3
-#: Where in an open window a nameless change may end, as shares of the data within; and starts that are refitted.
-ENDING, STARTS = (0.1, 0.3, 0.5, 0.7, 0.9), 3
+#: Where in an open window a nameless change may end, as shares of the data within; and starts that are refitted with
+#: each width of the edges.
+ENDING, STARTS = (0.1, 0.3, 0.5, 0.7, 0.9), 2
 
 
 def refit_nameless(search: Search) -> None:
@@ -38,10 +39,11 @@ def refit_nameless(search: Search) -> None:
     found = search.base
     count = len({(c.kind, c.target) for c in channels(found.problem, found) if c.kind in found.problem.kinds})
     prior = math.log(PRIOR["none"] / max(count, 1)) - math.log(3.0 * len(search.drivers()))
+    named = {_place(candidate) for candidate in search.candidates if _is_constant(search, candidate)}
     wanted: dict[tuple[tuple[str, ...], str], list[Hypothetical]] = {}
     for model in sorted(near, key=lambda m: -m.weight)[:MOST]:
-        where, window = _place(model), model.window
-        if where is None or window is None or _is_constant(search, model):
+        where, window = _place(model.candidate), model.window
+        if where is None or window is None or where in named:
             continue
         if (where, window.driver) not in wanted:
             wanted[where, window.driver] = _wanted(search, model, prior)
@@ -49,24 +51,24 @@ def refit_nameless(search: Search) -> None:
     search.nameless = [model for model in search.refit_together(every) if model is not None and model.physical]
 
 
-def _place(model: Model) -> tuple[str, ...] | None:
+def _place(candidate: Candidate) -> tuple[str, ...] | None:
     """Where a term acts, if in one place."""
-    (term,) = model.candidate.terms
+    (term,) = candidate.terms
     places = [(kind, name) for kind in ("rates", "outputs", "shifts") for name in getattr(term, kind)]
     return places[0] if len(places) == 1 and not term.states and not term.frees else None
 
 
-def _is_constant(search: Search, model: Model) -> bool:
-    """Whether a model's term adds the same wherever it acts, so that nothing else is known of it."""
-    plain = search.candidates[model.numbers[0]]
-    if plain.tangents.shape[0] != 1 or plain.tangents.shape[2] != 1:
+def _is_constant(search: Search, candidate: Candidate) -> bool:
+    """Whether a term of the list is a constant change, which has a name then; that of an instrument in a part of its
+    range has none."""
+    (term,) = candidate.terms
+    if _place(candidate) is None or term.outputs or candidate.tangents.shape[::2] != (1, 1):
         return False
-    constant = _constant(plain.terms[0], search.problem.in_time)
     try:
-        same = prepare(search.base.problem, search.base, [constant], search.fixed, {}).tangents[0, :, 0]
+        same = prepare(search.base.problem, search.base, [_constant(term, search.problem.in_time)], search.fixed, {})
     except (SimulatorError, DomainError):
         return False
-    return alike(plain.tangents[0, :, 0], same)
+    return alike(candidate.tangents[0, :, 0], same.tangents[0, :, 0])
 
 
 def _wanted(search: Search, model: Model, prior: float) -> list[Hypothetical]:
@@ -122,8 +124,11 @@ def _begin(
     known, problem = model.found.by_name, candidate.problem
     names = [q.name for q in problem.parameters]
     (place,) = candidate.amplitudes
+    widths = [share * span.size for share in (EDGE, *WIDTHS)]
+    if not any(name.endswith(WIDTH_OF_EDGE) for name in names):
+        widths = widths[:1]
     rows = []
-    for (low, high), width in itertools.product(ends, [share * span.size for share in (EDGE, *WIDTHS)]):
+    for width, (low, high) in itertools.product(widths, ends):
         row = candidate.begin.clone()
         for i, name in enumerate(names):
             if is_window(name):
@@ -131,11 +136,12 @@ def _begin(
             elif i not in candidate.own:
                 row[i] = known[name]
         rows.append(row)
-    begin = torch.stack(rows).unique(dim=0)
+    begin = torch.stack(rows)
     y, slope, _ = problem.evaluate(begin, [place])
     w = search.noise.whitening(problem)
     left, effect = w.vector(problem.y - y), torch.stack([w(one)[:, 0] for one in slope])
     size = (left * effect).sum(-1) / effect.square().sum(-1).clamp_min(1e-300)
     begin[:, place] += size
     chi2 = (left - size[:, None] * effect).square().sum(-1)
-    return begin[chi2.nan_to_num(nan=torch.inf).argsort()[:STARTS]]
+    order = chi2.nan_to_num(nan=torch.inf).reshape(len(widths), -1).argsort(-1)[:, :STARTS]
+    return begin.reshape(len(widths), -1, begin.shape[-1])[torch.arange(len(widths))[:, None], order].flatten(0, 1)

@@ -25,6 +25,7 @@ __all__ = [
     "explains",
     "fits_by_chance",
     "isolated",
+    "odds_alone",
     "other_growth",
     "outdone",
     "outliers",
@@ -96,6 +97,22 @@ def weigh_alone(search: "Search") -> tuple[float, float]:
     if best is not None:
         unknown.append(search.with_unknown(best.found)[1] + best.prior)
     return max(unknown) - base, min(here, 0.0)
+
+
+def odds_alone(search: "Search") -> float:
+    """Log odds of the likeliest physical model against the base, each with its own noise; −∞ where the noise is known.
+
+    The noise that a search begins with is that of the base, which may have taken what a term explains for slow noise.
+    """
+    if not search.noise.open:
+        return -math.inf
+    physical = [m for m in search.models if m.physical and not m.note]
+    own = {id(m): alone(m.found, search.noise, search.tangents)[1] + m.prior for m in physical}
+    best = max(physical, key=lambda m: own[id(m)], default=None)
+    if best is None:
+        return -math.inf
+    base = settled(search.base, search.noise, search.tangents)[1] + math.log(PRIOR["base"])
+    return settled(best.found, search.noise, search.tangents)[1] + best.prior - base
 
 
 def fits_by_chance(search: "Search") -> float:

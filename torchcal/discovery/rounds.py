@@ -1,6 +1,7 @@
 """Screening and refitting again, where the best model tells other outliers, or other noise, than the base did."""
 
 import dataclasses
+import math
 
 import torch
 
@@ -9,6 +10,7 @@ from torchcal.discovery.own_noise import (
     EXPLAINED,
     fits_by_chance,
     isolated,
+    odds_alone,
     other_growth,
     outdone,
     outliers,
@@ -114,6 +116,7 @@ def _refit(search: Search, confidence: float) -> bool:
         elif not detected:
             alone = base_alone(search)
             detected = alone < HOPELESS or (search.p_detect < OFTEN * level and alone < level)
+            detected = detected or odds_alone(search) > -math.log(level)
         if detected and not at_once and not search.stop.is_set():
             before, search.models = search.models, []
             search.refit_singles()

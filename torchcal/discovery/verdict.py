@@ -190,7 +190,9 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         decision.tied.append(list(model.names))
         decision.tied_models.append(model)
         _tie_other_names(search, model, decision)
-    if len(decision.tied) < 2 or decision.none > 1 - UNKNOWN:  # one alone is not sure enough, or it had been named
+    # One alone is not sure enough, or it had been named; and where several do what something unknown there would do.
+    local = all(model.window is not None for model in decision.tied_models) and bool(search.nameless)
+    if len(decision.tied) < 2 or decision.none > 1 - UNKNOWN or local:
         decision.tied.append(list(NONE))
     return decision
 

@@ -164,8 +164,8 @@ def _consistent(d: Any) -> list[str]:
 def _yet(d: Any) -> str:
     """What is likelier than the base, though chance may have done as much."""
     base = sum(row.probability for row in d.ranking if not row.terms)
-    best = max(d.ranking, key=lambda row: row.probability)
-    if not best.terms or best.probability <= base:
+    best = max(d.ranking, key=lambda row: row.probability, default=None)
+    if best is None or not best.terms or best.probability <= base:
         return ""
     return (
         f" Yet {_hypothesis(d, best.terms)} is likelier than the base alone (probability {best.probability:.2f} and "
