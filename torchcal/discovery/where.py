@@ -64,13 +64,16 @@ def locate(search: Search, best: Model | None, *, named: bool = False) -> Table[
         named: Whether it is accepted.
     """
     rows = []
-    if best is not None and best.window is not None:
-        w = best.window
+    local = best if best is not None and best.window is not None else None
+    if not named:  # where a nameless change is likelier, it says better where
+        local = max([*search.nameless, *([] if local is None else [local])], key=lambda m: m.weight, default=None)
+    if local is not None and local.window is not None:
+        w = local.window
         drivers = search.drivers()[w.driver]
         low = w.low if math.isfinite(w.low) else float(drivers.min())
         high = w.high if math.isfinite(w.high) else float(drivers.max())
-        kind, target = _acts_on(best)
-        share, evidence, extent = removed(search, best), best.log_evidence, _extent(drivers)
+        kind, target = _acts_on(local)
+        share, evidence, extent = removed(search, local), local.log_evidence, _extent(drivers)
         rows.append(Location(kind, target, w.driver, ((low, high),), share, evidence, extent=extent))
     sensor = best is not None and _acts_on(best)[0] == "output"  # then it has been shown to be the output
     places = [
