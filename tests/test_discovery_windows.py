@@ -333,3 +333,12 @@ def test_a_local_term_whose_shape_shows_is_named_all_the_same():
     d = diagnose(oscillator(), recording, [t for t in terms if t.name != "bias force"])
     assert (d.verdict, d.terms) == ("named", ["quadratic drag"])
     assert "v > " in d.settings["region"]
+
+
+def test_a_window_that_leaves_something_is_not_the_best_one():
+    """A spring that stiffens between two ends: another term that begins in the middle was named in its place."""
+    recording = recorded(lambda t, x, v: -2.0 * x**3 if -0.75 < x < 0.5 else 0.0, n=240)
+    d = diagnose(oscillator(), recording, tc.terms.mechanics(position="x", velocity="v"))
+    assert d.terms in ([], ["cubic stiffness"])
+    best = max((row for row in d.ranking if row.terms == ("cubic stiffness",)), key=lambda row: row.log_evidence)
+    assert [float(end) for end in best.region.split(" < x < ")] == pytest.approx([-0.75, 0.5], abs=0.02)

@@ -2,6 +2,7 @@
 
 Something that is in no list may act in a part of a range too, and in a short window many terms do much the same. A term
 is named for its own work there: a constant change in the same place, with the same ends to choose, must do worse.
+Before that, a term whose window leaves something is tried in all others: from the base alone its best one is not seen.
 """
 
 import dataclasses
@@ -16,7 +17,8 @@ from torchcal.discovery.candidates import Candidate, prepare
 from torchcal.discovery.channels import channels
 from torchcal.discovery.local import EDGE, WIDTH_OF_EDGE, WIDTHS, Span, is_window, localised
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
-from torchcal.discovery.search import Search, alike
+from torchcal.discovery.search import BETTER, Search, alike
+from torchcal.discovery.verdict import PLAINLY_WHITE
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators import Parameter
 from torchcal.terms import Term
@@ -25,30 +27,49 @@ __all__ = ["refit_nameless"]
 
 #: Log weight behind the leader down to which a term in a window is held against a nameless change, and of how many.
 CLOSE, MOST = 3.0, 3
+#: Terms that are tried in all windows of a driver, and places where these may begin or end.
+TRIED, CUTS = 4, 14
 #: Where in an open window a nameless change may end, as shares of the data within; and starts that are refitted with
 #: each width of the edges.
 ENDING, STARTS = (0.1, 0.3, 0.5, 0.7, 0.9), 2
 
 
 def refit_nameless(search: Search) -> None:
-    """Constant changes in the windows of the leading terms, where a term in a window leads."""
+    """Constant changes in the windows of the leading terms, where a term in a window leads; and these terms in other
+    windows, where their own leave something or do worse."""
     lead = search.physical_leader
     if search.exact or search.stop.is_set() or lead is None or lead.window is None:
         return
     near = [m for m in search.models if m.physical and m.window is not None and m.weight > lead.weight - CLOSE]
-    found = search.base
-    count = len({(c.kind, c.target) for c in channels(found.problem, found) if c.kind in found.problem.kinds})
+    problem = search.base.problem
+    count = len({(c.kind, c.target) for c in channels(problem, search.base) if c.kind in problem.kinds})
     prior = math.log(PRIOR["none"] / max(count, 1)) - math.log(3.0 * len(search.drivers()))
     named = {_place(candidate) for candidate in search.candidates if _is_constant(search, candidate)}
     wanted: dict[tuple[tuple[str, ...], str], list[Hypothetical]] = {}
-    for model in sorted(near, key=lambda m: -m.weight)[:MOST]:
+    near = sorted(near, key=lambda m: -m.weight)[:MOST]
+    for model in near:
         where, window = _place(model.candidate), model.window
         if where is None or window is None or where in named:
             continue
         if (where, window.driver) not in wanted:
             wanted[where, window.driver] = _wanted(search, model, prior)
     every = [one for each in wanted.values() for one in each]
-    search.nameless = [model for model in search.refit_together(every) if model is not None and model.physical]
+    search.nameless = [one for one in search.refit_together(every) if one is not None and one.physical]
+    outdone = any(one.weight > lead.weight for one in search.nameless)
+    if outdone or search.examine(lead).p_value < PLAINLY_WHITE:  # its window may not be the best that the term has
+        again = [(old, one) for old in _rivals(search, lead) if (one := _anywhere(search, old)) is not None]
+        for (old, _), new in zip(again, search.refit_together([one for _, one in again]), strict=True):
+            if new is not None and new.weight > old.weight + BETTER:
+                search.models = [m for m in search.models if m is not old] + [new]
+
+
+def _rivals(search: Search, lead: Model) -> list[Model]:
+    """The best model of each term in a window of the leader's driver, of the leading terms."""
+    best: dict[int, Model] = {}
+    for model in sorted(search.models, key=lambda m: -m.weight):
+        if model.window is not None and lead.window is not None and model.window.driver == lead.window.driver:
+            best.setdefault(model.numbers[0], model)
+    return list(best.values())[:TRIED]
 
 
 def _place(candidate: Candidate) -> tuple[str, ...] | None:
@@ -99,6 +120,24 @@ def _wanted(search: Search, model: Model, prior: float) -> list[Hypothetical]:
     return found
 
 
+def _anywhere(search: Search, model: Model) -> Hypothetical | None:
+    """A model's term in all windows along the same driver, open ones too, from the best of them."""
+    w, term = model.window, search.candidates[model.numbers[0]].terms[0]
+    if w is None or len(model.candidate.amplitudes) != 1:
+        return None
+    driver = search.drivers()[w.driver]
+    span = Span.of(driver)
+    cuts = [span.moved(span.low, k / (CUTS - 1) * span.size) for k in range(CUTS)]
+    local = localised(term, w.driver, cuts[0], cuts[-1], span, static=not search.problem.in_time, edge=True)
+    try:
+        candidate = prepare(search.base.problem, search.base, [local], search.fixed, {})
+        begin = _begin(search, model, candidate, list(itertools.combinations(cuts, 2)), span)
+    except (SimulatorError, DomainError):
+        return None
+    window = dataclasses.replace(w, low=cuts[0], high=cuts[-1], span=span)
+    return Hypothetical(model.numbers, candidate, begin, model.log_prior, window)
+
+
 def _constant(term: Term, in_time: bool) -> Term:
     """A constant change in the place where a term acts."""
 
@@ -133,8 +172,8 @@ def _begin(
         for i, name in enumerate(names):
             if is_window(name):
                 row[i] = width if name.endswith(WIDTH_OF_EDGE) else low if name.endswith("from") else high
-            elif i not in candidate.own:
-                row[i] = known[name]
+            elif i != place:
+                row[i] = known.get(name, float(row[i]))
         rows.append(row)
     begin = torch.stack(rows)
     y, slope, _ = problem.evaluate(begin, [place])

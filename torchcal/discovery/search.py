@@ -27,7 +27,7 @@ from torchcal.discovery.verify import HeldOut, held_out_fit
 from torchcal.errors import SimulatorError
 from torchcal.terms import Term
 
-__all__ = ["Search", "alike"]
+__all__ = ["BETTER", "Search", "alike"]
 
 #: Prior odds against an estimate on a physical bound that it wants to cross.
 UNPHYSICAL = math.log(1e-3)
