@@ -132,7 +132,7 @@ def follow_slopes(problem: Problem, begin: Tensor) -> Tensor:
     """Unknown initial states moved so that observed states begin with the slope that was recorded.
 
     An unobserved velocity, say, is then the recorded position's slope, whatever the other parameters are. The slope is
-    that of a parabola through the first samples, more of them in every next start.
+    that of a parabola through the first samples, more or fewer of them from start to start.
     """
     bound = problem.simulator
     if not isinstance(bound, Trajectories) or not bound.initial_names:

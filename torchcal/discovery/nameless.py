@@ -54,13 +54,24 @@ def refit_nameless(search: Search) -> None:
         if (where, window.driver) not in wanted:
             wanted[where, window.driver] = _wanted(search, model, prior)
     every = [one for each in wanted.values() for one in each]
-    search.nameless = [one for one in search.refit_together(every) if one is not None and one.physical]
+    search.nameless = [one for one in _refitted(search, every) if one is not None and one.physical]
     outdone = any(one.weight > lead.weight for one in search.nameless)
     if outdone or search.examine(lead).p_value < PLAINLY_WHITE:  # its window may not be the best that the term has
         again = [(old, one) for old in _rivals(search, lead) if (one := _anywhere(search, old)) is not None]
-        for (old, _), new in zip(again, search.refit_together([one for _, one in again]), strict=True):
+        for (old, _), new in zip(again, _refitted(search, [one for _, one in again]), strict=True):
             if new is not None and new.weight > old.weight + BETTER:
                 search.models = [m for m in search.models if m is not old] + [new]
+
+
+def _refitted(search: Search, wanted: Sequence[Hypothetical]) -> list[Model | None]:
+    """Refits one after another: none of the user's terms, they may take a simulator where it raises."""
+    found: list[Model | None] = []
+    for one in wanted:
+        try:
+            found += search.refit_together([one])
+        except SimulatorError:
+            found.append(None)
+    return found
 
 
 def _rivals(search: Search, lead: Model) -> list[Model]:
@@ -86,10 +97,14 @@ def _is_constant(search: Search, candidate: Candidate) -> bool:
     if _place(candidate) is None or term.outputs or candidate.tangents.shape[::2] != (1, 1):
         return False
     try:
-        same = prepare(search.base.problem, search.base, [_constant(term, search.problem.in_time)], search.fixed, {})
+        # Both at the base as it stands, which has moved with the noise since the candidate's own tangents.
+        now, same = (
+            prepare(search.base.problem, search.base, [one], search.fixed, {}).tangents
+            for one in (term, _constant(term, search.problem.in_time))
+        )
     except (SimulatorError, DomainError):
         return False
-    return alike(candidate.tangents[0, :, 0], same.tangents[0, :, 0])
+    return now.shape == same.shape and alike(now[0, :, 0], same[0, :, 0])
 
 
 def _wanted(search: Search, model: Model, prior: float) -> list[Hypothetical]:

@@ -116,7 +116,7 @@ def _refit(search: Search, confidence: float) -> bool:
         elif not detected:
             alone = base_alone(search)
             detected = alone < HOPELESS or (search.p_detect < OFTEN * level and alone < level)
-            detected = detected or odds_alone(search) > -math.log(level)
+            detected = detected or (not search.few and odds_alone(search) > -math.log(level))
         if detected and not at_once and not search.stop.is_set():
             before, search.models = search.models, []
             search.refit_singles()

@@ -76,6 +76,7 @@ class Search:
     local: list[Window] = field(init=False, default_factory=list)
     models: list[Model] = field(init=False, default_factory=list)
     nameless: list[Model] = field(init=False, default_factory=list)
+    unnamed: Model | None = field(init=False, default=None)
     aliases: dict[int, list[int]] = field(init=False, default_factory=dict)
     merged: dict[int, Model] = field(init=False, default_factory=dict)
     twins: dict[int, int] = field(init=False, default_factory=dict)
@@ -369,7 +370,8 @@ class Search:
 
 def alike(u: Tensor, v: Tensor) -> bool:
     """Whether two effects ``(n,)`` are one but for their sizes."""
-    return float((u @ v).abs()) >= (1 - 1e-9) * float(u.norm() * v.norm())
+    size = float(u.norm() * v.norm())
+    return size > 0 and float((u @ v).abs()) >= (1 - 1e-9) * size
 
 
 def _joint(nulls: Sequence[Tensor], seen: Sequence[float]) -> tuple[float, Tensor]:

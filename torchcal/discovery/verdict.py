@@ -83,7 +83,7 @@ class Decision:
         self.none = 0.0
         self.base = 1.0
         self.none_evidence = 0.0
-        self.none_note = ""
+        self.none_note = "something unknown and smooth"
         self.withdrawn = ""
         self.doubt = ""
         self.nearly = False
@@ -148,8 +148,9 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         decision.none_evidence = max(_none_evidence(search, ranked, here), unknown + decision.none_evidence)
         nameless = max(search.nameless, key=lambda m: m.weight, default=None)
         leading = next((p for p in search.structure.places if p.channel.kind in search.problem.kinds), None)
-        decision.none_note = "something unknown and smooth"
+        search.unnamed = None
         if nameless is not None and nameless.weight > decision.none_evidence:
+            search.unnamed = nameless
             decision.none_evidence, decision.none_note = nameless.weight, SOMEWHERE + str(nameless.where)
         elif leading is not None and leading.period is not None:
             decision.none_note = "an unknown oscillation"
@@ -193,7 +194,8 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         decision.tied_models.append(model)
         _tie_other_names(search, model, decision)
     # One alone is not sure enough, or it had been named; and where several do what something unknown there would do.
-    local = all(model.window is not None for model in decision.tied_models) and bool(search.nameless)
+    rival = any(m.weight > best.weight - BEHIND for m in search.nameless)
+    local = rival and all(model.window is not None for model in decision.tied_models)
     if len(decision.tied) < 2 or decision.none > 1 - UNKNOWN or local:
         decision.tied.append(list(NONE))
     return decision

@@ -65,8 +65,8 @@ def locate(search: Search, best: Model | None, *, named: bool = False) -> Table[
     """
     rows = []
     local = best if best is not None and best.window is not None else None
-    if not named:  # where a nameless change is likelier, it says better where
-        local = max([*search.nameless, *([] if local is None else [local])], key=lambda m: m.weight, default=None)
+    if not named and search.unnamed is not None:  # likelier than all that has a name, and says better where
+        local = search.unnamed
     if local is not None and local.window is not None:
         w = local.window
         drivers = search.drivers()[w.driver]

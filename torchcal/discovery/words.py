@@ -164,12 +164,14 @@ def _consistent(d: Any) -> list[str]:
 def _yet(d: Any) -> str:
     """What is likelier than the base, though chance may have done as much."""
     base = sum(row.probability for row in d.ranking if not row.terms)
-    best = max(d.ranking, key=lambda row: row.probability, default=None)
-    if best is None or not best.terms or best.probability <= base:
+    sound = [row for row in d.ranking if row.terms and row.refitted and row.physical and not row.note]
+    best = max(sound, key=lambda row: row.probability, default=None)
+    if best is None or best.probability <= base:
         return ""
+    known = ", or a known noise sd," if d.noise.source == "estimated" else ""
     return (
         f" Yet {_hypothesis(d, best.terms)} is likelier than the base alone (probability {best.probability:.2f} and "
-        f"{_probability(base)}), which chance may have done; more data, or a known noise sd, would tell."
+        f"{_probability(base)}), which chance may have done; more data{known} would tell."
     )
 
 
