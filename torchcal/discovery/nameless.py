@@ -40,27 +40,35 @@ def refit_nameless(search: Search) -> None:
     lead = search.physical_leader
     if search.exact or search.stop.is_set() or lead is None or lead.window is None:
         return
-    near = [m for m in search.models if m.physical and m.window is not None and m.weight > lead.weight - CLOSE]
     problem = search.base.problem
     count = len({(c.kind, c.target) for c in channels(problem, search.base) if c.kind in problem.kinds})
     prior = math.log(PRIOR["none"] / max(count, 1)) - math.log(3.0 * len(search.drivers()))
     named = {_place(candidate) for candidate in search.candidates if _is_constant(search, candidate)}
+    search.nameless = _held_against(search, prior, named)
+    outdone = any(one.weight > lead.weight for one in search.nameless)
+    if outdone or search.examine(lead).p_value < PLAINLY_WHITE:  # its window may not be the best that the term has
+        again = [(old, one) for old in _rivals(search, lead) if (one := _anywhere(search, old)) is not None]
+        before = search.models
+        for (old, _), new in zip(again, _refitted(search, [one for _, one in again]), strict=True):
+            if new is not None and new.weight > old.weight + BETTER:
+                search.models = [m for m in search.models if m is not old] + [new]
+        if search.models is not before:
+            search.nameless += _held_against(search, prior, named)
+
+
+def _held_against(search: Search, prior: float, named: set[tuple[str, ...] | None]) -> list[Model]:
+    """Constant changes beside the leading terms in windows, but in places that a constant of the list names."""
+    lead = max((m.weight for m in search.models if m.physical), default=0.0)
+    near = [m for m in search.models if m.physical and m.window is not None and m.weight > lead - CLOSE]
     wanted: dict[tuple[tuple[str, ...], str], list[Hypothetical]] = {}
-    near = sorted(near, key=lambda m: -m.weight)[:MOST]
-    for model in near:
+    for model in sorted(near, key=lambda m: -m.weight)[:MOST]:
         where, window = _place(model.candidate), model.window
         if where is None or window is None or where in named:
             continue
         if (where, window.driver) not in wanted:
             wanted[where, window.driver] = _wanted(search, model, prior)
     every = [one for each in wanted.values() for one in each]
-    search.nameless = [one for one in _refitted(search, every) if one is not None and one.physical]
-    outdone = any(one.weight > lead.weight for one in search.nameless)
-    if outdone or search.examine(lead).p_value < PLAINLY_WHITE:  # its window may not be the best that the term has
-        again = [(old, one) for old in _rivals(search, lead) if (one := _anywhere(search, old)) is not None]
-        for (old, _), new in zip(again, _refitted(search, [one for _, one in again]), strict=True):
-            if new is not None and new.weight > old.weight + BETTER:
-                search.models = [m for m in search.models if m is not old] + [new]
+    return [one for one in _refitted(search, every) if one is not None and one.physical]
 
 
 def _refitted(search: Search, wanted: Sequence[Hypothetical]) -> list[Model | None]:
