@@ -2,7 +2,7 @@
 
 Something that is in no list may act in a part of a range too, and in a short window many terms do much the same. A term
 is named for its own work there: a constant change in the same place, with the same ends to choose, must do worse.
-Before that, a term whose window leaves something is tried in all others: from the base alone its best one is not seen.
+A term whose window leaves something is tried in all others: from the base alone its best one is not seen.
 """
 
 import dataclasses

@@ -88,7 +88,8 @@ def screen(residual: Residual, candidates: Sequence[Candidate], before: Screenin
     norm = columns.norm(dim=0)
     good = norm > VANISHED * whole.norm(dim=0).clamp_min(1e-300)
     good &= ~_inward(residual, columns, torch.tensor(sign))
-    good &= True if before is None else before.norm > 0
+    if before is not None:
+        good &= before.norm > 0
     norm = torch.where(good, norm, torch.zeros_like(norm))
     columns = torch.where(good, columns / norm.clamp_min(1e-300), torch.zeros_like(columns))
     direction = torch.tensor(sign, dtype=torch.float64)

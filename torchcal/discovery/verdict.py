@@ -25,8 +25,8 @@ SURE = 0.75
 SURE_OF_PART = 0.85
 #: Probability of "none of these" from which on the verdict is that; where it has what is missing to 1, it is tied.
 UNKNOWN = 0.7
-#: The same where that is a nameless change in the window of a term, which the term may be after all; and what it is.
-UNNAMED, SOMEWHERE = 0.9, "something unknown where "
+#: The same where that is a nameless change in the window of a term, which the term may be after all.
+UNNAMED = 0.9
 #: Log odds behind the best model up to which one with fewer terms may be named for what all share.
 BEHIND = 5.0
 #: Structure left after a hypothesis with less probability than this by noise alone speaks against it.
@@ -151,7 +151,7 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         search.unnamed = None
         if nameless is not None and nameless.weight > decision.none_evidence:
             search.unnamed = nameless
-            decision.none_evidence, decision.none_note = nameless.weight, SOMEWHERE + str(nameless.where)
+            decision.none_evidence, decision.none_note = nameless.weight, f"something unknown where {nameless.where}"
         elif leading is not None and leading.period is not None:
             decision.none_note = "an unknown oscillation"
     _weigh(search, decision)
@@ -160,7 +160,7 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         return decision
     groups = _groups(ranked)
     white = [m for m in ranked[:6] if search.examine(m).p_value >= WHITE and _small(search, m)]
-    if not white or decision.none > (UNNAMED if decision.none_note.startswith(SOMEWHERE) else UNKNOWN):
+    if not white or decision.none > (UNKNOWN if search.unnamed is None else UNNAMED):
         decision.verdict = "unexplained"
         _nearly(search, ranked, mask, decision)
         return decision
