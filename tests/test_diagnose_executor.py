@@ -264,7 +264,7 @@ def test_an_interruption_among_pairs_names_no_single_term_as_missing(motion, mon
     with pytest.warns(ConvergenceWarning, match="It keeps 2 refitted"):
         d = diagnose(motion, terms)
     assert d.settings["interrupted"] == (
-        "The search was interrupted before several of them had been refitted together."
+        "The search was interrupted before all their combinations and ranges had been compared."
     )
 
 

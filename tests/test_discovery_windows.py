@@ -1,6 +1,9 @@
 """Terms that act in a range of a driver only: strong ones, steep ones, and what is no window."""
 
+import copy
+import dataclasses
 import math
+import sys
 
 import numpy as np
 import pytest
@@ -8,6 +11,9 @@ import torch
 from scipy.integrate import solve_ivp
 
 import torchcal as tc
+from torchcal.discovery.doubts import CLEARLY, doubt
+from torchcal.discovery.nameless import _where_possible, refit_nameless
+from torchcal.errors import SimulatorError
 
 F64 = torch.float64
 NOISE = 0.01
@@ -342,3 +348,88 @@ def test_a_window_that_leaves_something_is_not_the_best_one():
     assert d.terms in ([], ["cubic stiffness"])
     best = max((row for row in d.ranking if row.terms == ("cubic stiffness",)), key=lambda row: row.log_evidence)
     assert [float(end) for end in best.region.split(" < x < ")] == pytest.approx([-0.75, 0.5], abs=0.02)
+
+
+def searched(*args):
+    """A diagnosis, and its search once nameless changes have been held against the leading terms in windows."""
+    found = []
+    with pytest.MonkeyPatch.context() as patch:
+        spy = lambda search: (refit_nameless(search), found.append(search))  # noqa: E731
+        patch.setattr(sys.modules["torchcal.discovery.diagnose"], "refit_nameless", spy)
+        d = diagnose(*args)
+    return d, found[-1]
+
+
+def reactor(seed=0):
+    """A product of a reaction that is faster between 5 and 9 s, and what acts on both substances there."""
+    t = np.linspace(0, 20, 80)
+
+    def rate(t, z):
+        burst = 0.12 * z[0] * (5 < t < 9)
+        return [0.3 - 0.1 * z[0] - burst, 0.1 * z[0] + burst - 0.15 * z[1]]
+
+    y = solve_ivp(rate, (0, 20), [2.0, 0.0], t_eval=t, rtol=1e-9, atol=1e-11, max_step=0.05).y
+    y = y + 0.01 * np.random.default_rng(seed).standard_normal(y.shape)
+    base = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"A": p["in"] - p["k"] * s["A"], "B": p["k"] * s["A"] - p["out"] * s["B"]},
+        states={"A": "mol", "B": "mol"},
+        parameters=[
+            tc.Parameter("in", low=0.0, initial=0.3),
+            tc.Parameter("k", low=0.0, initial=0.1),
+            tc.Parameter("out", low=0.0, initial=0.15),
+        ],
+        observe=("A", "B"),
+    )
+    second = tc.Term(
+        "second channel",
+        rates={"A": lambda t, s, p, u: -p["k2"] * s["A"], "B": lambda t, s, p, u: p["k2"] * s["A"]},
+        parameters=[tc.Parameter("k2", low=0.0, neutral=0.0)],
+    )
+    run = tc.Run(time=t, outputs={"A": y[0], "B": y[1]}, initial={"A": 2.0, "B": 0.0})
+    return base, tc.Recording(runs=[run], noise=0.01), [second]
+
+
+@pytest.fixture(scope="module")
+def reaction():
+    return searched(*reactor())
+
+
+def test_a_term_of_two_equations_is_held_against_a_change_of_both(reaction):
+    d, search = reaction
+    rivals = search.nameless
+    assert rivals
+    assert {tuple(model.candidate.terms[0].rates) for model in rivals} == {("A", "B")}
+    assert {len(model.candidate.amplitudes) for model in rivals} == {2}
+    sizes = [model.found.values[model.candidate.amplitudes] for model in rivals]
+    for in_a, in_b in (size.tolist() for size in sizes):  # what A loses B gains, without being told to
+        assert in_a < 0 < in_b
+    best = max(rivals, key=lambda model: model.weight)
+    assert (best.window.low, best.window.high) == pytest.approx((5.0, 9.0), abs=0.7)
+    assert d.verdict in ("named", "ambiguous")
+    assert ["second channel"] in (d.tied or [d.terms])
+
+
+def test_a_nameless_change_that_the_simulator_does_not_take_is_left_out():
+    class Search:
+        def refit_together(self, wanted):
+            if "efficiency above 1" in wanted:
+                raise SimulatorError("no efficiency above 1")
+            return [f"{one}, refitted" for one in wanted]
+
+    found = _where_possible(Search(), ["steep", "efficiency above 1", "with edges"])
+    assert found == ["steep, refitted", None, "with edges, refitted"]
+
+
+def test_a_window_is_named_for_the_shape_of_its_term_alone(reaction):
+    """A constant change does nearly as well there, though the term is likelier by its price."""
+    _, search = reaction
+    model = search.physical_leader
+    assert model.window is not None
+    assert search.nameless
+    best = max(search.nameless, key=lambda one: one.weight)
+    best = dataclasses.replace(best, log_evidence=model.weight - best.log_prior - CLEARLY - 0.1)
+    search = copy.copy(search)
+    search.nameless = [best]
+    assert "Something unknown" not in doubt(search, model)
+    best.log_evidence += 0.2
+    assert doubt(search, model).startswith("Something unknown in a range of ")

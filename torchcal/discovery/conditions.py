@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import torch
@@ -21,6 +21,8 @@ ABSOLUTE_ZERO = {"degC": -273.15, "°C": -273.15, "degF": -459.67, "°F": -459.6
 MULTIPLES, BOLD, ALONE = (2.0, 0.5, 3.0), (5.0,), 3.0
 #: How far beyond its range a condition goes, in the width of that, and how far in a bolder experiment.
 BEYOND, FAR_BEYOND = 0.5, 1.5
+#: Bolder experiments on a static recording at most, those that move one condition first.
+MOST = 60
 #: Share of its largest value up to which a state begins at nothing, of which a multiple is nothing too.
 NOTHING = 0.01
 
@@ -62,12 +64,14 @@ def bolder(model: Fitted) -> list[Option]:
     ask = _ask(recording, begin)
     options = _elsewhere(recording, begin, BOLD)
     for name, value in begin.items() if len(begin) > 1 else ():
+        other = _ask(recording, [one for one in begin if one != name])
         if abs(value) > NOTHING * abs(largest[name]):
-            text = f"a run that starts from {ALONE:g} times the initial {name} of the first, all else as there"
+            text = f"a run that starts from {ALONE:g} times the initial {name} of the first, all else as there{other}"
             options.append(_run(recording, text, {**begin, name: ALONE * value}))
     for name, value in begin.items():
+        other = _ask(recording, [one for one in begin if one != name])
         if abs(value) <= NOTHING * abs(largest[name]) and largest[name]:
-            text = f"a run that starts from {name} = {largest[name]:.3g}, all else as in the first"
+            text = f"a run that starts from {name} = {largest[name]:.3g}, all else as in the first{other}"
             options.append(_run(recording, text, {**begin, name: float(f"{largest[name]:.3g}")}))
     options += _stronger(recording, begin, ask, BOLD)
     if _runs(recording)[0].inputs:
@@ -112,7 +116,7 @@ def _states(model: Fitted) -> tuple[dict[str, float], dict[str, float], bool]:
     return begin, largest, mirrored
 
 
-def _ask(recording: Recording, begin: Mapping[str, float]) -> str:
+def _ask(recording: Recording, begin: Iterable[str]) -> str:
     """What has to be known that the first run did not tell."""
     unsaid = [name for name in begin if name not in _runs(recording)[0].initial]
     return f", with initial {', '.join(unsaid)} known from elsewhere" if unsaid else ""
@@ -205,7 +209,7 @@ def _static_bolder(recording: Recording) -> list[Option]:
         for (first, ends), (second, others) in corners:
             text = f"conditions with {one} {first}, and {other} {second}"
             found.append(_moved(recording, text, {one: ends, other: others}))
-    return found
+    return found[:MOST]
 
 
 def _outside(recording: Recording, name: str, share: float) -> list[tuple[str, tuple[float, float]]]:
@@ -213,6 +217,8 @@ def _outside(recording: Recording, name: str, share: float) -> list[tuple[str, t
     values = _conditions(recording)[name]
     low, high = float(values.min()), float(values.max())
     width = high - low
+    if not width:  # one value tells nothing of how far others may be
+        return []
     above = high + share * width
     found = [(f"above the recorded range, to {placed(above, width)}", (high, above))]
     # Of what spans decades a share of the width is below nothing; a factor is as far on their scale.

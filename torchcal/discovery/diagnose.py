@@ -190,7 +190,7 @@ def _interruption(search: Search) -> str:
     if not search.stop.is_set():
         return ""
     left = search.unfinished
-    missing = f"{', '.join(left)} had been refitted" if left else "several of them had been refitted together"
+    missing = f"{', '.join(left)} had been refitted" if left else "all their combinations and ranges had been compared"
     return f"The search was interrupted before {missing}."
 
 

@@ -33,6 +33,8 @@ OPEN_IN_WINDOW = 2.0
 #: Distinct values of its driver at which a window must be open, and at which closed: its height, end and slope can be
 #: drawn through fewer, whatever they are. And the share of a term that may be missing, or left.
 LEVELS, NEARLY = 3, 0.2
+#: Log odds against a nameless change from which on a term in a window is there for its own shape.
+CLEARLY = 3.0
 #: Noise sd by which an instrument's reading must fall while the true value rises to be no instrument's: a hard limit is
 #: one. And the least sd, in the data's spread.
 FALL, ROUNDING = 2.0, 1e-3
@@ -46,7 +48,7 @@ UNSEEN = 1e-7
 
 def doubt(search: Search, model: Model) -> str:
     """Why a model is no name, however probable, in a sentence; empty if it may be one."""
-    found = left_open(search, model) or _no_instrument(search, model)
+    found = left_open(search, model) or _no_better(search, model) or _no_instrument(search, model)
     return found or ("" if search.exact else _noise_or_physics(search, model))
 
 
@@ -72,6 +74,13 @@ def left_open(search: Search, model: Model) -> str:
     if distinct(search.problem) - len(model.found.free) <= len(model.candidate.own):
         return "There are hardly more distinct conditions than parameters: more conditions would tell."
     return ""
+
+
+def _no_better(search: Search, model: Model) -> str:
+    """Why a term in a window is hardly likelier than a constant change in its place; empty if it is clearly so."""
+    if model.window is None or all(one.weight < model.weight - CLEARLY for one in search.nameless):
+        return ""
+    return f"Something unknown in a range of {model.window.driver} would do nearly as well: its shape is not seen yet."
 
 
 def _levels(model: Model) -> int:

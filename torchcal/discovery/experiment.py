@@ -55,8 +55,8 @@ class Tried:
 
 
 def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
-    """The experiment, among a few that anyone can do, that separates the two nearest of the models most, those aside
-    that none of them tells apart; the first, and mildest, of those that separate them by `PLENTY`.
+    """The experiment, of those tried in thought, that separates the two nearest of the models most, those aside that
+    none of them tells apart; the first, and mildest, of those that separate them by `PLENTY`.
 
     Simple experiments come first (`conditions.simple`). Where none of these would separate the models well, with more
     samples either, `conditions.bolder` ones are tried too. The best is asked for with more samples where it takes them.

@@ -8,7 +8,9 @@ A term whose window leaves something is tried in all others: from the base alone
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,8 +19,10 @@ from torchcal.discovery.candidates import Candidate, prepare
 from torchcal.discovery.channels import channels
 from torchcal.discovery.local import EDGE, WIDTH_OF_EDGE, WIDTHS, Span, is_window, localised
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
-from torchcal.discovery.search import BETTER, Search, alike
+from torchcal.discovery.own_noise import likeliest_alone
+from torchcal.discovery.search import BETTER, Search
 from torchcal.discovery.verdict import PLAINLY_WHITE
+from torchcal.discovery.windows import long_enough, stepped
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators import Parameter
 from torchcal.terms import Term
@@ -32,19 +36,27 @@ TRIED, CUTS = 4, 14
 #: Where in an open window a nameless change may end, as shares of the data within; and starts that are refitted with
 #: each width of the edges.
 ENDING, STARTS = (0.1, 0.3, 0.5, 0.7, 0.9), 2
+#: Relative difference up to which two effects are one, and relative size from which on two are independent.
+SAME, RANK = 1e-4, 1e-7
+
+Places = tuple[tuple[str, str], ...]
 
 
 def refit_nameless(search: Search) -> None:
     """Constant changes in the windows of the leading terms, where a term in a window leads; and these terms in other
     windows, where their own leave something or do worse."""
     lead = search.physical_leader
-    if search.exact or search.stop.is_set() or lead is None or lead.window is None:
+    if search.exact or search.stop.is_set() or lead is None:
+        return
+    if search.noise.open and lead.window is None:  # with the noise that each of them leaves, one in a window may lead
+        lead = likeliest_alone(search) or lead
+    if lead.window is None:
         return
     problem = search.base.problem
     count = len({(c.kind, c.target) for c in channels(problem, search.base) if c.kind in problem.kinds})
     prior = math.log(PRIOR["none"] / max(count, 1)) - math.log(3.0 * len(search.drivers()))
-    named = {_place(candidate) for candidate in search.candidates if _is_constant(search, candidate)}
-    search.nameless = _held_against(search, prior, named)
+    named = {_places(candidate) for candidate in search.candidates if _is_constant(search, candidate)}
+    search.nameless = _held_against(search, lead, prior, named)
     outdone = any(one.weight > lead.weight for one in search.nameless)
     if outdone or search.examine(lead).p_value < PLAINLY_WHITE:  # its window may not be the best that the term has
         again = [(old, one) for old in _rivals(search, lead) if (one := _anywhere(search, old)) is not None]
@@ -53,16 +65,15 @@ def refit_nameless(search: Search) -> None:
             if new is not None and new.weight > old.weight + BETTER:
                 search.models = [m for m in search.models if m is not old] + [new]
         if search.models is not before:
-            search.nameless += _held_against(search, prior, named)
+            search.nameless += _held_against(search, lead, prior, named)
 
 
-def _held_against(search: Search, prior: float, named: set[tuple[str, ...] | None]) -> list[Model]:
+def _held_against(search: Search, lead: Model, prior: float, named: set[Places | None]) -> list[Model]:
     """Constant changes beside the leading terms in windows, but in places that a constant of the list names."""
-    lead = max((m.weight for m in search.models if m.physical), default=0.0)
-    near = [m for m in search.models if m.physical and m.window is not None and m.weight > lead - CLOSE]
-    wanted: dict[tuple[tuple[str, ...], str], list[Hypothetical]] = {}
+    near = [m for m in search.models if m.physical and m.window is not None and m.weight > lead.weight - CLOSE]
+    wanted: dict[tuple[Places, str], list[Hypothetical]] = {}
     for model in sorted(near, key=lambda m: -m.weight)[:MOST]:
-        where, window = _place(model.candidate), model.window
+        where, window = _places(model.candidate), model.window
         if where is None or window is None or where in named:
             continue
         if (where, window.driver) not in wanted:
@@ -72,14 +83,22 @@ def _held_against(search: Search, prior: float, named: set[tuple[str, ...] | Non
 
 
 def _refitted(search: Search, wanted: Sequence[Hypothetical]) -> list[Model | None]:
-    """Refits one after another: none of the user's terms, they may take a simulator where it raises."""
-    found: list[Model | None] = []
-    for one in wanted:
-        try:
-            found += search.refit_together([one])
-        except SimulatorError:
-            found.append(None)
+    """Refits with steps for edges where these are better; no model where a window has closed."""
+    found = []
+    for model in map(long_enough, _where_possible(search, wanted)):
+        if model is not None and model.window is not None:
+            with suppress(SimulatorError):
+                model = long_enough(stepped(search, model, model.window.driver)) or model
+        found.append(model)
     return found
+
+
+def _where_possible(search: Search, wanted: Sequence[Hypothetical]) -> list[Model | None]:
+    """Refits: none of the user's terms, they may take a simulator where it raises."""
+    try:
+        return search.refit_together(wanted)
+    except SimulatorError:
+        return [None] if len(wanted) == 1 else [m for one in wanted for m in _where_possible(search, [one])]
 
 
 def _rivals(search: Search, lead: Model) -> list[Model]:
@@ -91,28 +110,33 @@ def _rivals(search: Search, lead: Model) -> list[Model]:
     return list(best.values())[:TRIED]
 
 
-def _place(candidate: Candidate) -> tuple[str, ...] | None:
-    """Where a term acts, if in one place."""
+def _places(candidate: Candidate) -> Places | None:
+    """The equations, outputs or parameters that a term acts on; None where it has states of its own or frees what is
+    held."""
     (term,) = candidate.terms
-    places = [(kind, name) for kind in ("rates", "outputs", "shifts") for name in getattr(term, kind)]
-    return places[0] if len(places) == 1 and not term.states and not term.frees else None
+    places = tuple((kind, name) for kind in ("rates", "outputs", "shifts") for name in getattr(term, kind))
+    return places if places and not term.states and not term.frees else None
 
 
 def _is_constant(search: Search, candidate: Candidate) -> bool:
     """Whether a term of the list is a constant change, which has a name then; that of an instrument in a part of its
     range has none."""
     (term,) = candidate.terms
-    if _place(candidate) is None or term.outputs or candidate.tangents.shape[::2] != (1, 1):
+    if _places(candidate) is None or term.outputs or candidate.tangents.shape[::2] != (1, 1):
         return False
     try:
         # Both at the base as it stands, which has moved with the noise since the candidate's own tangents.
-        now, same = (
+        now, constant = (
             prepare(search.base.problem, search.base, [one], search.fixed, {}).tangents
             for one in (term, _constant(term, search.problem.in_time))
         )
     except (SimulatorError, DomainError):
         return False
-    return now.shape == same.shape and alike(now[0, :, 0], same[0, :, 0])
+    if now.shape[::2] != (1, 1):
+        return False
+    own, plane = now[0], constant[0]
+    left = own - plane @ torch.linalg.lstsq(plane, own, driver="gelsd").solution
+    return 0 < float(own.norm()) and float(left.norm()) <= SAME * float(own.norm())
 
 
 def _wanted(search: Search, model: Model, prior: float) -> list[Hypothetical]:
@@ -122,7 +146,7 @@ def _wanted(search: Search, model: Model, prior: float) -> list[Hypothetical]:
         return []
     driver = search.drivers()[w.driver]
     inside = driver[(driver >= w.low) & (driver <= w.high)]
-    span = Span.of(driver)
+    span = w.span or Span.of(driver)
     ends = [([w.low], [w.high])]
     if not (math.isfinite(w.low) and math.isfinite(w.high)) and len(inside):
         other = inside.double().quantile(torch.tensor(ENDING, dtype=torch.float64)).tolist()
@@ -162,21 +186,23 @@ def _anywhere(search: Search, model: Model) -> Hypothetical | None:
 
 
 def _constant(term: Term, in_time: bool) -> Term:
-    """A constant change in the place where a term acts."""
+    """A constant change of its own in every place where a term acts."""
+    number = itertools.count(1)
 
-    def added(*given: object) -> object:
-        return given[2 if in_time else 1]["c"]  # type: ignore[index]
+    def added() -> Callable[..., Any]:
+        name = f"c{next(number)}"
+        return lambda *given: given[2 if in_time else 1][name]
 
-    def shown(*given: object) -> object:
-        return given[-1] + added(*given)  # type: ignore[operator]
+    def shown() -> Callable[..., Any]:
+        own = added()
+        return lambda *given: given[-1] + own(*given)
 
-    return Term(
-        "something unknown",
-        rates={name: added for name in term.rates},
-        outputs={name: shown for name in term.outputs},
-        shifts={name: added for name in term.shifts},
-        parameters=[Parameter("c")],
-    )
+    kinds: dict[str, Any] = {
+        "rates": {name: added() for name in term.rates},
+        "outputs": {name: shown() for name in term.outputs},
+        "shifts": {name: added() for name in term.shifts},
+    }
+    return Term("something unknown", **kinds, parameters=[Parameter(f"c{i}") for i in range(1, next(number))])
 
 
 def _begin(
@@ -185,7 +211,7 @@ def _begin(
     """Starting values at a model's base, of the best size each; those of the best few."""
     known, problem = model.found.by_name, candidate.problem
     names = [q.name for q in problem.parameters]
-    (place,) = candidate.amplitudes
+    places = candidate.amplitudes
     widths = [share * span.size for share in (EDGE, *WIDTHS)]
     if not any(name.endswith(WIDTH_OF_EDGE) for name in names):
         widths = widths[:1]
@@ -195,15 +221,17 @@ def _begin(
         for i, name in enumerate(names):
             if is_window(name):
                 row[i] = width if name.endswith(WIDTH_OF_EDGE) else low if name.endswith("from") else high
-            elif i != place:
+            elif i not in places:
                 row[i] = known.get(name, float(row[i]))
         rows.append(row)
     begin = torch.stack(rows)
-    y, slope, _ = problem.evaluate(begin, [place])
+    y, slope, _ = problem.evaluate(begin, places)
     w = search.noise.whitening(problem)
-    left, effect = w.vector(problem.y - y), torch.stack([w(one)[:, 0] for one in slope])
-    size = (left * effect).sum(-1) / effect.square().sum(-1).clamp_min(1e-300)
-    begin[:, place] += size
-    chi2 = (left - size[:, None] * effect).square().sum(-1)
+    left, effect = w.vector(problem.y - y), torch.stack([w(one) for one in slope])
+    # Of places where nothing happens the size stays as it is.
+    scale = effect.norm(dim=1, keepdim=True).clamp_min(1e-300)
+    size = torch.linalg.pinv(effect / scale, rtol=RANK) @ left[..., None]
+    begin[:, places] += (size[..., 0] / scale[:, 0])
+    chi2 = (left - ((effect / scale) @ size)[..., 0]).square().sum(-1)
     order = chi2.nan_to_num(nan=torch.inf).reshape(len(widths), -1).argsort(-1)[:, :STARTS]
     return begin.reshape(len(widths), -1, begin.shape[-1])[torch.arange(len(widths))[:, None], order].flatten(0, 1)

@@ -25,6 +25,7 @@ __all__ = [
     "explains",
     "fits_by_chance",
     "isolated",
+    "likeliest_alone",
     "odds_alone",
     "other_growth",
     "outdone",
@@ -85,7 +86,8 @@ def weigh_alone(search: "Search") -> tuple[float, float]:
     every = [*search.models, *search.nameless]
     own = {id(m): alone(m.found, search.noise, search.tangents)[1] - base for m in every}
     near = max((own[id(m)] + m.prior for m in every), default=0.0) - BEHIND
-    leading = sorted(every, key=lambda m: -m.weight)[:SETTLED]
+    leading = sorted(search.models, key=lambda m: -m.weight)[:SETTLED]
+    leading += sorted(search.nameless, key=lambda m: -m.weight)[:1]
     for model in every:
         found = own[id(model)]
         if model in leading and found + model.prior > near:  # fitted again with its noise, as the base is
@@ -99,16 +101,19 @@ def weigh_alone(search: "Search") -> tuple[float, float]:
     return max(unknown) - base, min(here, 0.0)
 
 
+def likeliest_alone(search: "Search") -> Model | None:
+    """The likeliest physical model, each with its own noise."""
+    physical = [m for m in search.models if m.physical and not m.note]
+    own = {id(m): alone(m.found, search.noise, search.tangents)[1] + m.prior for m in physical}
+    return max(physical, key=lambda m: own[id(m)], default=None)
+
+
 def odds_alone(search: "Search") -> float:
     """Log odds of the likeliest physical model against the base, each with its own noise; −∞ where the noise is known.
 
     The noise that a search begins with is that of the base, which may have taken what a term explains for slow noise.
     """
-    if not search.noise.open:
-        return -math.inf
-    physical = [m for m in search.models if m.physical and not m.note]
-    own = {id(m): alone(m.found, search.noise, search.tangents)[1] + m.prior for m in physical}
-    best = max(physical, key=lambda m: own[id(m)], default=None)
+    best = likeliest_alone(search) if search.noise.open else None
     if best is None:
         return -math.inf
     base = settled(search.base, search.noise, search.tangents)[1] + math.log(PRIOR["base"])

@@ -331,7 +331,7 @@ class Experiment:
             of the expected χ² difference).
         conditions: Ready for a new recording: in time ``{"time": (T,), "initial": {state: value}, "inputs":
             {input: (T,)}}``, otherwise ``{"x": {condition: (n,)}}``. Found for the first eight tied models.
-        untold: Pairs of hypotheses that no simple experiment tells apart.
+        untold: Pairs of hypotheses that none of the experiments tried in thought tells apart.
     """
 
     description: str

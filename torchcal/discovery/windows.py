@@ -18,7 +18,7 @@ from torchcal.discovery.verdict import PLAINLY_WHITE
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators import Trajectories
 
-__all__ = ["refit_local"]
+__all__ = ["long_enough", "refit_local", "stepped"]
 
 #: Refits at most, in windows that promise much and in the leader's; of one candidate; around one refitted term; how
 #: many of those, and how many more of terms that the base has everywhere.
@@ -98,7 +98,7 @@ def _turn(search: Search, prior: float) -> None:
     other = dataclasses.replace(w, low=low, high=high, amplitude=-_amplitude(search, lead)[2])
     (turned,) = _refit(search, [_begun(search, other, prior, edge=True, span=w.span)])
     if turned is not None:
-        turned = _stepped(search, turned, w.driver)
+        turned = stepped(search, turned, w.driver)
     if turned is not None and turned.physical and turned.weight > lead.weight - AS_GOOD:
         search.models.remove(lead)
         _keep(search, turned)
@@ -162,13 +162,13 @@ def _refine_edges(search: Search, prior: float) -> None:
         found = _refit(search, [_begun(search, w, prior, model, edge=True, span=scale) for scale in scales])
         other = max((one for one in found if one is not None), key=lambda one: one.weight, default=None)
         if other is not None:
-            other = _stepped(search, other, w.driver)
+            other = stepped(search, other, w.driver)
         if other is not None and other.weight > model.weight:
             search.models.remove(model)
             _keep(search, other)
 
 
-def _stepped(search: Search, model: Model, driver: str) -> Model:
+def stepped(search: Search, model: Model, driver: str) -> Model:
     """A static local model with steps for edges, each between two of the data near the edge that was found, if better.
 
     The misfit of a step jumps from datum to datum, and slopes lead to none of its minima.
@@ -310,7 +310,7 @@ def _begun(
 def _refit(search: Search, wanted: Sequence[Hypothetical | None]) -> list[Model | None]:
     """Refit local terms, those that can be; no model where a window has closed."""
     found = iter(search.refit_together([one for one in wanted if one is not None]))
-    return [None if one is None else _long_enough(next(found)) for one in wanted]
+    return [None if one is None else long_enough(next(found)) for one in wanted]
 
 
 def _keep_all(search: Search, wanted: Sequence[Hypothetical | None]) -> None:
@@ -319,7 +319,7 @@ def _keep_all(search: Search, wanted: Sequence[Hypothetical | None]) -> None:
         _keep(search, model)
 
 
-def _long_enough(model: Model | None) -> Model | None:
+def long_enough(model: Model | None) -> Model | None:
     """The model, unless its window has closed or is too short for one."""
     if model is None or model.window is None or model.window.span is None:
         return None

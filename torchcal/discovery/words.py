@@ -286,7 +286,7 @@ def _experiment(d: Any) -> list[str]:
     distance = f"predicted distance {up_to(d.experiment.separation)} noise sd"
     text = f"What would tell them apart: {d.experiment.description} ({distance})"
     untold = [f"{a} from {b}" for a, b in d.experiment.untold]
-    return [text + (f"; no simple experiment tells {', or '.join(untold)}." if untold else ".")]
+    return [text + (f"; none that was tried in thought tells {', or '.join(untold)}." if untold else ".")]
 
 
 def _ambiguous(d: Any) -> list[str]:
@@ -335,7 +335,7 @@ def _ambiguous(d: Any) -> list[str]:
     if d.experiment is not None:
         parts += _experiment(d)
     elif sum(any(row.refitted and set(row.terms) == set(tied) for row in d.ranking) for tied in known) > 1:
-        parts.append("None of the simple experiments that were tried in thought would tell them apart.")
+        parts.append("None of the experiments that were tried in thought would tell them apart.")
     return parts
 
 

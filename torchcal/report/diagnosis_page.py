@@ -292,7 +292,7 @@ def _experiment(diagnosis: Any) -> str:
         f"by {escaped(distance)} noise sd.</p>"
     )
     for one, other in getattr(experiment, "untold", ()):
-        text += f"<p>No simple experiment tells {escaped(one)} from {escaped(other)}.</p>"
+        text += f"<p>No experiment that was tried in thought tells {escaped(one)} from {escaped(other)}.</p>"
     return section("Experiment that would decide", text + table(rows))
 
 
