@@ -648,33 +648,29 @@ def test_few_samples_an_orbit_are_no_reason_to_lose_it():
     assert d.before.fitted.rmse < 0.05
 
 
-def test_what_the_base_has_stays_in_it_when_the_noise_changes():
-    """A gust that nothing explains: the noise found beside it moves the base, away from where tangents were taken."""
-    t, rng = np.linspace(0, 40, 160), np.random.default_rng(4)
-    x = solve(
-        lambda t, s: [s[1], -2.0 * s[0] - 0.05 * s[1] + 0.25 * np.exp(-(((t - 19) / 1.5) ** 2))], [1.0, 0.0], t
-    )[0]  # fmt: skip
+def swinging(extra, end, count):
+    """A spring with little damping, with an acceleration ``extra(t, v)`` that is in no list, and its base."""
+    t, rng = np.linspace(0, end, count), np.random.default_rng(4)
+    x = solve(lambda t, s: [s[1], -2.0 * s[0] + extra(t, s[1])], [1.0, 0.0], t)[0]
     base = tc.ODESimulator(
         lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"] - p["c"] * s["v"]}, {"x": "m", "v": "m/s"},
         [tc.Parameter("k", low=0.0, initial=2.0), tc.Parameter("c", low=0.0, initial=0.05)], observe=("x",),
     )  # fmt: skip
-    y = torch.tensor(x + 0.02 * rng.standard_normal(160))
-    recording = tc.Recording(runs=[tc.Run(time=t, outputs={"x": y}, initial={"x": 1.0, "v": 0.0})])
-    d = diagnose(base, recording, tc.terms.mechanics(position="x", velocity="v", angle=False))
+    y = torch.tensor(x + 0.02 * rng.standard_normal(count))
+    return base, tc.Recording(runs=[tc.Run(time=t, outputs={"x": y}, initial={"x": 1.0, "v": 0.0})])
+
+
+def test_what_the_base_has_stays_in_it_when_the_noise_changes():
+    """A gust that nothing explains: the noise found beside it moves the base, away from where tangents were taken."""
+    swing = swinging(lambda t, v: -0.05 * v + 0.25 * np.exp(-(((t - 19) / 1.5) ** 2)), 40, 160)
+    d = diagnose(*swing, tc.terms.mechanics(position="x", velocity="v", angle=False))
     notes = {limit.term: (limit.smallest, limit.note) for limit in d.detection_limit}
     assert notes["linear drag"] == notes["linear spring"] == (math.inf, "already in the base model")
 
 
 def test_a_parameter_on_its_bound_takes_up_what_moves_it_inwards():
     """Growth instead of damping: c stays at 0. More of it is no new physics all the same."""
-    t, rng = np.linspace(0, 20, 100), np.random.default_rng(4)
-    x = solve(lambda t, s: [s[1], -2.0 * s[0] + 0.05 * s[1]], [1.0, 0.0], t)[0]
-    base = tc.ODESimulator(
-        lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"] - p["c"] * s["v"]}, {"x": "m", "v": "m/s"},
-        [tc.Parameter("k", low=0.0, initial=2.0), tc.Parameter("c", low=0.0, initial=0.05)], observe=("x",),
-    )  # fmt: skip
-    y = torch.tensor(x + 0.02 * rng.standard_normal(100))
-    recording = tc.Recording(runs=[tc.Run(time=t, outputs={"x": y}, initial={"x": 1.0, "v": 0.0})])
-    d = diagnose(base, recording, tc.terms.mechanics(position="x", velocity="v", angle=False)[:3])
+    swing = swinging(lambda t, v: 0.05 * v, 20, 100)
+    d = diagnose(*swing, tc.terms.mechanics(position="x", velocity="v", angle=False)[:3])
     (limit,) = [limit for limit in d.detection_limit if limit.term == "linear drag"]
     assert limit.smallest == math.inf
