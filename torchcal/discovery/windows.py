@@ -22,7 +22,9 @@ __all__ = ["long_enough", "refit_local", "stepped"]
 
 #: Refits at most, in windows that promise much and in the leader's; of one candidate; around one refitted term; how
 #: many of those, and how many more of terms that the base has everywhere.
-MOST, MOST_EACH, MOST_AROUND, LEADING, HELD = 10, 2, 2, 3, 1
+MOST, MOST_EACH, MOST_AROUND, LEADING, HELD = 12, 2, 2, 3, 1
+#: χ² by which the best window along one more driver may promise less than the best of all.
+NEARLY = 6.0
 #: Score below which a window promises nothing, and the share that it may lack of what the best term removes: its edges
 #: are taken from a coarse grid, and its effect for linear.
 LEAST_SCORE, LACKING = 3.5, 0.1
@@ -134,16 +136,17 @@ def _rivals_of(search: Search, prior: float, lead: Model) -> bool:
 
 
 def _different(ranked: list[Window], spans: dict[str, Span]) -> list[Window]:
-    """The best windows of a candidate, no two of them along one driver with most of the one within the other."""
+    """The best windows of a candidate, no two of them along one driver with most of the one within the other; and those
+    along yet other drivers that promise nearly as much."""
     kept: list[Window] = []
     for w in ranked:
         span = spans[w.driver]
         own = span.share(w.low, w.high)
         within = [span.share(max(w.low, o.low), min(w.high, o.high)) for o in kept if o.driver == w.driver]
+        if len(kept) >= MOST_EACH and (within or w.z**2 < kept[0].z ** 2 - NEARLY):
+            continue
         if max(within, default=0.0) < ALIKE * own:
             kept.append(w)
-        if len(kept) == MOST_EACH:
-            break
     return kept
 
 
