@@ -222,7 +222,8 @@ class Limit:
         smallest: Smallest detectable magnitude, in ``unit``; infinite where the data cannot tell at all.
         unit: Unit of the amplitude.
         power: Probability with which an effect of this size is detected.
-        estimate: What was found, where the term was fitted.
+        estimate: What the term takes up where it alone is fitted beside the base: what others do as well, so that it is
+            no sign of the term where something else is missing.
         note: ``"already in the base model"`` or the like.
     """
 
