@@ -46,6 +46,11 @@ SAME_MEANS = 1e-3
 """Difference of scaled means up to which two starts ended at one maximum."""
 
 
+BETWEEN, LEVEL = 9, 0.01
+"""Points of a straight line between two maxima, ends included, and the difference in log-posterior along it up to which
+it is level."""
+
+
 @dataclass(frozen=True)
 class Estimate:
     """The best of many starts.
@@ -341,10 +346,11 @@ def modes_of(problem: Problem, estimate: Estimate) -> list[Laplace]:
     def objective(u: Tensor) -> Tensor:
         return -problem.log_prob(problem.prior.transform.bound(u)) - problem.prior.transform.log_slope(u)
 
-    tried = 0
+    ridge = len(estimate.null_directions) > 0
+    tried, places = 0, [estimate.alpha]
     for end in ends:
         start = problem.prior.transform.unbound(end)
-        if any(_apart(start, mode) < 1 for mode in found):
+        if any(_apart(start, mode) < 1 for mode in found) or (ridge and any(_joined(problem, end, p) for p in places)):
             continue
         tried += 1
         if tried > MOST_MODES:
@@ -355,10 +361,38 @@ def modes_of(problem: Problem, estimate: Estimate) -> list[Laplace]:
             continue
         found.append(mode)
         heights.append(height)
+        places.append(end)
     share = torch.tensor(heights, dtype=torch.float64).softmax(0)
     kept = [(mode, float(w)) for mode, w in zip(found, share, strict=True) if mode is best or w >= LEAST_WEIGHT]
     total = sum(w for _, w in kept)
     return [Laplace(mode.loc, mode.scale_tril, w / total) for mode, w in kept]
+
+
+def _joined(problem: Problem, one: Tensor, other: Tensor) -> bool:
+    """Whether two maxima ``(P,)`` are places of one ridge that the data do not see along.
+
+    A straight one keeps its height between them; along a bent one the density of λ changes in what the data see nothing
+    of, but neither in its mean nor in its covariance.
+    """
+    propagate = problem.propagate
+    share = torch.linspace(0, 1, BETWEEN).to(one)[:, None]
+    with torch.no_grad():
+        heights = problem.log_prob(one + share * (other - one))
+        if not abs(float(heights[-1] - heights[0])) <= LEVEL:
+            return False
+        if bool(((heights - heights[0]).abs() <= LEVEL).all()):
+            return True
+        if not propagate.pattern.num_germs:
+            return False
+        coefficients = torch.stack([one, other])[:, : propagate.num_alpha]
+        mean, covariance = propagate.parameter_moments(coefficients)
+    spread = covariance.diagonal(dim1=-2, dim2=-1).amax(0).sqrt()
+    unit = torch.maximum(spread, SAME_MEANS * mean.abs().amax(0)).clamp_min(1e-300)
+    apart = torch.maximum(
+        ((mean[1] - mean[0]) / unit).abs().max(),
+        ((covariance[1] - covariance[0]) / (unit[:, None] * unit)).abs().max(),
+    )
+    return float(apart) <= SAME_MEANS
 
 
 def _apart(point: Tensor, mode: Laplace) -> float:
