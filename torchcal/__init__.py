@@ -1,5 +1,8 @@
 """torchcal: calibrate a simulation that is wrong, and find the physics that it leaves out."""
 
+import importlib
+import typing
+
 from torchcal import discovery, embeddings, errors, likelihoods, models, polychaos, priors, results, terms
 from torchcal.data import Recording, Run
 from torchcal.discovery import diagnose
@@ -39,9 +42,17 @@ __all__ = [
     "errors",
     "likelihoods",
     "models",
+    "plots",
     "polychaos",
     "priors",
     "results",
     "scores",
     "terms",
 ]
+
+
+def __getattr__(name: str) -> typing.Any:
+    """`torchcal.plots`, which brings matplotlib, when it is asked for."""
+    if name == "plots":
+        return importlib.import_module("torchcal.plots")
+    raise AttributeError(f"module 'torchcal' has no attribute {name!r}")

@@ -8,8 +8,10 @@ from torchcal.errors import DomainError
 __all__ = ["whole"]
 
 
-def whole(name: str, value: Any, minimum: int, *, advice: str = "") -> int:
+def whole(name: str, value: Any, minimum: int, *, also: str = "", advice: str = "") -> int:
     """Return ``value`` as an ``int``; an integer of NumPy's or torch's is one too.
+
+    ``also`` says what else may be given, which the caller has seen to; ``advice`` what to do.
 
     Raises:
         DomainError: If ``value`` is not a whole number or is below ``minimum``. A float such as ``2.0`` and
@@ -20,6 +22,7 @@ def whole(name: str, value: Any, minimum: int, *, advice: str = "") -> int:
     except TypeError:
         number = None
     if number is None or isinstance(value, bool) or number < minimum:
+        wanted = f"a whole number >= {minimum}" + (f", {also}" if also else "")
         tail = f" ({advice})" if advice else ""
-        raise DomainError(f"Expected {name} to be a whole number >= {minimum}. Got {name}={value!r}{tail}.")
+        raise DomainError(f"Expected {name} to be {wanted}. Got {name}={value!r}{tail}.")
     return number

@@ -3,10 +3,13 @@
 import math
 from collections.abc import Sequence
 
-__all__ = ["DECADES", "FAR", "NONE", "between", "percent", "placed", "up_to", "with_unit"]
+__all__ = ["DECADES", "FAR", "NONE", "PATIENCE", "between", "percent", "placed", "up_to", "with_unit"]
 
 NONE = ("none of these",)
 """In place of terms: something that is not among the candidates."""
+
+PATIENCE = 2.0
+"""Seconds before a calibration shows a bar."""
 
 DECADES = 30.0
 """Ratio of the ends of a positive range from which on it is laid out in its logarithm."""

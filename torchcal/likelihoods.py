@@ -379,8 +379,9 @@ def get(likelihood: str | Likelihood) -> Likelihood:
         return likelihood
     if isinstance(likelihood, str) and likelihood in _BY_NAME:
         return _BY_NAME[likelihood]()
+    instead = f" (write {likelihood.__name__}(), with brackets)" if isinstance(likelihood, type) else ""
     raise DomainError(
-        f"Expected a torchcal.likelihoods object or one of {sorted(_BY_NAME)}. Got {likelihood!r}."
+        f"Expected a torchcal.likelihoods object or one of {sorted(_BY_NAME)}. Got {likelihood!r}{instead}."
     )
 
 

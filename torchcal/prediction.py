@@ -27,6 +27,9 @@ __all__ = [
     "scores",
 ]
 
+#: Sd relative to its datum up to which it is zero but for rounding.
+ROUNDING = 1e-13
+
 
 @dataclass(frozen=True)
 class Moments:
@@ -288,9 +291,10 @@ def scores(y: Any, moments: Moments | Prediction, *, noise: Any = None, level: f
     error = (y - moments.mean)[known]
     sd = moments.sd if noise is None else (moments.sd.square() + _noise_sd(noise, moments.sd).square()).sqrt()
     sd = sd[known]
-    if not bool((sd > 0).all()):
-        got = "0" if bool((sd == 0).any()) else "NaN"
-        raise DomainError(f"Expected sd > 0 for a log score. Got {got}. Give noise=, or compare the means alone.")
+    least = ROUNDING * torch.maximum(moments.mean[known].abs(), y[known].abs())
+    if not bool((sd > least).all()):
+        told = "NaN" if bool(sd.isnan().any()) else f"{float(sd.min()):.3g}, which is 0 but for rounding"
+        raise DomainError(f"Expected sd > 0 for a log score. Got {told}. Give noise=, or compare the means alone.")
     quantile = math.sqrt(2) * float(torch.erfinv(torch.tensor(level, dtype=torch.float64)))
     z = error / sd
     log_score = (-0.5 * z.square() - sd.log()).mean() - 0.5 * math.log(2 * math.pi)

@@ -39,7 +39,7 @@ def calibrate_additive(
     dtype: torch.dtype = torch.float64,
     sampler: str = "nuts",
     target_accept: float | None = None,
-    progress: bool = False,
+    progress: bool = True,
 ) -> AdditiveCalibration:
     r"""Calibrate the conventional way: λ and ln σ of an additive Gaussian discrepancy (Eqs. 2-4).
 
@@ -69,7 +69,7 @@ def calibrate_additive(
             ``"nuts"``, 0.8 for the others, and more where trajectories diverge: draws among which more than one in
             10,000 diverged are drawn anew with smaller steps, up to three times (not by ``"pyro"``, nor where this is
             given).
-        progress: Whether to show a bar.
+        progress: Whether to show a bar where it takes more than two seconds.
 
     Raises:
         ImproperPosteriorError: If the model fits the data exactly, or has as many parameters as there are data:

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from torchcal.display import PATIENCE
 from torchcal.errors import ConvergenceError, ConvergenceWarning
 from torchcal.inference import hmc_step, nuts_step
 from torchcal.inference.arrays import Arrays, arrays_for
@@ -208,7 +209,7 @@ def run_batched(
     moves: _Kernel = _HMC(arrays) if kernel == "hmc" else _NUTS(max_tree_depth, arrays)
     most, cheap = max(4, MOST_ELEMENTS // max(1, cost)), max(_FEW_WARM_UP_CHAINS, _WARM_UP_ELEMENTS // max(1, cost))
     crowd = max(num_chains, min(_WARM_UP_CHAINS, most, cheap))
-    bar = tqdm(total=num_warmup + num_samples, desc=kernel.upper(), disable=not progress, leave=False)
+    bar = tqdm(total=num_warmup + num_samples, desc=kernel.upper(), disable=not progress, delay=PATIENCE, leave=False)
     drawn = collector = _Collector(num_chains, loc)
     try:
         space = Whitened(log_density, loc, modes[0].scale_tril, slopes=slopes)

@@ -60,7 +60,7 @@ def calibrate(
     dtype: torch.dtype = torch.float64,
     sampler: str = "nuts",
     target_accept: float | None = None,
-    progress: bool = False,
+    progress: bool = True,
 ) -> Calibration:
     r"""Calibrate a simulator whose model error is embedded in its parameters.
 
@@ -100,7 +100,7 @@ def calibrate(
             ``"nuts"``, 0.8 for the others, and more where trajectories diverge: draws among which more than one in
             10,000 diverged are drawn anew with smaller steps, up to three times (not by ``"pyro"``, nor where this is
             given).
-        progress: Whether to show a bar.
+        progress: Whether to show a bar where it takes more than two seconds.
 
     Returns:
         A `torchcal.results.Calibration`.
@@ -123,7 +123,10 @@ def calibrate(
     check_run(num_starts, device)
     embedding = Gaussian() if embedding is None else embedding
     if not isinstance(embedding, Embedding):
-        raise DomainError(f"Expected one of torchcal.embeddings. Got {type(embedding).__name__}.")
+        instead = " (write Gaussian(), with brackets)" if isinstance(embedding, type) else ""
+        raise DomainError(
+            f"Expected embedding as one of torchcal.embeddings, such as Gaussian(). Got {embedding!r}{instead}."
+        )
     simulator, free = check_inputs(simulator, recording, fixed)
     if isinstance(simulator, Trajectories):
         embedding = embedding.sparing([parameter.name for parameter in free], simulator.nuisance)

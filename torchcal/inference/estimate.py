@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from torchcal.display import PATIENCE
 from torchcal.errors import ConvergenceError, ConvergenceWarning, IdentifiabilityWarning, ShapeError
 from torchcal.inference.coordinates import Laplace
 from torchcal.inference.newton import Minima, gradient, hessian, minimise
@@ -110,11 +111,11 @@ def maximise(
         starts = _starting_points(problem, leading.to(like), num_starts, seed)
 
     in_time = isinstance(problem.propagate.simulator, Trajectories)
-    bar = tqdm(desc="maximum", unit="step", disable=not progress, leave=False)
+    bar = tqdm(desc="maximum", unit="step", disable=not progress, delay=PATIENCE, leave=False)
 
     def show(_iteration: int, values: Tensor) -> None:
         bar.update(1)
-        bar.set_postfix(objective=f"{float(values.min()):.6g}")
+        bar.set_postfix(objective=f"{float(values.min()):.6g}", refresh=False)
 
     def coefficients(points: Tensor) -> Tensor:
         return transform.bound(points)[..., : problem.propagate.num_alpha]

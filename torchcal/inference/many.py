@@ -22,6 +22,7 @@ from tqdm.auto import tqdm
 
 from torchcal import embeddings, likelihoods
 from torchcal.data import Recording
+from torchcal.display import PATIENCE
 from torchcal.errors import DomainError, RecordingError, TorchcalError, TorchcalWarning
 from torchcal.inference.calibrate import calibrate
 from torchcal.results import Calibration, storage
@@ -41,7 +42,7 @@ def calibrate_many(
     *,
     executor: Executor | None = None,
     folder: str | os.PathLike[str] | None = None,
-    progress: bool = False,
+    progress: bool = True,
     **settings: Any,
 ) -> dict[str, Calibration]: ...
 
@@ -53,7 +54,7 @@ def calibrate_many(
     *,
     executor: Executor | None = None,
     folder: str | os.PathLike[str] | None = None,
-    progress: bool = False,
+    progress: bool = True,
     **settings: Any,
 ) -> list[Calibration]: ...
 
@@ -64,7 +65,7 @@ def calibrate_many(
     *,
     executor: Executor | None = None,
     folder: str | os.PathLike[str] | None = None,
-    progress: bool = False,
+    progress: bool = True,
     **settings: Any,
 ) -> list[Calibration] | dict[str, Calibration]:
     """Calibrate one simulator to many recordings, each as `calibrate` does by itself.
@@ -81,7 +82,7 @@ def calibrate_many(
             `torchcal.results.Calibration.load` reads. Results that are there already are not computed again: with the
             same recording and settings, and a simulator that still predicts what the first of them predicts. Made if
             it does not exist. Needs xarray.
-        progress: Whether to show a bar over the recordings.
+        progress: Whether to show a bar over the recordings where they take more than two seconds.
         **settings: Of `calibrate`, the same for all.
 
     Returns:
@@ -110,7 +111,7 @@ def calibrate_many(
     failures: dict[Any, BaseException] = {}
     warned: dict[tuple[type[Warning], str], None] = {}
     work = _Work(simulator, settings, os.getpid())
-    bar = tqdm(total=len(items), initial=len(results), desc="calibrations", disable=not progress)
+    bar = tqdm(total=len(items), initial=len(results), desc="calibrations", disable=not progress, delay=PATIENCE)
 
     def take(names: Sequence[Any], index: int, outcome: _Outcome) -> None:
         name = names[index]
@@ -182,7 +183,7 @@ class _Work:
             if away:
                 torch.set_num_threads(1)
             try:
-                result = calibrate(self.simulator, recording, **self.settings)
+                result = calibrate(self.simulator, recording, progress=False, **self.settings)
                 if away and result.propagate is not None:
                     # Makes it forget the closure that it has made of the simulator, which cannot be pickled.
                     result.propagate.to(device=result.propagate.nodes.device)

@@ -9,6 +9,7 @@ from pyro.infer import MCMC, NUTS
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from torchcal.display import PATIENCE
 from torchcal.errors import ConvergenceError, ConvergenceWarning
 from torchcal.inference.draws import Draws
 from torchcal.inference.randomness import preserve_random_state
@@ -51,7 +52,7 @@ def run_nuts(
     transform = prior.transform
     size = prior.low.shape[0]
     total = num_chains * (num_warmup + num_samples)
-    bar = tqdm(total=total, desc="NUTS", disable=not progress, leave=False)
+    bar = tqdm(total=total, desc="NUTS", disable=not progress, delay=PATIENCE, leave=False)
     current: list[Tensor] = []
 
     def hook(_kernel: NUTS, state: dict[str, Tensor], stage: str, _index: int) -> None:

@@ -17,7 +17,7 @@ from torchcal.inference.fitting import LeastSquares
 from torchcal.models import Problem
 from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results import Diagnostics, Quality
-from torchcal.results.diagnostics import ESS_THRESHOLD, r_hat_threshold
+from torchcal.results.diagnostics import ess_threshold, r_hat_threshold
 from torchcal.simulators import Simulator, Trajectories
 
 __all__ = [
@@ -57,7 +57,7 @@ def diagnose(
             labels, moments = _parameter_draws(propagate, samples)
             parameters = _quality(moments, labels)
         everything = {**alpha, **parameters}
-        wanted = min(ESS_THRESHOLD, samples.shape[0] * samples.shape[1] / 4)
+        wanted = ess_threshold(samples.shape[0] * samples.shape[1])
         limit = r_hat_threshold(samples.shape[1])
         count = samples.shape[1]
         if count < measure.FEWEST:
@@ -70,7 +70,7 @@ def diagnose(
         if loud:
             worst = max(loud, key=lambda name: loud[name].r_hat if loud[name].r_hat == loud[name].r_hat else 9e9)
             problems.append(
-                f"R-hat of {worst} is {loud[worst].r_hat:.3f} (threshold {limit:.3f}); {len(loud)} of "
+                f"R-hat of {worst} is {loud[worst].r_hat:.4f} (threshold {limit:.4f}); {len(loud)} of "
                 f"{len(everything)} quantities are past it"
             )
         few = {name: min(q.ess_bulk, q.ess_tail) for name, q in everything.items()}
@@ -118,7 +118,8 @@ def _quality(
 
 
 def _parameter_draws(propagate: NISP, samples: Tensor) -> tuple[tuple[str, ...], Tensor]:
-    """E[λ] and the lower triangle of Cov[λ] for every draw, with their names."""
+    """E[λ] and the lower triangle of Cov[λ] for every draw, with their names; no covariance that is 0 by construction.
+    """
     with torch.no_grad():
         mean, covariance = propagate.parameter_moments(samples.to(propagate.nodes))
     names = propagate.pattern.names
@@ -127,7 +128,7 @@ def _parameter_draws(propagate: NISP, samples: Tensor) -> tuple[tuple[str, ...],
     embedded = [i for i, name in enumerate(names) if name in propagate.pattern.embedded]
     for i in embedded:
         for j in embedded:
-            if j <= i:
+            if j == i or (j < i and bool(covariance[..., i, j].any())):
                 labels.append(f"Cov[{names[i]}, {names[j]}]" if i != j else f"Var[{names[i]}]")
                 columns.append(covariance[..., i, j, None])
     return tuple(labels), to_result(torch.cat(columns, dim=-1))

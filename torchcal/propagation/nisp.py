@@ -97,7 +97,7 @@ class NISP(nn.Module):
             raise DomainError(f"Expected a torchcal.Simulator. Got {type(simulator).__name__}. Wrap the function.")
         if not isinstance(embedding, Embedding):
             raise DomainError(f"Expected one of torchcal.embeddings, such as Gaussian(). Got {embedding!r}.")
-        order = None if order is None else whole("order", order, 1, advice="or None")
+        order = None if order is None else whole("order", order, 1, also="or None")
         if sd_floor is not None and not (math.isfinite(sd_floor) and sd_floor > 0):
             raise DomainError(f"Expected sd_floor > 0. Got {sd_floor!r}.")
         self.simulator = simulator

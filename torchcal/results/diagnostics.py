@@ -7,14 +7,26 @@ from torch import Tensor
 
 from torchcal.propagation import PropagationCheck
 
-__all__ = ["ESS_THRESHOLD", "R_HAT_THRESHOLD", "Diagnostics", "Mode", "Quality", "r_hat_threshold", "table"]
+__all__ = [
+    "ESS_THRESHOLD",
+    "R_HAT_THRESHOLD",
+    "Diagnostics",
+    "Mode",
+    "Quality",
+    "ess_threshold",
+    "r_hat_threshold",
+    "table",
+]
 
 R_HAT_THRESHOLD = 1.01
 """Largest R-hat that passes for chains of 400 draws or more (Vehtari et al. 2021)."""
 
 ESS_THRESHOLD = 400.0
 """Smallest effective sample size that passes: 100 a chain for four chains (Vehtari et al. 2021). Fewer draws than
-that in all are held to a quarter of their number."""
+four times that are held to a quarter of their number."""
+
+R_HAT_MOST, ESS_LEAST = 1.05, 100.0
+"""What passes for no chains, however short: less is too little to tell whether they have met."""
 
 
 @dataclass(frozen=True)
@@ -131,12 +143,21 @@ def r_hat_threshold(num_draws: int) -> float:
     """Largest R-hat that passes.
 
     Chains of n independent draws have, split in halves, an R-hat of about √(1 + 2/n) by chance alone; four times that
-    variance is allowed for the worst of many quantities where chains are short.
+    variance is allowed for the worst of many quantities where chains are short, but never more than 1.05.
 
-    >>> r_hat_threshold(1000)
-    1.01
+    >>> r_hat_threshold(1000), r_hat_threshold(10)
+    (1.01, 1.05)
     """
-    return max(R_HAT_THRESHOLD, (1 + 8 / max(num_draws, 1)) ** 0.5)
+    return min(max(R_HAT_THRESHOLD, (1 + 8 / max(num_draws, 1)) ** 0.5), R_HAT_MOST)
+
+
+def ess_threshold(num_draws: int) -> float:
+    """Smallest effective sample size that passes, of so many draws in all.
+
+    >>> ess_threshold(4000), ess_threshold(1000), ess_threshold(80)
+    (400.0, 250.0, 100.0)
+    """
+    return max(ESS_LEAST, min(ESS_THRESHOLD, num_draws / 4))
 
 
 def table(header: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:

@@ -172,7 +172,8 @@ def _hold_against(recording: Recording, size: Tensor, *pairs: tuple[Tensor, Tens
     allowed = SAME * (recording.spread + size.abs())
     if not all(bool(((predicted - stored).abs() <= allowed).all()) for predicted, stored in pairs):
         raise DomainError(
-            "Expected the simulator that was calibrated. Got one that predicts something else with the same parameters."
+            "Expected the simulator that was calibrated. Got one that predicts something else with the same parameters "
+            "(load with the function that was calibrated, and its constants, or calibrate again)."
         )
 
 
@@ -320,6 +321,8 @@ def _plain_fields(item: Any) -> dict[str, Any]:
 
 
 def _read(path: str | os.PathLike[str], kind: str) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
+    if not os.path.exists(path):
+        raise TorchcalError(f"Expected a netCDF file that torchcal wrote at {path}. Got none: there is no such file.")
     try:
         tree = xarray_module().open_datatree(os.fspath(path), engine="h5netcdf")
     except (OSError, ValueError) as error:

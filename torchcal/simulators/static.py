@@ -105,7 +105,7 @@ class Simulator:
             raise DomainError(f"Expected a callable f(x, p). Got {type(function).__name__}.")
         self.function = function
         self.parameters = check_parameters(parameters)
-        self.degree = None if degree is None else whole("degree", degree, 0, advice="or None")
+        self.degree = None if degree is None else whole("degree", degree, 0, also="or None")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -288,6 +288,11 @@ def _advice(error: Exception, x: Conditions, parameters: Sequence[str]) -> str:
         return (
             f" Here x holds {list(x)}, the recording's conditions, and p holds {list(parameters)}: names in "
             "the recording and in the simulator must agree."
+        )
+    if "numpy()" in str(error) or "converted to Python scalars" in str(error):
+        return (
+            " Use torch functions on p and x: values of many parameters come at once, with gradients. A function that "
+            "cannot be written so goes into torchcal.ExternalSimulator."
         )
     if named and "dict" in str(error):
         return f" Here x is a dict, as in the recording: use {', '.join(f'x[{name!r}]' for name in x)}."
