@@ -4,6 +4,10 @@ Every exception says what was expected, what came, and what to do. Every warning
 trust is a category of its own, so that a caller can filter it or turn it into an error.
 """
 
+import os
+import sys
+import warnings
+
 __all__ = [
     "ConvergenceError",
     "ConvergenceWarning",
@@ -24,7 +28,18 @@ __all__ = [
     "TorchcalWarning",
     "UnitWarning",
     "WorkerWarning",
+    "warn",
 ]
+
+_HERE = os.path.join(os.path.dirname(__file__), "")
+
+
+def warn(message: str, category: type[Warning]) -> None:
+    """Warn at the line outside torchcal that led here, which is where something can be done about it."""
+    level, frame = 2, sys._getframe(1)
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_HERE):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, category, stacklevel=level)
 
 
 class TorchcalError(Exception):

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import time
-import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from typing import Any
@@ -35,7 +34,7 @@ from torchcal.discovery.several import refit_several
 from torchcal.discovery.verdict import PLAINLY_WHITE, Decision, decide
 from torchcal.discovery.where import locate, missing_rate, needed_shifts
 from torchcal.display import NONE
-from torchcal.errors import ConvergenceWarning, DomainError, EmbeddingError, RecordingError
+from torchcal.errors import ConvergenceWarning, DomainError, EmbeddingError, RecordingError, warn
 from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories
 from torchcal.simulators.executor import check_executor
 from torchcal.terms import Term, extend
@@ -173,10 +172,9 @@ def diagnose(
 
 def _hold_back(search: Search, decision: Decision) -> None:
     """An interrupted search names nothing: what it has not refitted might explain as much."""
-    warnings.warn(
+    warn(
         f"The diagnosis was interrupted. It keeps {len(search.models)} refitted hypotheses and names none of them.",
         ConvergenceWarning,
-        stacklevel=3,
     )
     if decision.verdict == "named" and decision.best is not None:
         decision.tied = [list(decision.best.names), list(NONE)]
@@ -411,16 +409,14 @@ def _size(search: Search) -> float:
 
 def _warn(search: Search, lost: bool) -> None:
     if search.base.agreeing < 0.2:
-        warnings.warn(
+        warn(
             f"Only {search.base.agreeing:.0%} of the base's starting values came to the best fit. Give initial= or "
             "bounds to its parameters, or more num_starts.",
             ConvergenceWarning,
-            stacklevel=4,
         )
     if lost:
-        warnings.warn(
+        warn(
             f"The calibrated base explains no more than a constant would (its RMSE is {_size(search):.2g} of the "
             "data's spread). Check the units and the simulator, and give initial= or bounds to its parameters.",
             ConvergenceWarning,
-            stacklevel=4,
         )

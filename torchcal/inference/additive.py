@@ -2,14 +2,13 @@
 
 import dataclasses
 import math
-import warnings
 from collections.abc import Mapping
 
 import torch
 
 from torchcal import likelihoods, models
 from torchcal.data import Recording
-from torchcal.errors import IdentifiabilityWarning, ImproperPosteriorError
+from torchcal.errors import IdentifiabilityWarning, ImproperPosteriorError, warn
 from torchcal.inference.estimate import maximise
 from torchcal.inference.fitting import LeastSquares, least_squares, plain_propagation
 from torchcal.inference.sampling import Plan, draw
@@ -90,12 +89,11 @@ def calibrate_additive(
         )
     unbounded = sum(parameter.low is None or parameter.high is None for parameter in free)
     if recording.noise_sd is None and plan.samples and count - unbounded <= 2:
-        warnings.warn(
+        warn(
             f"With N = {count} data and d = {unbounded} parameters without two bounds the posterior has no finite "
             "variance: its tails are those of Student's t with N − d degrees of freedom, and the sd of its draws say "
             "nothing. Record more, hold parameters with fixed=, or give the recording's noise=.",
             IdentifiabilityWarning,
-            stacklevel=2,
         )
     fit = least_squares(simulator, recording, fixed, seed=seed)
     simulator = fit.simulator

@@ -1,7 +1,6 @@
 """Batched sampling: many chains as one tensor program, step size and coordinates adapted across them."""
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -12,7 +11,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchcal.display import PATIENCE
-from torchcal.errors import ConvergenceError, ConvergenceWarning
+from torchcal.errors import ConvergenceError, ConvergenceWarning, warn
 from torchcal.inference import hmc_step, nuts_step
 from torchcal.inference.arrays import Arrays, arrays_for
 from torchcal.inference.coordinates import Laplace, Slopes, Whitened, gathered, starting_points
@@ -238,11 +237,10 @@ def run_batched(
             drawn = collector
         if drawn.least < 4:
             raise ConvergenceError("The sampler was interrupted before it had drawn anything.") from None
-        warnings.warn(
+        warn(
             f"The sampler was interrupted. It keeps {drawn.least} of {num_samples} draws of each of {num_chains} "
             "chains.",
             ConvergenceWarning,
-            stacklevel=2,
         )
     finally:
         bar.close()

@@ -1,7 +1,6 @@
 """The maximum a posteriori from many starts, its curvature, and directions that the data do not see."""
 
 import dataclasses
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -10,7 +9,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchcal.display import PATIENCE
-from torchcal.errors import ConvergenceError, ConvergenceWarning, IdentifiabilityWarning, ShapeError
+from torchcal.errors import ConvergenceError, ConvergenceWarning, IdentifiabilityWarning, ShapeError, warn
 from torchcal.inference.coordinates import Laplace
 from torchcal.inference.newton import Minima, gradient, hessian, minimise
 from torchcal.inference.randomness import preserve_random_state
@@ -164,11 +163,10 @@ def maximise(
     bar.close()
     best, ties = _first_of_the_tied(problem, found)
     if agreeing < 2 <= len(found.values):
-        warnings.warn(
+        warn(
             f"Only 1 of {total} starts reached the best objective {float(found.values[0]):.6g}; the next ended at "
             f"{float(found.values[1]):.6g}. The maximum may not be the global one. Raise num_starts=.",
             ConvergenceWarning,
-            stacklevel=3,
         )
     piece = pieces(problem.propagate, outputs)
     curvature = hessian(lambda a: -problem.log_prob(a), _inside(problem, best)[None], piece=piece)[0]
@@ -178,18 +176,16 @@ def maximise(
     null = vectors.T[values.abs() <= min(NULL_CURVATURE * top, max(1.0, 1e-9 * top))]
     unseen = _unseen_means(problem, best, curvature)
     if unseen:
-        warnings.warn(
+        warn(
             f"The data do not determine {', '.join(unseen)}. Hold a parameter with fixed=, give a proper prior, or "
             "record conditions in which it matters.",
             IdentifiabilityWarning,
-            stacklevel=3,
         )
     elif together := _known_together(problem, found, null):
-        warnings.warn(
+        warn(
             f"The data determine {', '.join(together)} only together: other values of them give the same maximum, as "
             "where a model has nothing but their product. Hold one of them with fixed=, or give a proper prior.",
             IdentifiabilityWarning,
-            stacklevel=3,
         )
     with torch.no_grad():
         likelihood = float(problem.log_likelihood(best))

@@ -1,7 +1,6 @@
 """The best single parameter vector, and the coordinates that it suggests."""
 
 import math
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -10,7 +9,7 @@ from torch import Tensor
 
 from torchcal.data import Recording
 from torchcal.embeddings import PolynomialChaos
-from torchcal.errors import ConvergenceWarning, SimulatorError
+from torchcal.errors import ConvergenceWarning, SimulatorError, warn
 from torchcal.inference.newton import minimise
 from torchcal.inference.randomness import preserve_random_state
 from torchcal.inference.tangent import minimise_by_tangents
@@ -132,11 +131,10 @@ def _least_squares(
     left = float(relative.square().mean().sqrt())
     guessed = [p.name for p in free if p.initial is None and (p.low is None or p.high is None)]
     if left > 1 and guessed:
-        warnings.warn(
+        warn(
             f"The best single parameter vector leaves residuals of {left:.3g} times the spread of the data, so it fits "
             f"no better than a constant. If a better one exists, give {', '.join(guessed)} initial= or bounds.",
             ConvergenceWarning,
-            stacklevel=3,
         )
     return LeastSquares(scaling, best, relative * spread[observed], left, simulator)
 

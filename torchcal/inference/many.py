@@ -23,7 +23,7 @@ from tqdm.auto import tqdm
 from torchcal import embeddings, likelihoods
 from torchcal.data import Recording
 from torchcal.display import PATIENCE
-from torchcal.errors import DomainError, RecordingError, TorchcalError, TorchcalWarning
+from torchcal.errors import DomainError, RecordingError, TorchcalError, TorchcalWarning, warn
 from torchcal.inference.calibrate import calibrate
 from torchcal.results import Calibration, storage
 from torchcal.simulators import Simulator
@@ -151,7 +151,7 @@ def calibrate_many(
         _attach(error, {name: results[name] for name in items if name in results}, folder)
         raise error from next(iter(failures.values()))
     for category, text in warned:
-        warnings.warn(text, category, stacklevel=2)
+        warn(text, category)
     if isinstance(recordings, Mapping):
         return {name: results[name] for name in items}
     return [results[name] for name in items]

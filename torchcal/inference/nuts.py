@@ -1,6 +1,5 @@
 """The reference sampler: Pyro's No-U-Turn Sampler on the Pyro model, in coordinates whitened at the mode."""
 
-import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -10,7 +9,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchcal.display import PATIENCE
-from torchcal.errors import ConvergenceError, ConvergenceWarning
+from torchcal.errors import ConvergenceError, ConvergenceWarning, warn
 from torchcal.inference.draws import Draws
 from torchcal.inference.randomness import preserve_random_state
 from torchcal.priors import CoefficientPrior
@@ -90,10 +89,9 @@ def run_nuts(
     if not chains:
         raise ConvergenceError("The sampler was interrupted before it had drawn anything.")
     if interrupted:
-        warnings.warn(
+        warn(
             f"The sampler was interrupted. It keeps {len(chains)} of {num_chains} chains with "
             f"{len(chains[0])} draws.",
             ConvergenceWarning,
-            stacklevel=2,
         )
     return Draws(torch.stack(chains).detach().to(device="cpu", dtype=torch.float64), divergences)

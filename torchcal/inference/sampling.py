@@ -1,7 +1,6 @@
 """Which sampler draws, from where, and how much."""
 
 import math
-import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +9,7 @@ from torch import Tensor
 
 from torchcal import models
 from torchcal.checks import whole
-from torchcal.errors import ConvergenceWarning, DomainError, ImproperPosteriorError
+from torchcal.errors import ConvergenceWarning, DomainError, ImproperPosteriorError, warn
 from torchcal.inference.batched import MOST_ELEMENTS, run_batched
 from torchcal.inference.by_hand import by_hand
 from torchcal.inference.coordinates import Laplace, dealt_out, slopes_of
@@ -164,12 +163,11 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
     alpha = folded(draws.alpha)
     found = seen[0][1] if seen and torch.equal(seen[0][0], alpha) else figures(alpha)
     if plan.target_ess is not None and _missing(found, plan.target_ess) > 1:
-        warnings.warn(
+        warn(
             f"Wanted an effective sample size of {plan.target_ess:g} and R-hat below {R_HAT_THRESHOLD}. Got "
             f"{found.least_ess:.0f} and {found.worst_r_hat:.3f} after {alpha.shape[1]} draws of each of "
             f"{alpha.shape[0]} chains.",
             ConvergenceWarning,
-            stacklevel=3,
         )
     told = tuple(_mode(problem, mode, k in begun) for k, mode in enumerate(modes))
     return Draws(alpha, draws.divergences, told, found)
@@ -230,9 +228,8 @@ def _warn_of_rounding(estimate: Estimate, dtype: torch.dtype) -> None:
     """Differences of a log-density are known to its magnitude times the dtype's resolution; 0.05 of one matters."""
     error = abs(estimate.posterior_objective) * torch.finfo(dtype).eps
     if error > 0.05:
-        warnings.warn(
+        warn(
             f"In {dtype} the log-posterior, {estimate.posterior_objective:.3g} at the mode, is known to "
             f"{error:.2g} only, which distorts the draws. Use dtype=torch.float64, or a larger epsilon.",
             ConvergenceWarning,
-            stacklevel=4,
         )

@@ -1,7 +1,6 @@
 """Figures and warnings about a finished calibration."""
 
 import math
-import warnings
 from typing import Any
 
 import torch
@@ -9,7 +8,7 @@ from torch import Tensor
 
 from torchcal import likelihoods
 from torchcal.data import Recording
-from torchcal.errors import ConvergenceWarning, ExtrapolationWarning, IdentifiabilityWarning, ToleranceWarning
+from torchcal.errors import ConvergenceWarning, ExtrapolationWarning, IdentifiabilityWarning, ToleranceWarning, warn
 from torchcal.inference import diagnostics as measure
 from torchcal.inference.draws import WORTH_CHAINS, Draws, most_divergences
 from torchcal.inference.estimate import Estimate
@@ -137,11 +136,10 @@ def _parameter_draws(propagate: NISP, samples: Tensor) -> tuple[tuple[str, ...],
 def warn_of_chains(quality: Diagnostics) -> None:
     """Warn where the chains have not converged, with the numbers."""
     if quality.problems:
-        warnings.warn(
+        warn(
             "The chains have not converged: " + "; ".join(quality.problems) + ". Draw more, or look at the "
             "diagnostics before using the posterior.",
             ConvergenceWarning,
-            stacklevel=3,
         )
 
 
@@ -155,12 +153,11 @@ def warn_of_tolerance(quality: Diagnostics, likelihood: likelihoods.Likelihood) 
         return
     total = quality.model_error_variance + quality.posterior_variance
     if total > 2 * quality.map_variance:
-        warnings.warn(
+        warn(
             f"The tolerance ε sets the width of the prediction: E[σ²] = {quality.model_error_variance:.3g} and V[μ] = "
             f"{quality.posterior_variance:.3g} against σ² = {quality.map_variance:.3g} at the MAP, means over the "
             "data. Use a smaller epsilon=, unless the model is as good as exact.",
             ToleranceWarning,
-            stacklevel=3,
         )
 
 
@@ -182,11 +179,10 @@ def warn_of_bounds(problem: Problem, alpha: Tensor) -> None:
             if not there <= here:  # nor where it has no answer
                 told.append(f"{q.name} at its {side} bound {value:g}")
     if told:
-        warnings.warn(
+        warn(
             f"The best density has {', '.join(told)}: the bound decides it, and the spreads make up for it. Widen "
             "bounds that are not physical; others say that the model lacks something.",
             IdentifiabilityWarning,
-            stacklevel=3,
         )
 
 
@@ -206,12 +202,11 @@ def warn_of_spike(problem: Problem, alpha: Tensor) -> None:
     share = sd / torch.stack(own).amax(0).clamp_min(1e-300)
     share = share if problem.observed is None else share[problem.observed]
     if float(share.min()) < SPIKE:
-        warnings.warn(
+        warn(
             f"The best density is a spike: the spreads of several parameters cancel each other at one datum, to "
             f"{float(share.min()):.1g} of what one gives alone, and the {problem.likelihood.name} likelihood grows "
             "without limit as the output's sd vanishes there. Give the recording's noise=, or use ABC().",
             ConvergenceWarning,
-            stacklevel=3,
         )
 
 
@@ -226,11 +221,10 @@ def warn_of_box(simulator: Simulator, propagate: NISP, alpha: Tensor) -> None:
         values = propagate.with_held(propagate.parameters_at(alpha.to(propagate.nodes), xi))
         share = float(leaves(values).to(torch.float64).mean())
     if share > 0.05:
-        warnings.warn(
+        warn(
             f"{share:.0%} of the calibrated density of the parameters lies outside the box that the surrogate was "
             "built on. Build it on a larger box.",
             ExtrapolationWarning,
-            stacklevel=3,
         )
 
 

@@ -1,19 +1,18 @@
 """Whether output moments have converged in quadrature nodes and in the order of the expansion."""
 
 import math
-import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from torchcal.errors import PropagationWarning
+from torchcal.errors import PropagationWarning, warn
 
 if TYPE_CHECKING:
     from torchcal.propagation.nisp import NISP
 
-__all__ = ["SETTLED", "PropagationCheck", "compare", "warn"]
+__all__ = ["SETTLED", "PropagationCheck", "compare", "warn_unsettled"]
 
 SETTLED = 1e-7
 """Change of the moments, relative to the output's scale, with which enough nodes are found."""
@@ -64,7 +63,7 @@ def compare(propagate: "NISP", alpha: Tensor) -> PropagationCheck:
     )
 
 
-def warn(result: PropagationCheck, order: int | None, tolerance: float, order_tolerance: float) -> None:
+def warn_unsettled(result: PropagationCheck, order: int | None, tolerance: float, order_tolerance: float) -> None:
     """Warn of what has not converged, with the numbers."""
     if not max(result.mean_change, result.sd_change) <= tolerance:
         if math.isnan(result.mean_change + result.sd_change):
@@ -79,11 +78,10 @@ def warn(result: PropagationCheck, order: int | None, tolerance: float, order_to
                 f"its sd by {result.sd_change:.2g} of the output's scale, against {result.finer_nodes} nodes "
                 f"(tolerance {tolerance:.0e}). Pass a larger rule= (or, to NISP, max_nodes=)."
             )
-        warnings.warn(told, PropagationWarning, stacklevel=3)
+        warn(told, PropagationWarning)
     if result.truncated > order_tolerance:
-        warnings.warn(
+        warn(
             f"An expansion of order {order} leaves out {result.truncated:.1%} of the output's variance "
             f"(tolerance {order_tolerance:.0%}). Use order=None for the full variance.",
             PropagationWarning,
-            stacklevel=3,
         )

@@ -331,7 +331,7 @@ class NISP(nn.Module):
         """
         result = convergence.compare(self, alpha)
         if warn:
-            convergence.warn(result, self.order, tolerance, order_tolerance)
+            convergence.warn_unsettled(result, self.order, tolerance, order_tolerance)
         return result
 
     def refine(self, alpha: Tensor, *, tolerance: float = convergence.SETTLED) -> bool:

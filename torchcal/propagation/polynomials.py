@@ -7,7 +7,6 @@ of the many outputs:
 """
 
 import math
-import warnings
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchcal import polychaos
-from torchcal.errors import PropagationWarning
+from torchcal.errors import PropagationWarning, warn
 from torchcal.simulators import ExternalSimulator, PolynomialSurrogate
 
 if TYPE_CHECKING:
@@ -82,11 +81,10 @@ def expansion(propagate: "NISP") -> tuple[Expansion | None, int | None]:
     tolerance = max(TOLERANCE, 1e3 * torch.finfo(where.dtype).eps)
     size = propagate.largest(values.abs().amax(0))
     if bool((error > REFUTED * size).any()):  # the same words every time, so that they are told once
-        warnings.warn(
+        warn(
             f"Expected outputs that are polynomials of degree {degree} in the parameters, as degree= says. Got others, "
             "which are taken as those of any simulator: drop degree=.",
             PropagationWarning,
-            stacklevel=4,
         )
         return None, None
     if not bool((error <= tolerance * size).all()):

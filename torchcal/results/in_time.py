@@ -1,7 +1,6 @@
 """A calibration in time at other times, or for other runs."""
 
 import math
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -11,7 +10,7 @@ from torch import Tensor
 from torchcal.data import Recording, Run
 from torchcal.data.arrays import to_tensor
 from torchcal.data.run import change, convert
-from torchcal.errors import DomainError, PropagationWarning
+from torchcal.errors import DomainError, PropagationWarning, warn
 from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results.base import conditions
 from torchcal.simulators import Conditions, Simulator, Trajectories
@@ -32,13 +31,12 @@ def check_nodes_in_time(propagate: NISP, alpha: Tensor) -> PropagationCheck:
     result = propagate.check(alpha, warn=False)
     if math.isfinite(result.mean_change) and math.isfinite(result.sd_change):
         return propagate.check(alpha, tolerance=10 * NODE_TOLERANCE)
-    warnings.warn(
+    warn(
         f"The solution blows up at the outermost of {result.finer_nodes} quadrature nodes: the density of the "
         f"parameters reaches values with which the model has no solution. The moments are those of {result.nodes} "
         "nodes, which do not reach as far. Embed such a parameter as embeddings.Uniform or with transform='log', or "
         "name others: embedding=Gaussian(parameters=(...)).",
         PropagationWarning,
-        stacklevel=3,
     )
     return result
 

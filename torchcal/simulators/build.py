@@ -5,7 +5,6 @@ Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 4
 
 import math
 import os
-import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from typing import Any
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from torchcal import polychaos
 from torchcal.checks import whole
-from torchcal.errors import DomainError, SimulatorError, SurrogateWarning
+from torchcal.errors import DomainError, SimulatorError, SurrogateWarning, warn
 from torchcal.polychaos._checks import limit_rows
 from torchcal.simulators.design import Evaluations, evaluate_points
 from torchcal.simulators.executor import check_executor
@@ -167,11 +166,10 @@ def build_surrogate(
         worst=tuple(dict(zip(labels, points[int(i)].tolist(), strict=True)) for i in error.argmax(1)),
     )
     if bool((measured.relative > threshold).any()):
-        warnings.warn(
+        warn(
             f"The surrogate of order {order} has a large {measured}\n(threshold {threshold:g} of the sd). Raise "
             "order=, narrow the box, or take the logarithm of an output that spans decades.",
             SurrogateWarning,
-            stacklevel=2,
         )
     return PolynomialSurrogate(coefficients, error=measured, **settings)
 

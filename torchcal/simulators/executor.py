@@ -5,7 +5,6 @@ import pickle
 import time
 import traceback
 import uuid
-import warnings
 import weakref
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
@@ -20,7 +19,7 @@ from concurrent.futures import (
 )
 from typing import Any
 
-from torchcal.errors import DomainError, SimulatorError, WorkerWarning
+from torchcal.errors import DomainError, SimulatorError, WorkerWarning, warn
 from torchcal.simulators.cluster import submit
 
 __all__ = ["TaskError", "check_executor", "portable", "run_tasks", "worker_died"]
@@ -128,11 +127,10 @@ def run_tasks(
     finally:
         workers.close(wait=done)
     if workers.died:
-        warnings.warn(
+        warn(
             f"{workers.died} worker process{'es' if workers.died > 1 else ''} died. What they had not handed over was "
             "repeated, and nothing is lost. Too little memory is the usual reason: use fewer workers.",
             WorkerWarning,
-            stacklevel=3,
         )
 
 

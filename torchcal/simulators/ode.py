@@ -1,14 +1,13 @@
 """Simulators in time: ordinary differential equations with inputs, several runs and unknown initial states."""
 
 import functools
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from torch import Tensor
 
 from torchcal.data import Recording, same_unit
-from torchcal.errors import DomainError, SimulatorError, UnitWarning
+from torchcal.errors import DomainError, SimulatorError, UnitWarning, warn
 from torchcal.simulators.parameter import Parameter
 from torchcal.simulators.static import Conditions, Simulator, check_parameters
 from torchcal.simulators.trajectories import Trajectories
@@ -119,11 +118,10 @@ class ODESimulator(Simulator):
             seen = self.observe.get(name)
             own = self.states[seen.args[0]] if isinstance(seen, functools.partial) and seen.func is _read else None
             if own and unit and not same_unit(own, unit):
-                warnings.warn(
+                warn(
                     f"The state {name!r} is in {own} and was recorded in {unit}. Numbers are not converted: correct "
                     "one of them, or give observe={output: function(t, s, p, u)} that converts.",
                     UnitWarning,
-                    stacklevel=3,
                 )
 
     def at(self, x: Conditions, outputs: Sequence[str] | None = None) -> Callable[[Tensor], Tensor]:

@@ -6,7 +6,6 @@ Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 4
 import dataclasses
 import math
 import os
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -16,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchcal import polychaos
-from torchcal.errors import DomainError, ExtrapolationWarning, ShapeError, SimulatorError
+from torchcal.errors import DomainError, ExtrapolationWarning, ShapeError, SimulatorError, warn
 from torchcal.simulators.design import read_npz, write_npz
 from torchcal.simulators.held_out import NUMBERS, HeldOutError
 from torchcal.simulators.parameter import Parameter, Scaling
@@ -216,7 +215,7 @@ class PolynomialSurrogate(Simulator):
                     if message in said:
                         continue
                     said.add(message)
-                warnings.warn(message, ExtrapolationWarning, stacklevel=3)
+                warn(message, ExtrapolationWarning)
 
     def _rows(self, outputs: Sequence[str] | None) -> list[int]:
         if self.outputs is None:
