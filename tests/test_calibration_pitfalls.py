@@ -9,6 +9,7 @@ import torch
 
 import torchcal as tc
 from torchcal.errors import (
+    ConvergenceWarning,
     DomainError,
     EmbeddingError,
     IdentifiabilityWarning,
@@ -166,3 +167,69 @@ def test_parameters_that_are_known_as_a_product_alone_are_told(additive):
     calibrate = tc.calibrate_additive if additive else tc.calibrate
     with pytest.warns(IdentifiabilityWarning, match="The data determine a, c only together"):
         calibrate(product, recording, num_samples=0)
+
+
+def test_places_of_one_ridge_are_one_maximum():
+    """Of a coefficient of the second order the data see no more than what it adds to the variance."""
+    x = np.linspace(-1, 1, 11)
+    recording = tc.Recording(x=x, y=2 * x - 5 * x**3)
+    slope = tc.Simulator(lambda x, p: p["a"] * x, [tc.Parameter("a")])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # few draws
+        found = tc.calibrate(
+            slope, recording, embedding=tc.embeddings.PolynomialChaos(), likelihood=tc.likelihoods.ABC(epsilon=0.3),
+            num_samples=20, num_warmup=30, num_chains=2, num_starts=8, seed=0,
+        )  # fmt: skip
+    assert len(found.diagnostics.null_directions) == 1
+    assert found.diagnostics.ties == 1
+    assert len(found.diagnostics.modes) == 1
+
+
+@pytest.mark.parametrize(("draws", "chains"), [(8, 4), (20, 1)])
+def test_a_few_draws_never_count_as_converged(draws, chains):
+    with pytest.warns(ConvergenceWarning, match=r"threshold 100"):
+        found = mode(line(), 1 + 0.5 * X + 0.05 * X**2, num_samples=draws, num_chains=chains, num_warmup=5, seed=1)
+    assert not found.diagnostics.converged
+
+
+def test_warnings_are_told_of_the_users_line():
+    with pytest.warns(ConvergenceWarning) as told:
+        mode(line(), 1 + 0.5 * X + 0.05 * X**2, num_samples=8, num_chains=2, num_warmup=5)
+    assert {item.filename for item in told} == {__file__}
+
+
+def test_no_spread_but_for_rounding_has_no_log_score():
+    """Where the initial state is given, the first output is that, whatever the parameters are."""
+    decay = tc.ODESimulator(lambda t, s, p, u: {"c": -p["k"] * s["c"]}, ["c"], [tc.Parameter("k", initial=0.5)])
+    t = np.linspace(0, 2, 12)
+    y = 0.8 * np.exp(-0.8 * t) + 0.02 * np.random.default_rng(1).standard_normal(12)
+    found = tc.calibrate(decay, tc.Recording(runs=[tc.Run(t, {"c": y}, initial={"c": 0.8})]), num_samples=0, seed=0)
+    moments = found.predict().map
+    assert float(moments.sd[0]) < 1e-12
+    with pytest.raises(DomainError, match="0 but for rounding"):
+        tc.scores(y, moments)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"embedding": tc.embeddings.Gaussian}, r"write Gaussian\(\), with brackets"),
+        ({"embedding": "gaussian"}, r"such as Gaussian\(\)\. Got 'gaussian'"),
+        ({"likelihood": tc.likelihoods.ABC}, r"write ABC\(\), with brackets"),
+        ({"order": 0}, r"whole number >= 1, or None\. Got order=0"),
+    ],
+)
+def test_what_to_write_instead_is_said(wrong, message):
+    with pytest.raises(DomainError, match=message):
+        mode(line(), X, **wrong)
+
+
+def test_numpy_in_a_simulator_is_told_what_to_use():
+    with pytest.raises(tc.errors.SimulatorError, match="Use torch functions on p and x"):
+        mode(tc.Simulator(lambda x, p: np.exp(p["a"]) * x, [tc.Parameter("a")]), X)
+
+
+def test_plots_come_when_they_are_asked_for():
+    assert tc.plots.fit is not None
+    with pytest.raises(AttributeError, match="no attribute 'plot'"):
+        tc.plot  # noqa: B018

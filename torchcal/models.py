@@ -84,7 +84,21 @@ def log_likelihood(
     germ: Tensor | None = None,
     unit: Tensor | None = None,
 ) -> Tensor:
-    """Log-likelihood of α (with ln σ last for the additive one), ``(*batch, P)`` to ``(*batch,)``."""
+    """Log-likelihood of α (with ln σ last for the additive one), ``(*batch, P)`` to ``(*batch,)``.
+
+    Args:
+        alpha: Coefficients, ``(*batch, P)``, in scaled coordinates.
+        y: Recorded outputs, ``(n,)``.
+        propagate: From α to the outputs' mean and sd, at the recording's conditions.
+        likelihood: One of `torchcal.likelihoods`.
+        noise: Sd of the measurement noise, ``(n,)`` in the outputs' units, or None.
+        observed: Which outputs take part, ``(n,)`` bool, or None for all.
+        germ: Draws of the germ for likelihoods of samples, ``(S, germs)``; by default the same for every call.
+        unit: What the additive σ is measured in at each datum, ``(n,)``, or None.
+
+    Raises:
+        ShapeError: If α does not have as many columns as the propagation has coefficients.
+    """
 
     def pick(values: Tensor) -> Tensor:
         return values if observed is None else values[..., observed]
@@ -116,7 +130,10 @@ def embedded(
     observed: Tensor | None = None,
     germ: Tensor | None = None,
 ) -> None:
-    """Pyro model of the embedded calibration: α from its prior, the likelihood as a factor (Eq. 11)."""
+    """Pyro model of the embedded calibration: α from its prior, the likelihood as a factor (Eq. 11).
+
+    The arguments are those of `log_likelihood`; ``prior`` is one of `torchcal.priors`. The site is ``"alpha"``.
+    """
     alpha = pyro.sample("alpha", prior)
     value = log_likelihood(
         alpha, y, propagate, likelihood, noise=noise, observed=observed, germ=germ
@@ -132,7 +149,11 @@ def additive(
     observed: Tensor | None = None,
     unit: Tensor | None = None,
 ) -> None:
-    """Pyro model of the conventional calibration: (λ, ln σ) from their prior, Eq. 4 as a factor (Eq. 3)."""
+    """Pyro model of the conventional calibration: (λ, ln σ) from their prior, Eq. 4 as a factor (Eq. 3).
+
+    The arguments are those of `log_likelihood`; ``prior`` is on λ in scaled coordinates with ln σ last. The site is
+    ``"alpha"``.
+    """
     alpha = pyro.sample("alpha", prior)
     value = log_likelihood(alpha, y, propagate, Additive(), noise=noise, observed=observed, unit=unit)
     pyro.factor("log_likelihood", value)

@@ -1,5 +1,6 @@
 """Terms that act only in a range of time, a state, an input or a condition."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,6 +18,8 @@ __all__ = ["EDGE", "ENDS", "SHORT", "WIDTHS", "Span", "beyond", "force", "is_win
 #: Width of a window's edges, as a share of the driver's range: wide enough for a fit to move them; and the limits
 #: between which it is fitted, from nearly a step.
 EDGE, WIDTHS = 0.02, (0.004, 0.1)
+#: The same as a share of a short window's own length: with wider ones it would never be open.
+NARROW = 0.1
 #: Share of the driver's range below which a window is none: a kick at one moment is another kind of physics.
 SHORT = 0.02
 #: The narrowest of a static recording, whose ends are sought between its data: no time step has to meet them.
@@ -35,11 +38,13 @@ class Span:
         low: Its lower end.
         high: Its upper end.
         log: Whether that scale is logarithmic.
+        edge: Width of the edges of windows whose edges are not fitted, as a share of the range.
     """
 
     low: float
     high: float
     log: bool
+    edge: float = EDGE
 
     @classmethod
     def of(cls, driver: Tensor) -> "Span":
@@ -56,6 +61,10 @@ class Span:
         """Of the range, that lies between two values of the driver; negative where nothing does."""
         low, high = max(low, self.low), min(high, self.high)
         return (math.log(high / low) if self.log else high - low) / self.size
+
+    def edged(self, low: float, high: float) -> "Span":
+        """The same with edges that leave a short window between two values open in its middle."""
+        return dataclasses.replace(self, edge=min(max(NARROW * self.share(low, high), WIDTHS[0]), EDGE))
 
     def distance(self, d: Any, end: Any) -> Any:
         """From an end of a window to a value of the driver, on the scale."""
@@ -133,7 +142,7 @@ def localised(
 def force(span: Span, d: Tensor, p: Mapping[str, Any]) -> Any:
     """Share of a term that its window lets through, from 0 to 1, at values of the driver; p holds the window's own
     parameters."""
-    width = p.get(WIDTH_OF_EDGE, EDGE * span.size)
+    width = p.get(WIDTH_OF_EDGE, span.edge * span.size)
     w: Any = 1.0
     if ENDS["from"] in p:
         w = w * torch.sigmoid(span.distance(d, p[ENDS["from"]]) / width)

@@ -1,5 +1,6 @@
 """Several terms together: effects hide each other, so pairs are searched as well as second and third terms."""
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -19,7 +20,9 @@ from torchcal.errors import DomainError, SimulatorError
 __all__ = ["refit_several"]
 
 #: Pairs that are refitted at most; where one term leaves noise alone.
-MOST, FEWER = 14, 10
+MOST, FEWER = 18, 10
+#: Second terms that are tried beside one of the best.
+NEXT = 7
 #: Share of the misfit that one term removes of a recording without noise, and nothing need be sought beside it.
 ALL = 0.99999
 #: Of them from the linear search; and the correlation of two tangents from which on they are one.
@@ -45,11 +48,17 @@ def refit_several(search: Search) -> None:
     wanted: dict[tuple[int, ...], tuple[int, int] | None] = {}
     for columns in _linear_pairs(search):
         wanted[tuple(int(search.screening.owner[k]) for k in columns)] = columns
-    for model in single[: 1 if enough else 3]:
-        lead = model.numbers[0]
-        lead = search.twins[lead] if lead in search.gone else lead  # in a window they may differ, beside others not
-        for j in [j for j in _next_terms(search, model) if j != lead][:5]:
-            wanted.setdefault(tuple(sorted((lead, j))), None)
+    leads: dict[int, Model] = {}
+    for model in single:
+        lead = model.numbers[0]  # in a window merged ones may differ, beside others not
+        leads.setdefault(search.twins[lead] if lead in search.gone else lead, model)
+    beside = [
+        [tuple(sorted((lead, j))) for j in _next_terms(search, model) if j != lead][:NEXT]
+        for lead, model in itertools.islice(leads.items(), 1 if enough else 3)
+    ]
+    for pair in itertools.chain(*itertools.zip_longest(*beside)):  # the best of each lead first
+        if pair is not None:
+            wanted.setdefault(pair, None)
     pairs = list(wanted)[: FEWER if enough else MOST]
     prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))
     fitted = _refit_sets(search, [(pair, wanted[pair]) for pair in pairs], prior)

@@ -41,6 +41,8 @@ AS_GOOD = 0.5
 SAME = 1e-4
 #: How far ends are moved for other starts, as a share of the driver's range: where they are sought, and sharpened.
 SHIFT, FINE = 0.1, 0.03
+#: The same as a share of the window itself, which ends moved towards each other would close.
+WITHIN = 0.4
 #: Data below which no window is sought; nor is any without noise, where a window bends to whatever is left.
 LEAST = 30
 #: Gaps between data, around an edge that was found, where it is tried as a step; and fits from there.
@@ -278,6 +280,7 @@ def _begun(
     term = plain.terms[0]
     if term.frees or not span.high > span.low:
         return None
+    span = span.edged(w.low, w.high)
     local = localised(term, w.driver, w.low, w.high, span, static=not search.problem.in_time, edge=edge)
     try:
         candidate = prepare(search.base.problem, search.base, [local], search.fixed, {})
@@ -295,7 +298,7 @@ def _begun(
         values = near.found.by_name
     values[names[amplitude]] = float(plain.neutral[plain.own.index(amplitude)]) + size
     ends = {f"{term.name}.{ENDS['from']}": w.low, f"{term.name}.{ENDS['to']}": w.high}
-    shift = span.size * (FINE if edge else SHIFT)
+    shift = span.size * min(FINE if edge else SHIFT, WITHIN * span.share(w.low, w.high))
     choices = []
     for q, start in zip(candidate.problem.parameters, candidate.begin.tolist(), strict=True):
         if q.name in ends:

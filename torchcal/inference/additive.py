@@ -54,7 +54,7 @@ def calibrate_additive(
             them, by default 20,000.
         num_chains: Chains; by default 4, and with ``target_ess`` one for every 120 effective draws wanted, 32 to 400,
             or fewer where an evaluation is dear.
-        num_warmup: Draws thrown away a chain.
+        num_warmup: Draws thrown away a chain; by default as for `torchcal.calibrate`.
         target_ess: Draw until the effective sample size of every α, bulk and tail, is at least this and every R-hat
             below 1.01.
         num_starts: Starting points of the optimiser.
@@ -70,9 +70,19 @@ def calibrate_additive(
             given).
         progress: Whether to show a bar where it takes more than two seconds.
 
+    Returns:
+        A `torchcal.results.AdditiveCalibration`.
+
     Raises:
+        TorchcalError: A subclass that says what was expected, what came and what to do.
         ImproperPosteriorError: If the model fits the data exactly, or has as many parameters as there are data:
             the likelihood then grows without limit as σ → 0.
+
+    Warns:
+        ConvergenceWarning: If starts or chains disagree.
+        IdentifiabilityWarning: If the data do not determine a parameter.
+
+    Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 2-4.
     """
     plan = Plan(
         num_samples, num_chains, num_warmup, sampler, seed, dtype, target_accept, progress, target_ess

@@ -74,7 +74,7 @@ def calibrate(
             time the initial states that nobody knows, and parameters that each of several runs has one of, are
             inferred beside them without model error, unless the embedding names them.
         likelihood: One of `torchcal.likelihoods`, or its name; by default ABC with a tolerance of 1 % of the
-            data's sd.
+            data's sd, or √((1 %)² + s²) where the noise's sd s is known.
         prior: A function from the propagation to a prior on α, such as a class of `torchcal.priors`.
         fixed: Parameters to hold, ``{name: physical value}``.
         num_samples: Posterior draws a chain; 0 for the MAP alone; by default 1000. With ``target_ess`` the most of
@@ -114,6 +114,8 @@ def calibrate(
         PropagationWarning: If moments have not converged in nodes or order.
         ExtrapolationWarning: If the calibration leaves the box of a surrogate.
         IdentifiabilityWarning: If the data do not determine a parameter, or its bound does.
+        UnitWarning: If units of recording and simulator differ.
+        WorkerWarning: If workers that evaluate the simulator died, and their work was done again.
 
     Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276.
     """
