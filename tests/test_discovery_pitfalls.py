@@ -560,7 +560,7 @@ def test_limits_stay_within_a_parameters_bounds():
     base.parameters = (*base.parameters[:2], narrow)
     hidden = diagnose(base, recording(0.0), terms).detection_limit[0]
     assert hidden.smallest == math.inf
-    assert hidden.note == "calibration hides effects of 20, the largest that was tried"
+    assert hidden.note == "calibration hides effects of 20, the largest within its bounds"
 
 
 def test_a_hopeless_base_is_a_misfit_whatever_is_left_looks_like(monkeypatch):

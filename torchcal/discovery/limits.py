@@ -12,6 +12,7 @@ from torchcal.discovery.fitting import fit
 from torchcal.discovery.model import PRIOR
 from torchcal.discovery.records import Limit, Table
 from torchcal.discovery.search import Search
+from torchcal.display import with_unit
 from torchcal.terms import Term
 
 __all__ = ["limits"]
@@ -27,7 +28,8 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
 
     The linear limit, from the norm of the projected tangent, is checked: an effect of its size is simulated without
     noise, the base is calibrated to that, and the size is changed until what calibration cannot hide is just large
-    enough. Infinite where calibration hides ever larger effects, or all within the parameter's bounds.
+    enough. Infinite where calibration hides ever larger effects, or all within the parameter's bounds; of an amplitude
+    of either sign the larger of both, or that of the sign that is seen. An open shape is the one of median effect.
 
     Args:
         search: With its screening.
@@ -44,9 +46,9 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
     fitted = search.plain
     effects: dict[int, _Effect] = {}
     for i, candidate in enumerate(search.candidates):
-        column = screening.best[i]
-        if column < 0:
+        if screening.best[i] < 0:
             continue
+        column = _typical(search, i)
         # Seen is not enough: the evidence for the term must outweigh that for the base too.
         wanted = max(critical, math.sqrt(max(2 * odds + len(candidate.own) * math.log(search.problem.n), 0.0)))
         doubt = 1.0
@@ -54,12 +56,12 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
             doubt = math.sqrt(1 + wanted**2 / (2 * search.noise.freedom))
         effects[i] = _Effect(column, wanted + doubt * from_power, float(screening.norm[column]))
     sizes = {i: effect.distance / effect.norm for i, effect in effects.items()}
-    hidden: dict[int, float] = {}
+    told: dict[int, str] = {}
     if not search.exact and not search.stop.is_set():
-        sizes, hidden = _corrected(search, effects, sizes)
+        sizes, told = _corrected(search, effects, sizes)
     rows = []
     for i, candidate in enumerate(search.candidates):
-        column = screening.best[i]
+        column = effects[i].column if i in effects else screening.best[i]
         place = candidate.amplitudes[int(screening.amplitude[column]) if column >= 0 else 0]
         q = candidate.problem.parameters[place]
         model = fitted.get(i)
@@ -70,14 +72,33 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
             rows.append(Limit(candidate.name, q.name, math.inf, q.unit, power, estimate, note))
             continue
         others = [search.candidates[j].name for j in search.aliases.get(i, ())]
-        note = f"also: {', '.join(others)}" if others else ""
-        if math.isinf(sizes[i]):
-            note = f"calibration hides effects of {hidden[i]:.3g}, the largest that was tried"
+        notes = [_shape(candidate, effects[i], search), f"also: {', '.join(others)}" if others else "", told.get(i, "")]
+        note = "; ".join(filter(None, notes))
         rows.append(Limit(candidate.name, q.name, sizes[i], q.unit, power, estimate, note))
     for term in contained:
         name = term.full(term.parameters[0].name) if term.parameters else term.frees[0]
         rows.append(Limit(term.name, name, math.inf, None, power, None, "already in the base model"))
     return Table(rows, ("term", "parameter", "smallest", "unit", "power", "estimate", "note"))
+
+
+def _typical(search: Search, i: int) -> int:
+    """The column of a candidate's best amplitude at the shape of median effect: the best shape is that of the noise."""
+    screening = search.screening
+    same = screening.amplitude == screening.amplitude[screening.best[i]]
+    places = ((screening.owner == i) & same & (screening.norm > 0)).nonzero()[:, 0]
+    order = screening.norm[places].argsort()
+    return int(places[order[len(order) // 2]])
+
+
+def _shape(candidate: Candidate, effect: "_Effect", search: Search) -> str:
+    """The shape that a limit is of, in words; empty where there is none."""
+    row = candidate.shapes[int(search.screening.shape[effect.column])]
+    parts = []
+    for k, place in enumerate(candidate.own):
+        q = candidate.problem.parameters[place]
+        if place not in candidate.amplitudes:
+            parts.append(f"{q.name.rsplit('.', 1)[-1]} = {with_unit(f'{float(row[k]):.3g}', q.unit)}")
+    return f"at {', '.join(parts)}" if parts else ""
 
 
 @dataclass(frozen=True)
@@ -97,10 +118,10 @@ class _Effect:
 
 def _corrected(
     search: Search, effects: dict[int, _Effect], sizes: dict[int, float]
-) -> tuple[dict[int, float], dict[int, float]]:
+) -> tuple[dict[int, float], dict[int, str]]:
     """Sizes whose effects remain just large enough when the base is calibrated to them, of two signs the larger one.
 
-    With them the largest size that is not seen, where no larger one was found that is.
+    With them what is not seen whatever its size, in words.
     """
     base = search.base
     now: dict[tuple[int, int], float] = {}
@@ -159,10 +180,19 @@ def _corrected(
                 now[trial] = wanted
         if not trials:
             break
-    return (
-        {i: max(size for (j, _), size in seen.items() if j == i) for i in effects},
-        {i: max(size for (j, _), size in unseen.items() if j == i) for i in effects},
-    )
+    smallest: dict[int, float] = {}
+    told: dict[int, str] = {}
+    for i in effects:
+        mine = {sign: seen[i, sign] for sign in (1, -1) if (i, sign) in seen}
+        lost = [sign for sign, size in mine.items() if math.isinf(size)]
+        smallest[i] = max((size for size in mine.values() if math.isfinite(size)), default=math.inf)
+        if lost:
+            largest = max(unseen[i, sign] for sign in lost)
+            which = "" if len(lost) == len(mine) else "positive " if lost[0] > 0 else "negative "
+            within = all(unseen[i, sign] >= room[i, sign] for sign in lost)
+            end = "the largest within its bounds" if within else "the largest that was tried"
+            told[i] = f"calibration hides {which}effects of {largest:.3g}, {end}"
+    return smallest, told
 
 
 def _room(candidate: Candidate, place: int, sign: int) -> float:

@@ -318,7 +318,7 @@ class Search:
         else:
             model.note = ""
         parameters = len([i for i in candidate.own if names[i] not in off])
-        model.price = -0.5 * parameters * math.log(self.problem.n) + (UNPHYSICAL if new and not off else 0.0)
+        model.price = -0.5 * parameters * math.log(self.problem.n) + (UNPHYSICAL if new else 0.0)
         model.log_evidence = self.gain(found.chi2) + model.price
         return model
 

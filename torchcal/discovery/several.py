@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchcal.discovery.beginnings import make_up
+from torchcal.discovery.beginnings import is_far, make_up
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare, replaces
 from torchcal.discovery.explain import removed
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
@@ -20,13 +20,14 @@ from torchcal.errors import DomainError, SimulatorError
 __all__ = ["refit_several"]
 
 #: Pairs that are refitted at most; where one term leaves noise alone.
-MOST, FEWER = 18, 10
+MOST, FEWER = 20, 10
 #: Second terms that are tried beside one of the best.
 NEXT = 7
 #: Share of the misfit that one term removes of a recording without noise, and nothing need be sought beside it.
 ALL = 0.99999
-#: Of them from the linear search; and the correlation of two tangents from which on they are one.
-FROM_LINEAR, NEARLY_SAME = 8, 0.999
+#: Of them from the linear search, and from that of a base that is far off, which linear estimates do not reach; and the
+#: correlation of two tangents from which on they are one.
+FROM_LINEAR, FROM_FAR, NEARLY_SAME = 8, 3, 0.999
 #: Log weight behind the leading pair down to which that is tried, and for how many pairs.
 CLOSE, AGAIN = 5.0, 3
 #: Correlation of two tangents from which on a candidate is tried in the other's place beside the leading pair's.
@@ -46,7 +47,8 @@ def refit_several(search: Search) -> None:
     if enough and search.exact:
         return
     wanted: dict[tuple[int, ...], tuple[int, int] | None] = {}
-    for columns in _linear_pairs(search):
+    far = is_far(search.base)
+    for columns in _linear_pairs(search)[: FROM_FAR if far else FROM_LINEAR]:
         wanted[tuple(int(search.screening.owner[k]) for k in columns)] = columns
     leads: dict[int, Model] = {}
     for model in single:

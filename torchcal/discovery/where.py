@@ -11,6 +11,7 @@ from torchcal.discovery.model import Model
 from torchcal.discovery.records import Location, MissingRate, NeededShift, Table
 from torchcal.discovery.search import Search
 from torchcal.discovery.structure import Place
+from torchcal.terms import Term
 
 __all__ = ["locate", "missing_rate", "needed_shifts"]
 
@@ -107,7 +108,7 @@ def _own_places(search: Search, model: Model) -> set[tuple[str, str]]:
     own: set[tuple[str, str]] = set()
     for term in model.candidate.terms:
         if term.rates:
-            own |= {("equation", name) for name in term.rates}
+            own |= {("equation", name) for name in _equations(term)}
         elif term.outputs:
             own |= {("output", name if name in outputs else outputs[0]) for name in term.outputs}  # no name is y
         else:
@@ -141,10 +142,15 @@ def _contributed(search: Search, model: Model, drivers: Sequence[str]) -> Locati
 def _acts_on(model: Model) -> tuple[str, str]:
     term = model.candidate.terms[0]
     if term.rates:
-        return "equation", next(iter(term.rates))
+        return "equation", _equations(term)[0]
     if term.outputs:
         return "output", next(iter(term.outputs))
     return "parameter", next(iter([*term.shifts, *term.frees]))
+
+
+def _equations(term: Term) -> list[str]:
+    """Those that a term acts on, of the base's own states where there are any."""
+    return [name for name in term.rates if name not in term.states] or list(term.rates)
 
 
 def needed_shifts(search: Search) -> list[NeededShift]:

@@ -29,7 +29,9 @@ def where_in_words(d: Any) -> str:
     everywhere = _everywhere(d, place)
     if place.driver == RUN:
         largest = "" if everywhere else f" (largest in {spans}, counted from 0)"
-        advice = " A parameter of the simulator with per_run=True would take it up." if not d.terms else ""
+        advice = "" if d.terms else " What differs between the runs and was not recorded looks like this."
+        if not d.terms and place.kind == "parameter":
+            advice = " With per_run=True that parameter would take it up."
         return (
             f"The mismatch sits in the {place.kind} {place.target} and differs from run to run{largest}: one change "
             f"for each run removes {share_in_words(place.share)} of the misfit beyond noise.{advice}{_embedded(d)}"

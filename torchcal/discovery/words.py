@@ -19,6 +19,9 @@ LITTLE = 0.005
 #: Probability from which on the base, or something unknown, is told beside tied hypotheses; and how many times as
 #: likely as the next one of these is plainly the best.
 LISTED, PLAINLY = 0.05, 3.0
+#: Hypotheses in the first line, pairs of them that an experiment leaves, and the share of the best one's probability
+#: below which one explains less well.
+HEADLINE, UNTOLD, AS_WELL = 5, 3, 0.2
 #: Hypotheses that hold a named term and more, and detection limits, of which the paragraph lists so many.
 MORE, LIMITS = 4, 6
 #: Probability of what hypotheses that hold a name have beside it, from which on it is told.
@@ -71,7 +74,11 @@ def _headline(d: Any) -> str:
         known = [tied for tied in d.tied if tuple(tied) != NONE]
         if len(known) == 1 and _unknown(d) < LISTED:
             return f"Verdict: ambiguous: {_hypothesis(d, known[0])}, which is not sure enough for a name"
-        return "Verdict: ambiguous: " + ", or ".join(_hypothesis(d, tied) for tied in d.tied)
+        told = [_hypothesis(d, tied) for tied in known[:HEADLINE]]
+        if len(known) > HEADLINE:
+            told.append(f"one of {len(known) - HEADLINE} others")
+        told += [_hypothesis(d, NONE)] if len(known) < len(d.tied) else []
+        return "Verdict: ambiguous: " + ", or ".join(told)
     return "Verdict: unexplained (something is missing that is not in this library)"
 
 
@@ -286,6 +293,8 @@ def _experiment(d: Any) -> list[str]:
     distance = f"predicted distance {up_to(d.experiment.separation)} noise sd"
     text = f"What would tell them apart: {d.experiment.description} ({distance})"
     untold = [f"{a} from {b}" for a, b in d.experiment.untold]
+    if len(untold) > UNTOLD + 1:
+        untold = [*untold[:UNTOLD], f"{len(untold) - UNTOLD} other pairs apart"]
     return [text + (f"; none that was tried in thought tells {', or '.join(untold)}." if untold else ".")]
 
 
@@ -312,7 +321,9 @@ def _ambiguous(d: Any) -> list[str]:
         told += f"exclude {others}."
     else:
         which = "either" if len(known) == 2 else "any"
-        told = f"{len(known)} hypotheses explain it about as well, and these data cannot exclude {which} of them."
+        alike = min(filter(None, shares), default=1.0) > AS_WELL * shares[best]
+        well = "about as well" if alike else "more or less well"
+        told = f"{len(known)} hypotheses explain it {well}, and these data cannot exclude {which} of them."
     parts = [where_in_words(d), told]
     sets = [set(tied) for tied in known]
     beside = sum(

@@ -8,6 +8,7 @@ from typing import Any
 
 from torch import Tensor
 
+from torchcal.display import NONE
 from torchcal.errors import DomainError, SimulatorError, TorchcalError
 from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories, Values
 
@@ -100,6 +101,8 @@ class Term:
     ) -> None:
         if not isinstance(name, str) or not name:
             raise DomainError(f"Expected a term's name (a non-empty string). Got {name!r}.")
+        if (name,) == NONE:
+            raise DomainError(f"Expected a term's name other than {name!r}, which stands for what is in no list.")
         if (equation is None) != (rate is None):
             raise DomainError(f"Expected equation= and rate= together for the term {name!r}. Got one of them.")
         every = dict(rates or {})
