@@ -620,7 +620,9 @@ def emission(n, seed):
 def test_what_the_base_takes_for_slow_noise_is_weighed_with_the_noise_that_a_term_leaves():
     found = [diagnose(*emission(60, seed)) for seed in range(6)]
     assert all(d.verdict != "consistent" for d in found)
-    assert sum(d.terms == ["line"] for d in found) >= 4  # the others hold a bend in a window as likely
+    first = [next(row.terms for row in d.ranking if row.terms != ("none of these",)) for d in found]
+    assert sum(terms == ("line",) for terms in first) >= 5
+    assert all(["line"] in (d.tied or [d.terms]) for d in found)  # a bend in a window may do it too
     assert all(d.noise.sd["y"] < 0.08 for d in found)
 
 
