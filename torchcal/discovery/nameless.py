@@ -33,9 +33,9 @@ __all__ = ["refit_nameless"]
 CLOSE, MOST = 3.0, 3
 #: Terms that are tried in all windows of a driver, and places where these may begin or end.
 TRIED, CUTS = 4, 14
-#: Where in an open window a nameless change may end, as shares of the data within; and starts that are refitted with
-#: each width of the edges.
-ENDING, STARTS = (0.1, 0.3, 0.5, 0.7, 0.9), 2
+#: Places within an open window where a nameless change may begin or end, and starts that are refitted with each width
+#: of the edges.
+INSIDE, STARTS = 10, 2
 #: Relative difference up to which two effects are one, and relative size from which on two are independent.
 SAME, RANK = 1e-4, 1e-7
 
@@ -147,22 +147,26 @@ def _wanted(search: Search, model: Model, prior: float) -> list[Hypothetical]:
     driver = search.drivers()[w.driver]
     inside = driver[(driver >= w.low) & (driver <= w.high)]
     span = w.span or Span.of(driver)
-    ends = [([w.low], [w.high])]
+    ends = [[(w.low, w.high)]]
     if not (math.isfinite(w.low) and math.isfinite(w.high)) and len(inside):
-        other = inside.double().quantile(torch.tensor(ENDING, dtype=torch.float64)).tolist()
-        ends.append(([w.low], other) if math.isfinite(w.low) else (other, [w.high]))
+        cuts = inside.double().quantile(torch.linspace(0, 1, INSIDE, dtype=torch.float64)).unique().tolist()
+        last = w.low if math.isfinite(w.low) else w.high  # the end that it has, which need not be one of the data
+        cuts = sorted({*cuts[1:], last}) if math.isfinite(w.low) else sorted({*cuts[:-1], last})
+        ends.append(list(itertools.combinations(cuts, 2)))
     found = []
-    for (lows, highs), edge in itertools.product(ends, (False, True)):
+    for chosen, edge in itertools.product(ends, (False, True)):
+        low, high = chosen[0]
+        near = span.edged(low, high)
         local = localised(
-            _constant(term, search.problem.in_time), w.driver, lows[0], highs[0], span,
+            _constant(term, search.problem.in_time), w.driver, low, high, near,
             static=not search.problem.in_time, edge=edge,
         )  # fmt: skip
         try:
             candidate = prepare(search.base.problem, search.base, [local], search.fixed, {})
-            begin = _begin(search, model, candidate, list(itertools.product(lows, highs)), span)
+            begin = _begin(search, model, candidate, chosen, span)
         except (SimulatorError, DomainError):
             continue
-        window = dataclasses.replace(w, low=lows[0], high=highs[0], span=span)
+        window = dataclasses.replace(w, low=low, high=high, span=near)
         found.append(Hypothetical((), candidate, begin, prior, window))
     return found
 
