@@ -36,6 +36,8 @@ TRIED, CUTS = 4, 14
 #: Places within an open window where a nameless change may begin or end, and starts that are refitted with each width
 #: of the edges.
 INSIDE, STARTS = 10, 2
+#: Shares of a window by which its ends are moved for other starts; not at all first.
+MOVES = (0.0, -0.15, 0.15, -0.3, 0.3)
 #: Relative difference up to which two effects are one, and relative size from which on two are independent.
 SAME, RANK = 1e-4, 1e-7
 
@@ -62,7 +64,7 @@ def refit_nameless(search: Search) -> None:
         again = [(old, one) for old in _rivals(search, lead) if (one := _anywhere(search, old)) is not None]
         before = search.models
         for (old, _), new in zip(again, _refitted(search, [one for _, one in again]), strict=True):
-            if new is not None and new.weight > old.weight + BETTER:
+            if long_enough(new) is not None and new is not None and new.weight > old.weight + BETTER:
                 search.models = [m for m in search.models if m is not old] + [new]
         if search.models is not before:
             search.nameless += _held_against(search, lead, prior, named)
@@ -83,12 +85,12 @@ def _held_against(search: Search, lead: Model, prior: float, named: set[Places |
 
 
 def _refitted(search: Search, wanted: Sequence[Hypothetical]) -> list[Model | None]:
-    """Refits with steps for edges where these are better; no model where a window has closed."""
+    """Refits with steps for edges where these are better."""
     found = []
-    for model in map(long_enough, _where_possible(search, wanted)):
+    for model in _where_possible(search, wanted):
         if model is not None and model.window is not None:
             with suppress(SimulatorError):
-                model = long_enough(stepped(search, model, model.window.driver)) or model
+                model = stepped(search, model, model.window.driver)
         found.append(model)
     return found
 
@@ -147,12 +149,13 @@ def _wanted(search: Search, model: Model, prior: float) -> list[Hypothetical]:
     driver = search.drivers()[w.driver]
     inside = driver[(driver >= w.low) & (driver <= w.high)]
     span = w.span or Span.of(driver)
-    ends = [[(w.low, w.high)]]
+    moves = [k * span.size * span.share(w.low, w.high) for k in MOVES]
+    ends = [[(span.moved(w.low, a), span.moved(w.high, b)) for a, b in itertools.product(moves, moves)]]
     if not (math.isfinite(w.low) and math.isfinite(w.high)) and len(inside):
         cuts = inside.double().quantile(torch.linspace(0, 1, INSIDE, dtype=torch.float64)).unique().tolist()
         last = w.low if math.isfinite(w.low) else w.high  # the end that it has, which need not be one of the data
         cuts = sorted({*cuts[1:], last}) if math.isfinite(w.low) else sorted({*cuts[:-1], last})
-        ends.append(list(itertools.combinations(cuts, 2)))
+        ends += [list(itertools.combinations(cuts, 2))] if len(cuts) > 1 else []
     found = []
     for chosen, edge in itertools.product(ends, (False, True)):
         low, high = chosen[0]
