@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import math
 import sys
+import types
 
 import numpy as np
 import pytest
@@ -13,6 +14,8 @@ from scipy.integrate import solve_ivp
 import torchcal as tc
 from torchcal.discovery.doubts import CLEARLY, doubt
 from torchcal.discovery.nameless import _where_possible, refit_nameless
+from torchcal.discovery.screen import Window
+from torchcal.discovery.windows import _beyond_the_edge
 from torchcal.errors import SimulatorError
 
 F64 = torch.float64
@@ -433,3 +436,50 @@ def test_a_window_is_named_for_the_shape_of_its_term_alone(reaction):
     assert "Something unknown" not in doubt(search, model)
     best.log_evidence += 0.2
     assert doubt(search, model).startswith("Something unknown in a range of ")
+
+
+@pytest.mark.parametrize(("side", "amplitude"), [(0, -0.3), (1, 0.3), (-1, -0.3)])
+def test_beyond_an_edge_a_term_begins_with_the_other_sign_where_it_may(side, amplitude):
+    candidate = types.SimpleNamespace(one_sided=lambda place: side)
+    search = types.SimpleNamespace(
+        candidates=[candidate], screening=types.SimpleNamespace(acting=[0]), amplitude=lambda column: 0
+    )
+    lead = Window(0, "T", 18.25, math.inf, 5.0, 0.3)
+    beyond = _beyond_the_edge(search, lead, lead)
+    assert (beyond.low, beyond.high, beyond.amplitude) == (-math.inf, 18.25, amplitude)
+    again = _beyond_the_edge(search, lead, dataclasses.replace(lead, low=-math.inf, high=18.25))
+    assert (again.low, again.high) == (18.25, math.inf)
+
+
+def test_a_loss_like_the_bases_is_found_on_its_own_side_of_an_edge():
+    """Below 18 degrees it is nearly the base's own: another does nearly that above, with the other sign."""
+    t, rng = np.linspace(0, 30, 150), np.random.default_rng(2)
+    outside = 12 + 5 * np.sin(0.7 * t)
+
+    def rate(t, z):
+        gap = z[0] - (12 + 5 * np.sin(0.7 * t))
+        return [-0.25 * gap + 1.5 + math.sin(0.31 * t) - 0.05 * np.sign(gap) * abs(gap) ** 1.25 * (z[0] < 18)]
+
+    y = solve_ivp(rate, (0, 30), [20.0], t_eval=t, rtol=1e-9, atol=1e-10, max_step=0.02).y[0]
+    y = y + 0.02 * rng.standard_normal(150)
+    base = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"T": -p["a"] * (s["T"] - u["To"]) + p["b"] + u["h"]},
+        states={"T": "degC"},
+        parameters=[tc.Parameter("a", low=0.0, initial=0.25), tc.Parameter("b", initial=1.5)],
+    )
+    gap = lambda s, u: s["T"] - u["To"]  # noqa: E731
+    terms = [
+        tc.Term(
+            "convection", equation="T", parameters=[tc.Parameter("c", low=0.0)],
+            rate=lambda t, s, p, u: -p["c"] * gap(s, u) * (gap(s, u).abs() + 1e-9) ** 0.25,
+        ),
+        tc.Term(
+            "growing loss", equation="T", parameters=[tc.Parameter("c")],
+            rate=lambda t, s, p, u: -p["c"] * gap(s, u) * gap(s, u).abs(),
+        ),
+    ]  # fmt: skip
+    run = tc.Run(time=t, outputs={"T": y}, inputs={"To": outside, "h": np.sin(0.31 * t)}, hold="cubic")
+    d = diagnose(base, tc.Recording(runs=[run], noise=0.02), terms)
+    assert ["convection"] in (d.tied or [d.terms])
+    below = [row for row in d.ranking if row.terms == ("convection",) and (row.region or "").startswith("T < ")]
+    assert float(below[0].region.removeprefix("T < ")) == pytest.approx(18.0, abs=0.3)

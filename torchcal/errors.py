@@ -28,7 +28,6 @@ __all__ = [
     "TorchcalWarning",
     "UnitWarning",
     "WorkerWarning",
-    "warn",
 ]
 
 _HERE = os.path.join(os.path.dirname(__file__), "")

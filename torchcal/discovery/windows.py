@@ -23,6 +23,8 @@ __all__ = ["long_enough", "refit_local", "stepped"]
 #: Refits at most, in windows that promise much and in the leader's; of one candidate; around one refitted term; how
 #: many of those, and how many more of terms that the base has everywhere.
 MOST, MOST_EACH, MOST_AROUND, LEADING, HELD = 12, 2, 2, 3, 1
+#: Candidates that are tried on the other side of the leader's edge.
+MOST_BEYOND = 6
 #: χ² by which the best window along one more driver may promise less than the best of all.
 NEARLY = 6.0
 #: Score below which a window promises nothing, and the share that it may lack of what the best term removes: its edges
@@ -109,7 +111,8 @@ def _turn(search: Search, prior: float) -> None:
 
 
 def _rivals(search: Search, prior: float) -> bool:
-    """Hold what leads in a window against the other candidates in that window: in a short one many do the same.
+    """Hold what leads in a window against the other candidates in that window, where many do the same if it is short,
+    and beyond its edge, if it has one.
 
     A term that is no physics may lead too, where the range is right and the term is not.
 
@@ -130,11 +133,22 @@ def _rivals_of(search: Search, prior: float, lead: Model) -> bool:
     }  # fmt: skip
     others: dict[int, Window] = {}
     for other in sorted(search.local, key=lambda other: -other.z):
-        if other.driver == w.driver and other.z > LEAST_SCORE and other.candidate not in {*tried, *search.gone}:
+        if other.driver == w.driver and other.z > LEAST_SCORE and other.candidate not in search.gone:
             others.setdefault(other.candidate, other)
-    there = [dataclasses.replace(other, low=w.low, high=w.high) for other in others.values()]
-    _keep_all(search, [_begun(search, other, prior) for other in there[:MOST]])
-    return bool(others)
+    wanted = [dataclasses.replace(one, low=w.low, high=w.high) for i, one in others.items() if i not in tried][:MOST]
+    if math.isfinite(w.low) != math.isfinite(w.high):
+        wanted += [_beyond_the_edge(search, other, w) for other in list(others.values())[:MOST_BEYOND]]
+    _keep_all(search, [_begun(search, one, prior) for one in wanted])
+    return bool(wanted)
+
+
+def _beyond_the_edge(search: Search, other: Window, w: Window) -> Window:
+    """A candidate on the other side of the edge of a window with one: nearly what the base has does nearly the same
+    there, with the other sign."""
+    low, high = (-math.inf, w.low) if math.isfinite(w.low) else (w.high, math.inf)
+    candidate = search.candidates[other.candidate]
+    side = candidate.one_sided(search.amplitude(search.screening.acting[other.candidate]))
+    return dataclasses.replace(other, low=low, high=high, amplitude=abs(other.amplitude) * side or -other.amplitude)
 
 
 def _different(ranked: list[Window], spans: dict[str, Span]) -> list[Window]:
