@@ -137,3 +137,35 @@ def test_a_term_that_a_far_bent_base_hides_is_found_from_the_base_of_another():
     assert list(d.ranking[0].terms) == ["linear spring"]
     stiffness = d.ranking[0].estimates[0]  # by the moment of inertia
     assert abs(stiffness.value - 1.0) < 4 * stiffness.sd < 0.4
+
+
+def test_a_pair_is_tried_beside_three_different_terms():
+    """A rocket that burns its propellant, with drag: one drag in three windows had left no place for the other."""
+    t = np.linspace(0, 20, 81)
+    z = solve_ivp(
+        lambda t, s: [s[1], 20 / (1 - 0.02 * t) - 9.81 - 5e-4 * abs(s[1]) * s[1]], (0, 20), [0, 0], t_eval=t,
+        rtol=1e-9, atol=1e-11,
+    ).y[0]  # fmt: skip
+    z = z + 1.7 * np.random.default_rng(0).standard_normal(81)
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"z": s["v"], "v": p["F"] - 9.81 + 0 * s["v"]}, {"z": "m", "v": "m/s"},
+        [tc.Parameter("F", unit="m/s^2", low=0.0, initial=20.0)], observe=("z",),
+    )  # fmt: skip
+    burnt = tc.Term(
+        "propellant burnt", shifts={"F": lambda t, s, p, u: p["F"] * (1 / (1 - p["m"] * t) - 1)},
+        parameters=[tc.Parameter("m", unit="1/s", low=0.0, high=0.045)], elapsed="run",
+    )  # fmt: skip
+    build_up = tc.Term(
+        "thrust build-up", shifts={"F": lambda t, s, p, u: -p["F"] * p["a"] * torch.exp(-t / p["tau"])},
+        parameters=[tc.Parameter("a", low=0.0, high=1.0), tc.Parameter("tau", low=0.2, high=10.0)], elapsed="run",
+    )  # fmt: skip
+    terms = [
+        burnt, build_up, *tc.terms.mechanics(position="z", velocity="v", angle=False),
+        *tc.terms.sensor(outputs=("z",), units={"z": "m"}),
+    ]  # fmt: skip
+    run = tc.Run(time=t, outputs={"z": z}, initial={"z": 0.0, "v": 0.0})
+    recording = tc.Recording(runs=[run], units={"time": "s", "z": "m"})
+    d = tc.diagnose(base, recording, terms, seed=0, progress=False)
+    known = [row.terms for row in d.ranking if row.terms != ("none of these",)]
+    assert set(known[0]) == {"propellant burnt", "quadratic drag"}
+    assert str(d).split("\n")[0].count(", or ") <= 6  # five of them and how many others, and none of them
