@@ -483,3 +483,22 @@ def test_a_loss_like_the_bases_is_found_on_its_own_side_of_an_edge():
     assert ["convection"] in (d.tied or [d.terms])
     below = [row for row in d.ranking if row.terms == ("convection",) and (row.region or "").startswith("T < ")]
     assert float(below[0].region.removeprefix("T < ")) == pytest.approx(18.0, abs=0.3)
+
+
+def test_a_base_that_blows_up_without_its_term_is_no_start_of_a_nameless_change():
+    """Growth in proportion to the square, braked for a while: without the brake the rate found beside it diverges."""
+    t, rng = np.linspace(0, 7, 120), np.random.default_rng(0)
+    growth = solve_ivp(
+        lambda t, x: [0.2 * x[0] ** 2 - 0.6 * x[0] * (2 < t < 3.5)], (0, 7), [1.0], t_eval=t, max_step=0.02
+    )  # fmt: skip
+    x = growth.y[0] + 0.01 * rng.standard_normal(120)
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"x": p["r"] * s["x"] ** 2}, ["x"], [tc.Parameter("r", low=0.0, initial=0.1)]
+    )
+    terms = [
+        tc.Term(f"loss of order {k}", equation="x", rate=lambda t, s, p, u, k=k: -p["c"] * s["x"] ** k,
+                parameters=[tc.Parameter("c", low=0.0)])
+        for k in (1, 3)
+    ]  # fmt: skip
+    d = diagnose(base, tc.Recording(runs=[tc.Run(t, {"x": x}, initial={"x": 1.0})], noise=0.01), terms)
+    assert ["loss of order 1"] in (d.tied or [d.terms])

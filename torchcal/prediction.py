@@ -293,7 +293,9 @@ def scores(y: Any, moments: Moments | Prediction, *, noise: Any = None, level: f
     sd = sd[known]
     least = ROUNDING * torch.maximum(moments.mean[known].abs(), y[known].abs())
     if not bool((sd > least).all()):
-        told = "NaN" if bool(sd.isnan().any()) else f"{float(sd.min()):.3g}, which is 0 but for rounding"
+        worst = float(sd[~(sd > least)][0])
+        nothing = math.isnan(worst) or bool(moments.mean[known].isnan().any())
+        told = "NaN" if nothing else f"{worst:.3g}, which is 0 but for rounding"
         raise DomainError(f"Expected sd > 0 for a log score. Got {told}. Give noise=, or compare the means alone.")
     quantile = math.sqrt(2) * float(torch.erfinv(torch.tensor(level, dtype=torch.float64)))
     z = error / sd

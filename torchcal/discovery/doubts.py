@@ -35,8 +35,6 @@ OPEN_IN_WINDOW = 2.0
 LEVELS, NEARLY = 3, 0.2
 #: Log odds against a nameless change from which on a term in a window is there for its own shape.
 CLEARLY = 3.0
-#: Difference of χ² up to which a nameless change is what a term is.
-SAME = 0.01
 #: Noise sd by which an instrument's reading must fall while the true value rises to be no instrument's: a hard limit is
 #: one. And the least sd, in the data's spread.
 FALL, ROUNDING = 2.0, 1e-3
@@ -80,11 +78,13 @@ def left_open(search: Search, model: Model) -> str:
 
 def _no_better(search: Search, model: Model) -> str:
     """Why a term in a window is hardly likelier than a constant change in its place; empty if it is clearly so."""
-    # What is a constant itself has no other shape to show.
-    others = [one for one in search.nameless if abs(one.found.chi2 - model.found.chi2) > SAME]
-    if model.window is None or all(one.weight < model.weight - CLEARLY for one in others):
+    rival = max(search.nameless, key=lambda one: one.weight, default=None)
+    if model.window is None or rival is None or rival.window is None or rival.weight < model.weight - CLEARLY:
         return ""
-    return f"Something unknown in a range of {model.window.driver} would do nearly as well: its shape is not seen yet."
+    if search.constants.intersection(model.numbers):  # which has no other shape to show
+        return ""
+    what = f"Something unknown in a range of {rival.window.driver}"
+    return f"{what} would do nearly as well: the term's own shape is not seen yet."
 
 
 def _levels(model: Model) -> int:

@@ -57,7 +57,10 @@ def refit_nameless(search: Search) -> None:
     problem = search.base.problem
     count = len({(c.kind, c.target) for c in channels(problem, search.base) if c.kind in problem.kinds})
     prior = math.log(PRIOR["none"] / max(count, 1)) - math.log(3.0 * len(search.drivers()))
-    named = {_places(candidate) for candidate in search.candidates if _is_constant(search, candidate)}
+    search.constants = {i for i, candidate in enumerate(search.candidates) if _is_constant(search, candidate)}
+    # That of an instrument in a part of its range has no name.
+    listed = (search.candidates[i] for i in search.constants)
+    named = {_places(candidate) for candidate in listed if not candidate.terms[0].outputs}
     search.nameless = _held_against(search, lead, prior, named)
     outdone = any(one.weight > lead.weight for one in search.nameless)
     if outdone or search.examine(lead).p_value < PLAINLY_WHITE:  # its window may not be the best that the term has
@@ -121,10 +124,9 @@ def _places(candidate: Candidate) -> Places | None:
 
 
 def _is_constant(search: Search, candidate: Candidate) -> bool:
-    """Whether a term of the list is a constant change, which has a name then; that of an instrument in a part of its
-    range has none."""
+    """Whether a term of the list is a constant change."""
     (term,) = candidate.terms
-    if _places(candidate) is None or term.outputs or candidate.tangents.shape[::2] != (1, 1):
+    if _places(candidate) is None or candidate.tangents.shape[::2] != (1, 1):
         return False
     try:
         # Both at the base as it stands, which has moved with the noise since the candidate's own tangents.
@@ -150,7 +152,8 @@ def _wanted(search: Search, model: Model, prior: float) -> list[Hypothetical]:
     inside = driver[(driver >= w.low) & (driver <= w.high)]
     span = w.span or Span.of(driver)
     moves = [k * span.size * span.share(w.low, w.high) for k in MOVES]
-    ends = [[(span.moved(w.low, a), span.moved(w.high, b)) for a, b in itertools.product(moves, moves)]]
+    moved = [(span.moved(w.low, a), span.moved(w.high, b)) for a, b in itertools.product(moves, moves)]
+    ends = [list(dict.fromkeys(moved))]
     if not (math.isfinite(w.low) and math.isfinite(w.high)) and len(inside):
         cuts = inside.double().quantile(torch.linspace(0, 1, INSIDE, dtype=torch.float64)).unique().tolist()
         last = w.low if math.isfinite(w.low) else w.high  # the end that it has, which need not be one of the data
@@ -235,10 +238,13 @@ def _begin(
     y, slope, _ = problem.evaluate(begin, places)
     w = search.noise.whitening(problem)
     left, effect = w.vector(problem.y - y), torch.stack([w(one) for one in slope])
+    lost = ~(left.isfinite().all(-1) & effect.square().sum((1, 2)).isfinite())  # solutions that blow up
+    left, effect = left.masked_fill(lost[:, None], 0.0), effect.masked_fill(lost[:, None, None], 0.0)
     # Of places where nothing happens the size stays as it is.
     scale = effect.norm(dim=1, keepdim=True).clamp_min(1e-300)
     size = torch.linalg.pinv(effect / scale, rtol=RANK) @ left[..., None]
     begin[:, places] += (size[..., 0] / scale[:, 0])
     chi2 = (left - ((effect / scale) @ size)[..., 0]).square().sum(-1)
+    chi2 = chi2.masked_fill(lost, torch.inf)
     order = chi2.nan_to_num(nan=torch.inf).reshape(len(widths), -1).argsort(-1)[:, :STARTS]
     return begin.reshape(len(widths), -1, begin.shape[-1])[torch.arange(len(widths))[:, None], order].flatten(0, 1)

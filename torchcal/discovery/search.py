@@ -77,6 +77,7 @@ class Search:
     models: list[Model] = field(init=False, default_factory=list)
     nameless: list[Model] = field(init=False, default_factory=list)
     unnamed: Model | None = field(init=False, default=None)
+    constants: set[int] = field(init=False, default_factory=set)
     aliases: dict[int, list[int]] = field(init=False, default_factory=dict)
     merged: dict[int, Model] = field(init=False, default_factory=dict)
     twins: dict[int, int] = field(init=False, default_factory=dict)

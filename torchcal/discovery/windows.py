@@ -292,7 +292,7 @@ def _begun(
     plain = search.candidates[w.candidate]
     span = span or Span.of(search.drivers()[w.driver])
     term = plain.terms[0]
-    if term.frees or not span.high > span.low:
+    if term.frees or not span.high > span.low or (span.log and w.high <= 0):
         return None
     span = span.edged(w.low, w.high)
     local = localised(term, w.driver, w.low, w.high, span, static=not search.problem.in_time, edge=edge)

@@ -1,6 +1,7 @@
 """A diagnosis in words: a paragraph that could go into a report."""
 
 import math
+import re
 import textwrap
 from collections.abc import Sequence
 from typing import Any
@@ -74,9 +75,9 @@ def _headline(d: Any) -> str:
         known = [tied for tied in d.tied if tuple(tied) != NONE]
         if len(known) == 1 and _unknown(d) < LISTED:
             return f"Verdict: ambiguous: {_hypothesis(d, known[0])}, which is not sure enough for a name"
-        told = [_hypothesis(d, tied) for tied in known[:HEADLINE]]
-        if len(known) > HEADLINE:
-            told.append(f"one of {len(known) - HEADLINE} others")
+        first = known if len(known) <= HEADLINE + 1 else known[:HEADLINE]
+        told = [_hypothesis(d, tied) for tied in first]
+        told += [f"one of {len(known) - HEADLINE} others"] if len(first) < len(known) else []
         told += [_hypothesis(d, NONE)] if len(known) < len(d.tied) else []
         return "Verdict: ambiguous: " + ", or ".join(told)
     return "Verdict: unexplained (something is missing that is not in this library)"
@@ -148,7 +149,8 @@ def _rmse_unit(d: Any) -> str:
 
 
 def _consistent(d: Any) -> list[str]:
-    limits = [limit for limit in d.detection_limit if math.isfinite(limit.smallest)]
+    # Of what is seen with one sign alone the table tells.
+    limits = [one for one in d.detection_limit if math.isfinite(one.smallest) and "calibration hides" not in one.note]
     nothing = "There is no sign of missing physics." + _yet(d)
     if d.p_detect < 1 - d.confidence:
         nothing = "Yet the base alone remains likelier than all that was tried beside it."
@@ -340,7 +342,7 @@ def _ambiguous(d: Any) -> list[str]:
     if shared:
         parts.append(f"All of them have {_and(shared)}.")
     if d.settings.get("doubt"):
-        parts.append(d.settings["doubt"].replace("it ", "the best of them ", 1))
+        parts.append(re.sub(r"\bit ", "the best of them ", d.settings["doubt"], count=1))
     if len(known) < len(d.tied):
         parts.append(f"Nor can they exclude something that is not in the library (probability {unknown:.2f}).")
     if d.experiment is not None:

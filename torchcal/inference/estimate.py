@@ -110,57 +110,56 @@ def maximise(
         starts = _starting_points(problem, leading.to(like), num_starts, seed)
 
     in_time = isinstance(problem.propagate.simulator, Trajectories)
-    bar = tqdm(desc="maximum", unit="step", disable=not progress, delay=PATIENCE, leave=False)
+    with tqdm(desc="maximum", unit="step", disable=not progress, delay=PATIENCE, leave=False) as bar:
 
-    def show(_iteration: int, values: Tensor) -> None:
-        bar.update(1)
-        bar.set_postfix(objective=f"{float(values.min()):.6g}", refresh=False)
+        def show(_iteration: int, values: Tensor) -> None:
+            bar.update(1)
+            bar.set_postfix(objective=f"{float(values.min()):.6g}", refresh=False)
 
-    def coefficients(points: Tensor) -> Tensor:
-        return transform.bound(points)[..., : problem.propagate.num_alpha]
+        def coefficients(points: Tensor) -> Tensor:
+            return transform.bound(points)[..., : problem.propagate.num_alpha]
 
-    objective = _objective(problem)
-    begin = transform.unbound(starts)
-    outputs = len(problem.y)
-    cost = problem.propagate.num_evaluations * outputs * begin.numel()
-    places = problem.propagate.pattern.leading.nonzero()[:, 0].to(begin.device)
-    coarse = few_nodes(problem.propagate) if cost > DEAR and problem.likelihood.needs != "samples" else None
-    found: Minima | None = None
-    if in_time and len(begin) > 2:
-        found = search(objective, problem.propagate, begin, leading, progress=show)
-    elif not in_time and coarse is not None:
-        found = search_with_few_nodes(
-            objective, problem.propagate, coarse, begin, outputs, alpha=coefficients, places=places, progress=show
-        )
-    if found is None:
-        found = minimise(
-            lambda u: objective(problem.propagate, u),
-            begin,
-            keep=MOST_KEPT if cost > DEAR else None,
-            piece=pieces(problem.propagate, outputs),
-            places=places,
-            progress=show,
-        )
-    if not bool(torch.isfinite(found.values[0])):
-        raise ConvergenceError(
-            f"Expected a finite posterior at some starting point. Got none at {len(starts)}. Check the "
-            "simulator over the parameters' ranges, or pass starts=."
-        )
-    agreeing = _agreeing(found)
-    total = len(found.values)
-    if problem.propagate.pattern.num_germs:
-        for _ in range(4):  # a maximum found with too few nodes may move with more of them
-            best = coefficients(found.points[:1])
-            if not problem.propagate.refine(best, tolerance=NODE_TOLERANCE if in_time else SETTLED):
-                break
-            points = found.points[torch.isfinite(found.values)]
-            different = (points.diff(dim=0) != 0).any(-1)  # those that joined are one
-            points = torch.cat([points[:1], points[1:][different]])[: 1 if in_time else max(4, total // 4)]
-            piece = pieces(problem.propagate, outputs)
-            found = minimise(
-                lambda u: objective(problem.propagate, u), points, piece=piece, places=places, progress=show
+        objective = _objective(problem)
+        begin = transform.unbound(starts)
+        outputs = len(problem.y)
+        cost = problem.propagate.num_evaluations * outputs * begin.numel()
+        places = problem.propagate.pattern.leading.nonzero()[:, 0].to(begin.device)
+        coarse = few_nodes(problem.propagate) if cost > DEAR and problem.likelihood.needs != "samples" else None
+        found: Minima | None = None
+        if in_time and len(begin) > 2:
+            found = search(objective, problem.propagate, begin, leading, progress=show)
+        elif not in_time and coarse is not None:
+            found = search_with_few_nodes(
+                objective, problem.propagate, coarse, begin, outputs, alpha=coefficients, places=places, progress=show
             )
-    bar.close()
+        if found is None:
+            found = minimise(
+                lambda u: objective(problem.propagate, u),
+                begin,
+                keep=MOST_KEPT if cost > DEAR else None,
+                piece=pieces(problem.propagate, outputs),
+                places=places,
+                progress=show,
+            )
+        if not bool(torch.isfinite(found.values[0])):
+            raise ConvergenceError(
+                f"Expected a finite posterior at some starting point. Got none at {len(starts)}. Check the "
+                "simulator over the parameters' ranges, or pass starts=."
+            )
+        agreeing = _agreeing(found)
+        total = len(found.values)
+        if problem.propagate.pattern.num_germs:
+            for _ in range(4):  # a maximum found with too few nodes may move with more of them
+                best = coefficients(found.points[:1])
+                if not problem.propagate.refine(best, tolerance=NODE_TOLERANCE if in_time else SETTLED):
+                    break
+                points = found.points[torch.isfinite(found.values)]
+                different = (points.diff(dim=0) != 0).any(-1)  # those that joined are one
+                points = torch.cat([points[:1], points[1:][different]])[: 1 if in_time else max(4, total // 4)]
+                piece = pieces(problem.propagate, outputs)
+                found = minimise(
+                    lambda u: objective(problem.propagate, u), points, piece=piece, places=places, progress=show
+                )
     best, ties = _first_of_the_tied(problem, found)
     if agreeing < 2 <= len(found.values):
         warn(
@@ -382,12 +381,12 @@ def _joined(problem: Problem, one: Tensor, other: Tensor) -> bool:
         if not propagate.pattern.num_germs:
             return False
         coefficients = torch.stack([one, other])[:, : propagate.num_alpha]
-        mean, covariance = propagate.parameter_moments(coefficients)
+        mean, covariance = (moment.double() for moment in propagate.parameter_moments(coefficients))
     spread = covariance.diagonal(dim1=-2, dim2=-1).amax(0).sqrt()
     unit = torch.maximum(spread, SAME_MEANS * mean.abs().amax(0)).clamp_min(1e-300)
     apart = torch.maximum(
         ((mean[1] - mean[0]) / unit).abs().max(),
-        ((covariance[1] - covariance[0]) / (unit[:, None] * unit)).abs().max(),
+        ((covariance[1] - covariance[0]) / unit[:, None] / unit).abs().max(),
     )
     return float(apart) <= SAME_MEANS
 
