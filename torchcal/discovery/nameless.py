@@ -66,8 +66,9 @@ def refit_nameless(search: Search) -> None:
     if outdone or search.examine(lead).p_value < PLAINLY_WHITE:  # its window may not be the best that the term has
         again = [(old, one) for old in _rivals(search, lead) if (one := _anywhere(search, old)) is not None]
         before = search.models
-        for (old, _), new in zip(again, _refitted(search, [one for _, one in again]), strict=True):
-            if long_enough(new) is not None and new is not None and new.weight > old.weight + BETTER:
+        moved = map(long_enough, _refitted(search, [one for _, one in again]))
+        for (old, _), new in zip(again, moved, strict=True):
+            if new is not None and new.weight > old.weight + BETTER:
                 search.models = [m for m in search.models if m is not old] + [new]
         if search.models is not before:
             search.nameless += _held_against(search, lead, prior, named)

@@ -47,8 +47,7 @@ def refit_several(search: Search) -> None:
     if enough and search.exact:
         return
     wanted: dict[tuple[int, ...], tuple[int, int] | None] = {}
-    far = is_far(search.base)
-    for columns in _linear_pairs(search)[: FROM_FAR if far else FROM_LINEAR]:
+    for columns in _linear_pairs(search, FROM_FAR if is_far(search.base) else FROM_LINEAR):
         wanted[tuple(int(search.screening.owner[k]) for k in columns)] = columns
     leads: dict[int, Model] = {}
     for model in single:
@@ -122,7 +121,7 @@ def _swapped(search: Search, lead: Model) -> list[tuple[int, ...]]:
     return sorted(found, key=lambda pair: -found[pair])[:MOST]
 
 
-def _linear_pairs(search: Search) -> list[tuple[int, int]]:
+def _linear_pairs(search: Search, most: int) -> list[tuple[int, int]]:
     """Columns of two candidates, each at any of its shapes, that explain most together; the best of each two."""
     screening = search.screening
     usable = (screening.norm > 0).nonzero()[:, 0]
@@ -143,7 +142,7 @@ def _linear_pairs(search: Search) -> list[tuple[int, int]]:
     chosen: dict[tuple[int, int], tuple[int, int]] = {}
     for k in gain.flatten().argsort(descending=True).tolist():
         i, j = k // len(usable), k % len(usable)
-        if float(gain[i, j]) <= 0 or len(chosen) == FROM_LINEAR:
+        if float(gain[i, j]) <= 0 or len(chosen) == most:
             break
         chosen.setdefault((int(owner[i]), int(owner[j])), (int(usable[i]), int(usable[j])))
     return list(chosen.values())
