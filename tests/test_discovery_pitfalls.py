@@ -561,6 +561,26 @@ def test_limits_stay_within_a_parameters_bounds():
     hidden = diagnose(base, recording(0.0), terms).detection_limit[0]
     assert hidden.smallest == math.inf
     assert hidden.note == "calibration hides effects of 20, the largest within its bounds"
+    assert hidden.sign == 0
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_limit_is_of_the_sign_that_can_be_seen(sign):
+    x = torch.linspace(0, 1, 40, dtype=torch.float64)
+    base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    # With one sign it adds less than the noise whatever its size, with the other more and more.
+    term = tc.Term(
+        "saturating",
+        outputs={"y": lambda x, p, y: y + 0.02 * (1 - torch.exp(sign * p["c"])) * x**2},
+        parameters=[tc.Parameter("c")],
+    )
+    noise = 0.02 * np.random.default_rng(0).standard_normal(40)
+    found = diagnose(base, tc.Recording(x=x, y=1 + 0.3 * x.numpy() + noise, noise=0.02), [term])
+    (limit,) = found.detection_limit
+    assert limit.sign == sign
+    assert 1.0 < limit.smallest < 5.0  # exp(4) - 1 times 0.02 x^2 is ten noise sd at the end
+    assert f"calibration hides {'negative' if sign > 0 else 'positive'} effects" in limit.note
+    assert "smallest effects" not in str(found)  # the paragraph has no room for the sign
 
 
 def test_a_hopeless_base_is_a_misfit_whatever_is_left_looks_like(monkeypatch):

@@ -63,16 +63,15 @@ def bolder(model: Fitted) -> list[Option]:
     begin, largest, _ = _states(model)
     ask = _ask(recording, begin)
     options = _elsewhere(recording, begin, BOLD)
-    for name, value in begin.items() if len(begin) > 1 else ():
-        other = _ask(recording, [one for one in begin if one != name])
-        if abs(value) > NOTHING * abs(largest[name]):
-            text = f"a run that starts from {ALONE:g} times the initial {name} of the first, all else as there{other}"
-            options.append(_run(recording, text, {**begin, name: ALONE * value}))
     for name, value in begin.items():
-        other = _ask(recording, [one for one in begin if one != name])
-        if abs(value) <= NOTHING * abs(largest[name]) and largest[name]:
-            text = f"a run that starts from {name} = {largest[name]:.3g}, all else as in the first{other}"
+        others = _ask(recording, [one for one in begin if one != name])
+        at_rest = abs(value) <= NOTHING * abs(largest[name])
+        if at_rest and largest[name]:
+            text = f"a run that starts from {name} = {largest[name]:.3g}, all else as in the first{others}"
             options.append(_run(recording, text, {**begin, name: float(f"{largest[name]:.3g}")}))
+        elif not at_rest and len(begin) > 1:  # of one state alone this is a multiple of all initial states
+            text = f"a run that starts from {ALONE:g} times the initial {name} of the first, all else as there{others}"
+            options.append(_run(recording, text, {**begin, name: ALONE * value}))
     options += _stronger(recording, begin, ask, BOLD)
     if _runs(recording)[0].inputs:
         options.append(_run(recording, f"a run with the inputs held at their largest{ask}", begin, change=_steady))

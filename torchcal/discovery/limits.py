@@ -56,9 +56,9 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
             doubt = math.sqrt(1 + wanted**2 / (2 * search.noise.freedom))
         effects[i] = _Effect(column, wanted + doubt * from_power, float(screening.norm[column]))
     sizes = {i: effect.distance / effect.norm for i, effect in effects.items()}
-    told: dict[int, str] = {}
+    hidden: dict[int, _Hidden] = {}
     if not search.exact and not search.stop.is_set():
-        sizes, told = _corrected(search, effects, sizes)
+        sizes, hidden = _corrected(search, effects, sizes)
     rows = []
     for i, candidate in enumerate(search.candidates):
         column = effects[i].column if i in effects else screening.best[i]
@@ -72,9 +72,11 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
             rows.append(Limit(candidate.name, q.name, math.inf, q.unit, power, estimate, note))
             continue
         others = [search.candidates[j].name for j in search.aliases.get(i, ())]
-        notes = [_shape(candidate, effects[i], search), f"also: {', '.join(others)}" if others else "", told.get(i, "")]
+        notes = [_shape(candidate, effects[i], search), f"also: {', '.join(others)}" if others else ""]
+        notes += [hidden[i].note] if i in hidden else []
         note = "; ".join(filter(None, notes))
-        rows.append(Limit(candidate.name, q.name, sizes[i], q.unit, power, estimate, note))
+        sign = -hidden[i].sign if i in hidden else 0
+        rows.append(Limit(candidate.name, q.name, sizes[i], q.unit, power, estimate, note, sign))
     for term in contained:
         name = term.full(term.parameters[0].name) if term.parameters else term.frees[0]
         rows.append(Limit(term.name, name, math.inf, None, power, None, "already in the base model"))
@@ -116,12 +118,25 @@ class _Effect:
     norm: float
 
 
+@dataclass(frozen=True)
+class _Hidden:
+    """What of a candidate is not seen whatever its size.
+
+    Attributes:
+        sign: Of the effects that are not seen, 1 or −1; 0 where none is seen.
+        note: That in words.
+    """
+
+    sign: int
+    note: str
+
+
 def _corrected(
     search: Search, effects: dict[int, _Effect], sizes: dict[int, float]
-) -> tuple[dict[int, float], dict[int, str]]:
+) -> tuple[dict[int, float], dict[int, _Hidden]]:
     """Sizes whose effects remain just large enough when the base is calibrated to them, of two signs the larger one.
 
-    With them what is not seen whatever its size, in words.
+    With them what is not seen whatever its size.
     """
     base = search.base
     now: dict[tuple[int, int], float] = {}
@@ -181,18 +196,19 @@ def _corrected(
         if not trials:
             break
     smallest: dict[int, float] = {}
-    told: dict[int, str] = {}
+    hidden: dict[int, _Hidden] = {}
     for i in effects:
         mine = {sign: seen[i, sign] for sign in (1, -1) if (i, sign) in seen}
         lost = [sign for sign, size in mine.items() if math.isinf(size)]
         smallest[i] = max((size for size in mine.values() if math.isfinite(size)), default=math.inf)
         if lost:
-            largest = max(unseen[i, sign] for sign in lost)
-            which = "" if len(lost) == len(mine) else "positive " if lost[0] > 0 else "negative "
-            within = all(unseen[i, sign] >= room[i, sign] for sign in lost)
+            largest = max(unseen[i, one] for one in lost)
+            sign = 0 if len(lost) == len(mine) else lost[0]
+            within = all(unseen[i, one] >= room[i, one] for one in lost)
             end = "the largest within its bounds" if within else "the largest that was tried"
-            told[i] = f"calibration hides {which}effects of {largest:.3g}, {end}"
-    return smallest, told
+            which = {0: "", 1: "positive ", -1: "negative "}[sign]
+            hidden[i] = _Hidden(sign, f"calibration hides {which}effects of {largest:.3g}, {end}")
+    return smallest, hidden
 
 
 def _room(candidate: Candidate, place: int, sign: int) -> float:

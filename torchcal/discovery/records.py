@@ -225,6 +225,8 @@ class Limit:
         estimate: What the term takes up where it alone is fitted beside the base: what others do as well, so that it is
             no sign of the term where something else is missing.
         note: ``"already in the base model"`` or the like.
+        sign: 1 or −1 where ``smallest`` is of effects of that sign, as calibration hides those of the other whatever
+            their size; 0 where it is of any that its bounds allow.
     """
 
     term: str
@@ -234,6 +236,7 @@ class Limit:
     power: float
     estimate: float | None = None
     note: str = ""
+    sign: int = 0
 
 
 @dataclass(frozen=True)

@@ -150,7 +150,7 @@ def _rmse_unit(d: Any) -> str:
 
 def _consistent(d: Any) -> list[str]:
     # Of what is seen with one sign alone the table tells.
-    limits = [one for one in d.detection_limit if math.isfinite(one.smallest) and "calibration hides" not in one.note]
+    limits = [one for one in d.detection_limit if math.isfinite(one.smallest) and not one.sign]
     nothing = "There is no sign of missing physics." + _yet(d)
     if d.p_detect < 1 - d.confidence:
         nothing = "Yet the base alone remains likelier than all that was tried beside it."
