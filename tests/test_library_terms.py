@@ -215,6 +215,13 @@ def test_names_units_and_words(case):
                 assert bounded != (parameter.name in term.scales)
 
 
+def test_friction_of_an_angular_velocity_w_has_a_formula_that_can_be_read():
+    term = term_of(mechanics("angle", "w"), "Coulomb friction")
+    assert term.formula == "dw/dt ∋ -c sign(w), smoothed as -c tanh(3 w/w_)"
+    assert [parameter.name for parameter in term.parameters] == ["c", "w_"]
+    assert term.scales == {"w_": "w"}
+
+
 @pytest.mark.parametrize("case", CASES)
 def test_the_whole_library_extends_a_base_model_and_changes_nothing(case):
     terms, states, inputs, parameters = CASES[case]

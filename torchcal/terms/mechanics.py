@@ -86,10 +86,11 @@ def mechanics(
         f"-c |{v}| {v}", "Drag of a wake at high Reynolds number, with the square of the speed.")  # fmt: skip
     add("cubic drag", lambda t, s, p, u: -p["c"] * s[v] ** 3, [amplitude("c", units(2, -1), low=0.0)],
         f"-c {v}³", "Damping that grows with the cube of the speed.")  # fmt: skip
-    add("Coulomb friction", lambda t, s, p, u: -p["c"] * torch.tanh(FULL * s[v] / p["w"]),
-        [amplitude("c", units(-1, 2), low=0.0), shape("w", units(-1, 1))],
-        f"-c sign({v}), smoothed as -c tanh(3 {v}/w)", "Dry friction, independent of the speed while sliding.",
-        {"w": v})  # fmt: skip
+    w = own_name("w", v)  # the usual name of an angular velocity too
+    add("Coulomb friction", lambda t, s, p, u: -p["c"] * torch.tanh(FULL * s[v] / p[w]),
+        [amplitude("c", units(-1, 2), low=0.0), shape(w, units(-1, 1))],
+        f"-c sign({v}), smoothed as -c tanh(3 {v}/{w})", "Dry friction, independent of the speed while sliding.",
+        {w: v})  # fmt: skip
     add("Stribeck friction",
         lambda t, s, p, u: -p["c"] * torch.exp(-((s[v] / p["vs"]) ** 2)) * torch.tanh(STICKING * s[v] / p["vs"]),
         [amplitude("c", units(-1, 2), low=0.0), shape("vs", units(-1, 1))],
