@@ -1,5 +1,6 @@
 """Calibration of models in time: initial states as nuisance, step sizes, predictions elsewhere, files."""
 
+import warnings
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -11,14 +12,17 @@ from torch import Tensor
 
 import torchcal as tc
 from torchcal.errors import (
+    ConvergenceWarning,
     DomainError,
     EmbeddingError,
     PropagationWarning,
     RecordingError,
     SimulatorError,
 )
+from torchcal.inference import estimate, tangent
 from torchcal.inference.estimate import maximise
 from torchcal.inference.fitting import least_squares
+from torchcal.inference.newton import Minima
 from torchcal.inference.setup import check_inputs, embedded_problem
 from torchcal.plots import additive_fit as plot_additive_fit
 from torchcal.plots import fit as plot_fit
@@ -264,6 +268,26 @@ def test_the_maximum_is_that_of_the_plain_search(recording: tc.Recording) -> Non
         means.append(fit.scaling.physical(found.alpha[[0, 2]]))
     assert objectives[0] == pytest.approx(objectives[1], rel=1e-6)
     torch.testing.assert_close(means[0], means[1], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("apart", [0.0, 1.0])
+def test_starts_that_disagree_are_told_also_where_the_best_is_refined(
+    monkeypatch: pytest.MonkeyPatch, apart: float
+) -> None:
+    recording = tc.Recording(runs=[run_of(np.linspace(0, 10, 80), (2.0, 0.5), noise=0.01)], noise=0.01)
+
+    def search(*args: object, **options: object) -> Minima:
+        found = tangent.search(*args, **options)
+        values = found.values[:1] + apart * torch.arange(len(found.values), dtype=F64)
+        return Minima(found.points, values, found.iterations)
+
+    monkeypatch.setattr(estimate, "search", search)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        tc.calibrate(body(), recording, fixed={"c": 0.5}, num_samples=0, num_starts=4, seed=0)
+    told = [str(one.message) for one in caught if issubclass(one.category, ConvergenceWarning)]
+    assert len(told) == (apart > 0)
+    assert all(message.startswith("Only 1 of 4 starts reached the best objective") for message in told)
 
 
 def test_several_likelihoods_and_embeddings(recording: tc.Recording) -> None:

@@ -15,7 +15,7 @@ import torchcal as tc
 from benchmarks.sampling import density
 from benchmarks.sampling.density import FUNCTIONS, Arrays
 from torchcal import polychaos
-from torchcal.inference.estimate import laplace
+from torchcal.inference.modes import laplace
 from torchcal.models import Problem
 from torchcal.results import Calibration
 

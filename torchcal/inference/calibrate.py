@@ -13,10 +13,11 @@ from torchcal.data import Recording
 from torchcal.embeddings import Embedding, Gaussian
 from torchcal.errors import DomainError
 from torchcal.inference.draws import Draws
-from torchcal.inference.estimate import check_starts, maximise
+from torchcal.inference.estimate import maximise
 from torchcal.inference.fitting import allowed_solver_error, least_squares
 from torchcal.inference.sampling import Plan, draw
 from torchcal.inference.setup import PriorMaker, check_inputs, check_run, embedded_problem
+from torchcal.inference.starts import check_starts
 from torchcal.inference.summary import (
     diagnose,
     mean_square,

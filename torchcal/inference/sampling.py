@@ -15,7 +15,8 @@ from torchcal.inference.by_hand import by_hand
 from torchcal.inference.coordinates import Laplace, dealt_out, slopes_of
 from torchcal.inference.diagnostics import Figures, figures
 from torchcal.inference.draws import WORTH_CHAINS, Draws
-from torchcal.inference.estimate import Estimate, modes_of
+from torchcal.inference.estimate import Estimate
+from torchcal.inference.modes import modes_of
 from torchcal.inference.nuts import run_nuts
 from torchcal.models import Problem
 from torchcal.results.diagnostics import R_HAT_THRESHOLD, Mode
