@@ -324,6 +324,25 @@ def test_a_static_sensor_on_an_output_without_a_name() -> None:
     close(extend(plain, [sensor]).at(X["t"])(tensor(2.0, 0.5)), 2.5 * X["t"])
 
 
+@pytest.mark.parametrize(
+    ("static", "where"),
+    [(True, {"outputs": "q"}), (True, {"shifts": "m"}), (False, {"rates": "v"}), (False, {"outputs": "x"}),
+     (False, {"shifts": "k"})],
+)  # fmt: skip
+@pytest.mark.parametrize("returned", [None, "text", [1.0]])
+def test_a_term_that_returns_no_tensor_is_blamed_by_name(static: bool, where: dict[str, str], returned: object) -> None:
+    kinds: dict[str, Any] = {kind: {place: lambda *given: returned} for kind, place in where.items()}
+    term = tc.Term("mute", parameters=[tc.Parameter("e")], **kinds)
+    run = (
+        (lambda: extend(line(), [term]).at(X)(tensor(2.0, 1.5, 0.3)))
+        if static
+        else (lambda: outputs(extend(body(), [term]), **{"mute.e": 0.0}))
+    )
+    message = rf"^Expected a tensor from every function of the term 'mute'.* returned {type(returned).__name__}"
+    with pytest.raises(SimulatorError, match=message):
+        run()
+
+
 def test_an_extended_static_simulator_is_calibrated() -> None:
     t = tensor(0.5, 1.0, 2.0)
     recorded = tc.Recording(x={"t": t, "h": X["h"]}, y={"q": 2.0 * (1 + 0.3 * X["h"].log()) * t**2})

@@ -210,7 +210,7 @@ class Term:
             t, s, p, *more = given
             given = (t - self.began(p), s, p, *more)
         try:
-            return function(*given)
+            result = function(*given)
         except TorchcalError:
             raise
         except Exception as error:
@@ -219,6 +219,12 @@ class Term:
                 f"Expected a tensor from every function of the term {self.name!r}. One of them raised "
                 f"{type(error).__name__}: {error}. It was given {known}."
             ) from error
+        if not isinstance(result, Tensor | int | float):
+            raise SimulatorError(
+                f"Expected a tensor from every function of the term {self.name!r}. One of them returned "
+                f"{type(result).__name__}."
+            )
+        return result
 
     @property
     def is_sensor(self) -> bool:
