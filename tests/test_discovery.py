@@ -665,6 +665,36 @@ def test_a_hold_out_of_numpy_and_lists():
     assert quiet(body, motion, library[-1:], holdout=torch.tensor(mask).numpy()).held_out.tolist() == mask
 
 
+def several_falls(given: bool) -> tuple[tc.ODESimulator, tc.Recording]:
+    t = torch.linspace(0, 2, 21, dtype=F64)
+    body = tc.ODESimulator(
+        lambda t, s, p, u: {"v": p["g"] - p["k"] * s["v"]},
+        {"v": None},
+        [tc.Parameter("g", initial=9.0), tc.Parameter("k", low=0.0, initial=0.3)],
+    )
+    runs = [tc.Run(time=t, outputs={"v": 25 + (v - 25) * torch.exp(-0.4 * t)}, initial={"v": v} if given else {})
+            for v in (0.0, 3.0, 6.0)]  # fmt: skip
+    return body, tc.Recording(runs=runs, noise={"v": 0.1})
+
+
+def test_a_run_that_alone_tells_its_initial_state_is_not_held_out():
+    body, recording = several_falls(given=False)
+    last = recording.x["run"] == 2
+    with pytest.raises(tc.errors.DomainError, match=r"^Expected holdout .*only held-out data for 'v.*2"):
+        quiet(body, recording, [], holdout=last)
+    assert quiet(body, recording, [], holdout=last & (recording.x["time"] > 1)).before.held_out.n == 10
+    body, recording = several_falls(given=True)
+    assert quiet(body, recording, [], holdout=last).before.held_out.n == 21
+
+
+def test_an_output_that_alone_tells_a_parameter_is_not_held_out():
+    base = tc.Simulator(lambda x, p: {"q": p["a"] * x, "r": p["b"] * x}, [tc.Parameter("a"), tc.Parameter("b")])
+    x = torch.linspace(1, 2, 20, dtype=F64)
+    recording = tc.Recording(x=x, y={"q": x, "r": 2 * x}, noise={"q": 0.1, "r": 0.1})
+    with pytest.raises(tc.errors.DomainError, match="only held-out data for 'b'"):
+        quiet(base, recording, [], holdout=torch.arange(40) >= 20)
+
+
 def test_a_name_that_predicts_worse_is_withdrawn(monkeypatch):
     from torchcal.discovery import verify
 
@@ -983,6 +1013,7 @@ def costly(allowed=0, **parameters):
         ({"holdout": 1.0}, "share"),
         ({"holdout": math.nan}, "share"),
         ({"holdout": 3}, "bool array"),
+        ({"holdout": "last"}, r"a bool array\. Got 'last'\.$"),
         ({"holdout": True}, "bool array"),
         ({"holdout": [0, 1]}, "bool array"),
         ({"holdout": torch.ones(5, dtype=torch.bool)}, r"shape \(20,\)"),

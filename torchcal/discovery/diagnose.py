@@ -128,8 +128,11 @@ def diagnose(
             raise DomainError(f"Expected the term {term.name!r} on outputs of {recording.outputs}. Got {unknown}.")
         extend(simulator, [term])  # raises for names that do not fit, before any long work
     mask = verify.choose(recording, holdout, len(free))
-    for values in starts(problem, 2, seed, held):  # at zero nothing may move
+    begin = starts(problem, 2, seed, held)  # at zero nothing may move
+    for values in begin:
         check_repeats(problem, values)
+    if mask is not None and holdout is not None:
+        verify.check_left(problem, begin, free, mask)
     bar = tqdm(disable=not progress, desc="diagnose", unit="step", leave=False)
 
     def tick(text: str) -> None:

@@ -11,10 +11,11 @@ from torch import Tensor
 from torchcal.data import Recording
 from torchcal.discovery.fitting import Fitted, fit
 from torchcal.discovery.noise import Noise
+from torchcal.discovery.problem import Problem
 from torchcal.discovery.records import Score
 from torchcal.errors import DomainError
 
-__all__ = ["HeldOut", "choose", "compare", "held_out_fit", "score", "within"]
+__all__ = ["HeldOut", "check_left", "choose", "compare", "held_out_fit", "score", "within"]
 
 #: Share of the data that is held out.
 SHARE = 0.25
@@ -47,9 +48,7 @@ def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None
         try:
             mask = holdout if isinstance(holdout, Tensor) else torch.as_tensor(np.asarray(holdout))
         except (TypeError, ValueError) as error:
-            raise DomainError(
-                f"Expected holdout as None, False, a share or a bool array. Got {holdout!r} ({error})."
-            ) from error
+            raise DomainError(f"Expected holdout as None, False, a share or a bool array. Got {holdout!r}.") from error
         if mask.dtype != torch.bool or mask.shape not in ((recording.n,), recording.y.shape):
             raise DomainError(
                 f"Expected holdout as False, a share, or a bool array of shape ({recording.n},), True where held out. "
@@ -94,6 +93,24 @@ def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None
         mask = torch.zeros(recording.n, dtype=torch.bool)
         mask[distance.argsort(descending=True, stable=True)[:count]] = True
     return mask.repeat(len(recording.outputs))
+
+
+def check_left(problem: Problem, values: Tensor, free: list[int], mask: Tensor) -> None:
+    """Raise DomainError where only the data in ``mask`` tell a parameter: what then predicts them has seen them.
+
+    Such are the initial states of a run that is held out whole, and its parameters with ``per_run=True``. ``values``
+    (H, P) are where the slopes are taken.
+    """
+    slope = problem.evaluate(values, free)[1].abs()
+    kept = ~mask[problem.index]
+    alone = (slope[:, kept].amax(1) == 0) & (slope.amax(1) > 0)
+    if bool(alone.any()):
+        name = problem.parameters[free[int(alone.any(0).nonzero()[0, 0])]].name
+        raise DomainError(
+            f"Expected holdout to leave data for every parameter. Got only held-out data for {name!r}, which cannot "
+            "predict themselves (hold out a part of that run or range, give its initial states, or hold the parameter "
+            "with fixed=)."
+        )
 
 
 def within(recording: Recording) -> Tensor:
