@@ -20,6 +20,7 @@ from torchcal.errors import SimulatorError
 
 F64 = torch.float64
 NOISE = 0.01
+A = tc.Parameter("a")
 
 
 def diagnose(*args, **options):
@@ -302,8 +303,9 @@ def test_a_term_that_bends_to_a_dip_is_no_name(seed):
     d = diagnose(*dip(seed))
     assert d.verdict == "unexplained" or ["none of these"] in d.tied
     (row,) = [row for row in d.ranking if row.terms == ("none of these",)]
-    assert row.note.startswith("something unknown where ")
-    low, high = (float(end) for end in row.note.removeprefix("something unknown where ").split(" < V < "))
+    what, place = row.note.split(" where ")
+    assert what in ("something unknown", "a change of G")
+    low, high = (float(end) for end in place.split(" < V < "))
     assert 1.0 < low < 1.2 < high < 1.4
     if d.verdict == "unexplained":  # the place is where it is, not where the best term of the list would act
         assert d.where[0].spans == (pytest.approx((low, high), abs=1e-3),)
@@ -335,13 +337,46 @@ def test_where_many_terms_do_the_same_in_a_window_none_of_them_may_be_there():
 
 
 def test_a_local_term_whose_shape_shows_is_named_all_the_same():
-    """Drag that acts from a speed of 1 on: a constant force there would not do."""
-    recording = recorded(lambda t, x, v: -0.5 * abs(v) * v if v > 1 else 0.0)
-    near = ("linear drag", "linear spring")  # in so narrow a window one drag is like another
+    """Drag that acts from a speed of 0.7 on: neither a constant force there nor more damping would do."""
+    recording = recorded(lambda t, x, v: -0.5 * abs(v) * v / (1 + math.exp(-(v - 0.7) / 0.005)))
+    near = ("linear drag", "linear spring", "bias force")
     terms = [t for t in tc.terms.mechanics(position="x", velocity="v", angle=False) if t.name not in near]
-    d = diagnose(oscillator(), recording, [t for t in terms if t.name != "bias force"])
+    d = diagnose(oscillator(), recording, terms)
     assert (d.verdict, d.terms) == ("named", ["quadratic drag"])
-    assert "v > " in d.settings["region"]
+    assert float(d.settings["region"].removeprefix("v > ")) == pytest.approx(0.7, abs=0.05)
+
+
+@pytest.mark.parametrize(("seed", "depth"), [(1, 0.35), (3, 0.2)])
+def test_what_changes_a_factor_of_the_base_in_a_range_is_no_name(seed, depth):
+    """A wake that takes a share of a turbine's power in some directions: terms with a power of their own were named
+    there, since no constant loss of power is like it at all wind speeds."""
+    rng = np.random.default_rng(seed)
+    v, rho, direction = rng.uniform(4, 12, 240), rng.uniform(1.1, 1.3, 240), rng.uniform(0, 360, 240)
+    wake = 1 - depth * np.exp(-0.5 * ((direction - 220) / 12) ** 2)
+    power = 1.05 * rho * v**3 * wake - 3.0
+    noise = 0.02 * power.std()
+    base = tc.Simulator(
+        lambda x, p: 2.5 * p["cp"] * x["rho"] * x["v"] ** 3 - p["loss"],
+        [tc.Parameter("cp", low=0.0, high=0.6, initial=0.35), tc.Parameter("loss", low=0.0, initial=1.0)],
+    )
+
+    def factor(name, function):
+        return tc.Term(name, outputs={"P": lambda x, p, y: y * (1 + p["a"] * function(x))}, parameters=[A])
+
+    terms = [
+        factor("yaw", lambda x: torch.sin(math.pi / 180 * x["dir"])),
+        factor("turbulence", lambda x: 1 / x["v"]),
+        factor("density exponent", lambda x: torch.log(x["rho"] / 1.2)),
+        tc.Term("drive loss", outputs={"P": lambda x, p, y: y - p["a"] * x["v"] ** 2}, parameters=[A]),
+    ]
+    recording = tc.Recording(
+        x={"v": v, "rho": rho, "dir": direction}, y={"P": power + noise * rng.standard_normal(240)}, noise=noise
+    )
+    d = diagnose(base, recording, terms)
+    assert d.verdict == "unexplained" or ["none of these"] in d.tied
+    assert d.where[0].driver == "dir"
+    (span,) = d.where[0].spans
+    assert 180 < span[0] < 220 < span[1] < 260
 
 
 def test_a_window_that_leaves_something_is_not_the_best_one():
@@ -401,6 +436,7 @@ def test_a_term_of_two_equations_is_held_against_a_change_of_both(reaction):
     d, search = reaction
     rivals = search.nameless
     assert rivals
+    rivals = [model for model in rivals if not model.candidate.terms[0].shifts]  # the others change the base's own
     assert {tuple(model.candidate.terms[0].rates) for model in rivals} == {("A", "B")}
     assert {len(model.candidate.amplitudes) for model in rivals} == {2}
     sizes = [model.found.values[model.candidate.amplitudes] for model in rivals]
@@ -433,9 +469,10 @@ def test_a_window_is_named_for_the_shape_of_its_term_alone(reaction):
     best = dataclasses.replace(best, log_evidence=model.weight - best.log_prior - CLEARLY - 0.1)
     search = copy.copy(search)
     search.nameless = [best]
-    assert "Something unknown" not in doubt(search, model)
+    assert "would do nearly as well" not in doubt(search, model)
     best.log_evidence += 0.2
-    assert doubt(search, model).startswith("Something unknown in a range of ")
+    what = best.candidate.name[1:]
+    assert doubt(search, model)[1:].startswith(f"{what} in a range of t would do nearly as well")
 
 
 @pytest.mark.parametrize(("side", "amplitude"), [(0, -0.3), (1, 0.3), (-1, -0.3)])

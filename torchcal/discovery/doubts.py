@@ -77,13 +77,13 @@ def left_open(search: Search, model: Model) -> str:
 
 
 def _no_better(search: Search, model: Model) -> str:
-    """Why a term in a window is hardly likelier than a constant change in its place; empty if it is clearly so."""
+    """Why a term in a window is hardly likelier than a constant change there; empty if it is clearly so."""
     rival = max(search.nameless, key=lambda one: one.weight, default=None)
     if model.window is None or rival is None or rival.window is None or rival.weight < model.weight - CLEARLY:
         return ""
     if search.constants.intersection(model.numbers):  # which has no other shape to show
         return ""
-    what = f"Something unknown in a range of {rival.window.driver}"
+    what = f"{rival.candidate.name[0].upper()}{rival.candidate.name[1:]} in a range of {rival.window.driver}"
     return f"{what} would do nearly as well: the term's own shape is not seen yet."
 
 

@@ -1,7 +1,8 @@
 """What has no name and acts where a term in a window does.
 
 Something that is in no list may act in a part of a range too, and in a short window many terms do much the same. A term
-is named for its own work there: a constant change in the same place, with the same ends to choose, must do worse.
+is named for its own work there: a constant change in the same place, of a parameter of the base or of an output's gain,
+with the same ends to choose, must do worse.
 A term whose window leaves something is tried in all others: from the base alone its best one is not seen.
 """
 
@@ -10,6 +11,7 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -24,13 +26,14 @@ from torchcal.discovery.search import BETTER, Search
 from torchcal.discovery.verdict import PLAINLY_WHITE
 from torchcal.discovery.windows import long_enough, stepped
 from torchcal.errors import DomainError, SimulatorError
-from torchcal.simulators import Parameter
+from torchcal.simulators import Parameter, Trajectories
 from torchcal.terms import Term
 
 __all__ = ["refit_nameless"]
 
-#: Log weight behind the leader down to which a term in a window is held against a nameless change, and of how many.
-CLOSE, MOST = 3.0, 3
+#: Log weight behind the leader down to which a term in a window is held against nameless changes, and of how many; and
+#: against how many changes elsewhere than where it acts.
+CLOSE, MOST, ELSEWHERE = 3.0, 3, 2
 #: Terms that are tried in all windows of a driver, and places where these may begin or end.
 TRIED, CUTS = 4, 14
 #: Places within an open window where a nameless change may begin or end, and starts that are refitted with each width
@@ -41,6 +44,7 @@ MOVES = (0.0, -0.15, 0.15, -0.3, 0.3)
 #: Relative difference up to which two effects are one, and relative size from which on two are independent.
 SAME, RANK = 1e-4, 1e-7
 
+#: Kinds and names of what a constant is added to, or of the outputs that are multiplied ("gains").
 Places = tuple[tuple[str, str], ...]
 
 
@@ -54,14 +58,9 @@ def refit_nameless(search: Search) -> None:
         lead = likeliest_alone(search) or lead
     if lead.window is None:
         return
-    problem = search.base.problem
-    count = len({(c.kind, c.target) for c in channels(problem, search.base) if c.kind in problem.kinds})
-    prior = math.log(PRIOR["none"] / max(count, 1)) - math.log(3.0 * len(search.drivers()))
     search.constants = {i for i, candidate in enumerate(search.candidates) if _is_constant(search, candidate)}
-    # That of an instrument in a part of its range has no name.
-    listed = (search.candidates[i] for i in search.constants)
-    named = {_places(candidate) for candidate in listed if not candidate.terms[0].outputs}
-    search.nameless = _held_against(search, lead, prior, named)
+    changes = _Changes.of(search)
+    changes.hold_against(lead)
     outdone = any(one.weight > lead.weight for one in search.nameless)
     if outdone or search.examine(lead).p_value < PLAINLY_WHITE:  # its window may not be the best that the term has
         again = [(old, one) for old in _rivals(search, lead) if (one := _anywhere(search, old)) is not None]
@@ -71,21 +70,89 @@ def refit_nameless(search: Search) -> None:
             if new is not None and new.weight > old.weight + BETTER:
                 search.models = [m for m in search.models if m is not old] + [new]
         if search.models is not before:
-            search.nameless += _held_against(search, lead, prior, named)
+            changes.hold_against(lead)
 
 
-def _held_against(search: Search, lead: Model, prior: float, named: set[Places | None]) -> list[Model]:
-    """Constant changes beside the leading terms in windows, but in places that a constant of the list names."""
-    near = [m for m in search.models if m.physical and m.window is not None and m.weight > lead.weight - CLOSE]
-    wanted: dict[tuple[Places, str], list[Hypothetical]] = {}
-    for model in sorted(near, key=lambda m: -m.weight)[:MOST]:
-        where, window = _places(model.candidate), model.window
-        if where is None or window is None or where in named:
-            continue
-        if (where, window.driver) not in wanted:
-            wanted[where, window.driver] = _wanted(search, model, prior)
-    every = [one for each in wanted.values() for one in each]
-    return [one for one in _refitted(search, every) if one is not None and one.physical]
+@dataclass(eq=False)
+class _Changes:
+    """Constant changes that leading terms in windows are held against.
+
+    Attributes:
+        search: Whose terms these are.
+        prior: Log prior probability of each change.
+        named: Places where a constant of the list has a name.
+        elsewhere: Parameters of the base and gains of outputs, which change whatever acts there.
+        tried: Places and windows from which one has been refitted.
+    """
+
+    search: Search
+    prior: float
+    named: set[Places | None]
+    elsewhere: list[Places]
+    tried: set[tuple[Places, str, float, float]] = field(default_factory=set)
+
+    @classmethod
+    def of(cls, search: Search) -> "_Changes":
+        """Those of a search that knows its constants."""
+        problem = search.base.problem
+        count = len({(c.kind, c.target) for c in channels(problem, search.base) if c.kind in problem.kinds})
+        prior = math.log(PRIOR["none"] / max(count, 1)) - math.log(3.0 * len(search.drivers()))
+        # That of an instrument in a part of its range has no name.
+        listed = (search.candidates[i] for i in search.constants)
+        named = {_places(candidate) for candidate in listed if not candidate.terms[0].outputs}
+        return cls(search, prior, named, _elsewhere(search))
+
+    def hold_against(self, lead: Model) -> None:
+        """Refit changes beside the leading terms in windows: where these act, but not in places that a constant of the
+        list names; and those elsewhere that come nearest."""
+        search = self.search
+        near = [m for m in search.models if m.physical and m.window is not None and m.weight > lead.weight - CLOSE]
+        wanted: dict[tuple[Places, str], list[Hypothetical]] = {}
+        for model in sorted(near, key=lambda m: -m.weight)[:MOST]:
+            where, window = _places(model.candidate), model.window
+            if where is None or window is None:
+                continue
+            others = []
+            for place in dict.fromkeys([where, *self.elsewhere]):
+                key = (place, window.driver, window.low, window.high)
+                if (place, window.driver) in wanted or key in self.tried or place in self.named:
+                    continue
+                self.tried.add(key)
+                begun, chi2 = _wanted(search, model, place, self.prior)
+                if place == where:
+                    wanted[place, window.driver] = begun
+                elif chi2 < search.base.chi2:
+                    others.append((chi2, place, begun))
+            for _, place, begun in sorted(others, key=lambda one: one[0])[:ELSEWHERE]:
+                wanted[place, window.driver] = begun
+        every = [one for each in wanted.values() for one in each]
+        search.nameless += [one for one in _refitted(search, every) if one is not None and one.physical]
+
+
+def _elsewhere(search: Search) -> list[Places]:
+    """Every calibrated parameter of the base, and the gain of every output, but what is the same as another or as a
+    candidate of the list."""
+    problem = search.base.problem
+    simulator = problem.simulator
+    declared = simulator.ode.parameters if isinstance(simulator, Trajectories) else problem.parameters
+    free = [problem.parameters[i].name for i in search.base.free]
+    names = [q.name for q in declared if any(one == q.name or one.startswith(f"{q.name}[") for one in free)]
+    listed = [c.tangents[0] for c in search.candidates if c.tangents.shape[::2] == (1, 1)]
+    found: list[Places] = []
+    for place in [("shifts", name) for name in names] + [("gains", name) for name in search.problem.recording.outputs]:
+        with suppress(SimulatorError, DomainError):
+            change = _constant((place,), search.problem.in_time)
+            own = prepare(problem, search.base, [change], search.fixed, {}).tangents[0]
+            if own.norm() > 0 and not any(_within(own, other) for other in listed):
+                found.append((place,))
+                listed.append(own)
+    return found
+
+
+def _within(own: Tensor, plane: Tensor) -> bool:
+    """Whether an effect ``(n, 1)`` is a combination of others ``(n, m)``."""
+    left = own - plane @ torch.linalg.lstsq(plane, own, driver="gelsd").solution
+    return 0 < float(own.norm()) and float(left.norm()) <= SAME * float(own.norm())
 
 
 def _refitted(search: Search, wanted: Sequence[Hypothetical]) -> list[Model | None]:
@@ -127,28 +194,26 @@ def _places(candidate: Candidate) -> Places | None:
 def _is_constant(search: Search, candidate: Candidate) -> bool:
     """Whether a term of the list is a constant change."""
     (term,) = candidate.terms
-    if _places(candidate) is None or candidate.tangents.shape[::2] != (1, 1):
+    where = _places(candidate)
+    if where is None or candidate.tangents.shape[::2] != (1, 1):
         return False
     try:
         # Both at the base as it stands, which has moved with the noise since the candidate's own tangents.
         now, constant = (
             prepare(search.base.problem, search.base, [one], search.fixed, {}).tangents
-            for one in (term, _constant(term, search.problem.in_time))
+            for one in (term, _constant(where, search.problem.in_time))
         )
     except (SimulatorError, DomainError):
         return False
-    if now.shape[::2] != (1, 1):
-        return False
-    own, plane = now[0], constant[0]
-    left = own - plane @ torch.linalg.lstsq(plane, own, driver="gelsd").solution
-    return 0 < float(own.norm()) and float(left.norm()) <= SAME * float(own.norm())
+    return now.shape[::2] == (1, 1) and _within(now[0], constant[0])
 
 
-def _wanted(search: Search, model: Model, prior: float) -> list[Hypothetical]:
-    """A constant in a model's window, with steep edges and with edges to fit; an open window closed as well."""
-    w, (term,) = model.window, model.candidate.terms
+def _wanted(search: Search, model: Model, where: Places, prior: float) -> tuple[list[Hypothetical], float]:
+    """A constant in a model's window, with steep edges and with edges to fit; an open window closed as well. And the
+    least χ² of all their beginnings, for linear."""
+    w = model.window
     if w is None:
-        return []
+        return [], math.inf
     driver = search.drivers()[w.driver]
     inside = driver[(driver >= w.low) & (driver <= w.high)]
     span = w.span or Span.of(driver)
@@ -160,22 +225,23 @@ def _wanted(search: Search, model: Model, prior: float) -> list[Hypothetical]:
         last = w.low if math.isfinite(w.low) else w.high  # the end that it has, which need not be one of the data
         cuts = sorted({*cuts[1:], last}) if math.isfinite(w.low) else sorted({*cuts[:-1], last})
         ends += [list(itertools.combinations(cuts, 2))] if len(cuts) > 1 else []
-    found = []
+    found, least = [], math.inf
     for chosen, edge in itertools.product(ends, (False, True)):
         low, high = chosen[0]
         near = span.edged(low, high)
         local = localised(
-            _constant(term, search.problem.in_time), w.driver, low, high, near,
+            _constant(where, search.problem.in_time), w.driver, low, high, near,
             static=not search.problem.in_time, edge=edge,
         )  # fmt: skip
         try:
             candidate = prepare(search.base.problem, search.base, [local], search.fixed, {})
-            begin = _begin(search, model, candidate, chosen, span)
+            begin, chi2 = _begin(search, model, candidate, chosen, span)
         except (SimulatorError, DomainError):
             continue
         window = dataclasses.replace(w, low=low, high=high, span=near)
         found.append(Hypothetical((), candidate, begin, prior, window))
-    return found
+        least = min(least, chi2)
+    return found, least
 
 
 def _anywhere(search: Search, model: Model) -> Hypothetical | None:
@@ -189,15 +255,15 @@ def _anywhere(search: Search, model: Model) -> Hypothetical | None:
     local = localised(term, w.driver, cuts[0], cuts[-1], span, static=not search.problem.in_time, edge=True)
     try:
         candidate = prepare(search.base.problem, search.base, [local], search.fixed, {})
-        begin = _begin(search, model, candidate, list(itertools.combinations(cuts, 2)), span)
+        begin, _ = _begin(search, model, candidate, list(itertools.combinations(cuts, 2)), span)
     except (SimulatorError, DomainError):
         return None
     window = dataclasses.replace(w, low=cuts[0], high=cuts[-1], span=span)
     return Hypothetical(model.numbers, candidate, begin, model.log_prior, window)
 
 
-def _constant(term: Term, in_time: bool) -> Term:
-    """A constant change of its own in every place where a term acts."""
+def _constant(where: Places, in_time: bool) -> Term:
+    """A constant change of its own in every one of some places."""
     number = itertools.count(1)
 
     def added() -> Callable[..., Any]:
@@ -208,18 +274,24 @@ def _constant(term: Term, in_time: bool) -> Term:
         own = added()
         return lambda *given: given[-1] + own(*given)
 
-    kinds: dict[str, Any] = {
-        "rates": {name: added() for name in term.rates},
-        "outputs": {name: shown() for name in term.outputs},
-        "shifts": {name: added() for name in term.shifts},
-    }
-    return Term("something unknown", **kinds, parameters=[Parameter(f"c{i}") for i in range(1, next(number))])
+    def scaled() -> Callable[..., Any]:
+        own = added()
+        return lambda *given: given[-1] * (1 + own(*given))
+
+    how = {"rates": ("rates", added), "outputs": ("outputs", shown), "shifts": ("shifts", added),
+           "gains": ("outputs", scaled)}  # fmt: skip
+    kinds: dict[str, Any] = {}
+    for kind, name in where:
+        place, change = how[kind]
+        kinds.setdefault(place, {})[name] = change()
+    what = " and ".join(f"a change of {name}" for kind, name in where if kind == "shifts")
+    return Term(what or "something unknown", **kinds, parameters=[Parameter(f"c{i}") for i in range(1, next(number))])
 
 
 def _begin(
     search: Search, model: Model, candidate: Candidate, ends: Sequence[tuple[float, float]], span: Span
-) -> Tensor:
-    """Starting values at a model's base, of the best size each; those of the best few."""
+) -> tuple[Tensor, float]:
+    """Starting values at a model's base, of the best size each, those of the best few; and the least χ², for linear."""
     known, problem = model.found.by_name, candidate.problem
     names = [q.name for q in problem.parameters]
     places = candidate.amplitudes
@@ -244,8 +316,10 @@ def _begin(
     # Of places where nothing happens the size stays as it is.
     scale = effect.norm(dim=1, keepdim=True).clamp_min(1e-300)
     size = torch.linalg.pinv(effect / scale, rtol=RANK) @ left[..., None]
-    begin[:, places] += (size[..., 0] / scale[:, 0])
+    begin[:, places] += size[..., 0] / scale[:, 0]
     chi2 = (left - ((effect / scale) @ size)[..., 0]).square().sum(-1)
     chi2 = chi2.masked_fill(lost, torch.inf)
-    order = chi2.nan_to_num(nan=torch.inf).reshape(len(widths), -1).argsort(-1)[:, :STARTS]
-    return begin.reshape(len(widths), -1, begin.shape[-1])[torch.arange(len(widths))[:, None], order].flatten(0, 1)
+    chi2 = chi2.nan_to_num(nan=torch.inf)
+    order = chi2.reshape(len(widths), -1).argsort(-1)[:, :STARTS]
+    best = begin.reshape(len(widths), -1, begin.shape[-1])[torch.arange(len(widths))[:, None], order]
+    return best.flatten(0, 1), float(chi2.min())

@@ -151,7 +151,8 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         search.unnamed = None
         if nameless is not None and nameless.weight > decision.none_evidence:
             search.unnamed = nameless
-            decision.none_evidence, decision.none_note = nameless.weight, f"something unknown where {nameless.where}"
+            decision.none_evidence = nameless.weight
+            decision.none_note = f"{nameless.candidate.name} where {nameless.where}"
         elif leading is not None and leading.period is not None:
             decision.none_note = "an unknown oscillation"
     _weigh(search, decision)
