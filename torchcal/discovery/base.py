@@ -25,6 +25,8 @@ SAME_FIT = 0.01
 MOST = 0.2
 #: How often steps are made four times shorter where no starting value has a finite solution.
 STEEP = 3
+#: How often noise that grows is estimated from what it leaves when it is weighed.
+GROWTHS = 4
 
 
 def calibrate_base(
@@ -95,19 +97,23 @@ def calibrate_base(
     noise = estimate(found.problem, found.residual, found.jacobian, recording.noise, units)
     base = refit(found, noise.whitening(found.problem))
     if not exact:
-        units = growing(base) if unit is None else unit
-        noise = estimate(base.problem, base.residual, base.jacobian, recording.noise, units)
-        base = _sharpen(refit(base, noise.whitening(base.problem)))
+        for _ in range(1 if unit is not None else GROWTHS):  # what large data hide of small ones, their weights show
+            before, units = units, growing(base, units) if unit is None else unit
+            noise = estimate(base.problem, base.residual, base.jacobian, recording.noise, units)
+            base = refit(base, noise.whitening(base.problem))
+            if torch.allclose(units, before):
+                break
+        base = _sharpen(base)
     return base, noise
 
 
-def growing(found: Fitted) -> Tensor:
+def growing(found: Fitted, unit: Tensor | None = None) -> Tensor:
     """How unknown noise grows with the outputs, by the residual of a fit, ``(n_total,)``; see `growth`."""
     if found.problem.recording.noise is not None:
         return torch.ones_like(found.problem.recording.y)
     whole = dataclasses.replace(found.problem, keep=torch.ones_like(found.problem.keep))
     f = whole.evaluate(found.values[None], [], found.warm)[0][0]
-    return growth(found.problem, found.residual, found.jacobian, f)
+    return growth(found.problem, found.residual, found.jacobian, f, unit)
 
 
 def _from_starts(problem: Problem, begin: Tensor, free: list[int], rough: Tensor, outputs: Tensor) -> Fitted | None:

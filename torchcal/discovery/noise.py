@@ -35,7 +35,7 @@ FLOOR = 1e-7
 #: Fewest data of an output whose noise may grow with it; the log-likelihood that this must gain; the sd at zero that
 #: are tried, in those at the largest output; the ratio of the largest sd to the smallest below which nothing is gained;
 #: and as how many independent data differences of neighbours count.
-FEWEST, GROWS, OFFSETS, LITTLE, INDEPENDENT = 20, 3.0, (0.003, 0.01, 0.03, 0.1, 0.3), 4.0, 0.6
+FEWEST, GROWS, OFFSETS, LITTLE, INDEPENDENT = 20, 3.0, (0.001, 0.003, 0.01, 0.03, 0.1, 0.3), 4.0, 0.6
 #: Ratio of the largest to the smallest sd of an output from which on both are told.
 VARIES = 1.05
 #: How much larger the noise found may be than the noise given before the given one is doubted.
@@ -242,15 +242,16 @@ def _beyond(problem: Problem, places: Tensor, design: Tensor, unit: Tensor, *, e
     return orthonormal(wide, most=int(0.6 * len(places)))
 
 
-def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor) -> Tensor:
+def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor, before: Tensor | None = None) -> Tensor:
     """Noise sd in units of its median, ``(n_total,)``: 1, or growing with the model's output where the scatter does.
 
     An sd of a + |f| / max |f| is taken for the best of a few a where it makes the fastest part of the residual much
     likelier (by `GROWS`; Laplace's distribution, whose scale a few outliers move little). Where there are replicates,
     how far they are off their means takes the place of the residual. It is for noise of unknown size. Outputs ``f`` are
-    those of all data, used or not, ``(n_total,)``.
+    those of all data, used or not, ``(n_total,)``; ``before`` is what was found before, by which data are weighed.
     """
     unit = torch.ones_like(problem.recording.y)
+    before = unit if before is None else before
     f, replicated = f.abs(), _replicates(problem)
     for output in range(len(problem.recording.outputs)):
         parts = [places for places in problem.recorded if int(problem.output_of[places[0]]) == output]
@@ -263,7 +264,7 @@ def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor) -> Ten
         else:
             left, size = [], []
             for places in parts:
-                kept, inside = _fastest(problem, places, residual, design)
+                kept, inside = _fastest(problem, places, residual, design, before)
                 left.append(kept)
                 size.append(f[problem.index[places]][inside] / used.max())
             e, size_of = torch.cat(left).abs(), torch.cat(size)
@@ -282,18 +283,20 @@ def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor) -> Ten
     return torch.where(torch.isfinite(unit), unit, 1.0)
 
 
-def _fastest(problem: Problem, places: Tensor, residual: Tensor, design: Tensor) -> tuple[Tensor, slice]:
+def _fastest(
+    problem: Problem, places: Tensor, residual: Tensor, design: Tensor, unit: Tensor
+) -> tuple[Tensor, slice]:
     """What a sequence has that no smooth curve has, and at which of its data.
 
     In an order by how much data are off the line between their neighbours, which hardly any misfit moves; elsewhere
-    what is left beyond smooth curves.
+    what is left beyond smooth curves, weighed by a unit of the noise ``(n_total,)``.
     """
     r = residual[places]
     if len(r) < 3:
         return r[:0], slice(0, 0)
     if problem.order is None:
-        basis = _beyond(problem, places, design, torch.ones_like(problem.recording.y))
-        return r - basis @ (basis.T @ r), slice(None)
+        basis, size = _beyond(problem, places, design, unit), unit[problem.index[places]]
+        return r - size * (basis @ (basis.T @ (r / size))), slice(None)
     at = problem.order[problem.condition_of[places]]
     at = at if bool((at.diff() > 0).all()) else torch.arange(len(r), dtype=torch.float64)
     share = (at[1:-1] - at[:-2]) / (at[2:] - at[:-2])

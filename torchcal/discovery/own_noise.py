@@ -157,7 +157,7 @@ def other_growth(search: "Search") -> Tensor | None:
     best = search.leader
     if search.unit is not None or not search.noise.open or best is None or not explains(search):
         return None
-    unit = growing(best.found)
+    unit = growing(best.found, search.noise.unit)
     same = all(
         bool((unit[here] == 1).all()) == bool((search.noise.unit[here] == 1).all())
         for here in (mine(search.problem, output) for output in range(len(search.problem.recording.outputs)))
