@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcal import Recording, calibrate
+from torchcal import Recording, Term, calibrate, diagnose
 from torchcal.embeddings import Gaussian
 from torchcal.errors import DomainError, ShapeError, SimulatorError
 from torchcal.propagation import NISP
@@ -184,6 +184,13 @@ def test_vectorized_functions_refuse_shifted_parameters():
     simulator = ExternalSimulator(arrays, PARAMETERS, vectorized=True)
     with pytest.raises(SimulatorError, match="vectorized=False"):
         simulator.function(X, {"a": X["t"], "b": torch.ones(1).double()})
+
+
+def test_a_term_that_shifts_a_parameter_of_a_vectorized_function_is_refused_by_its_name():
+    simulator = ExternalSimulator(arrays, PARAMETERS, vectorized=True)
+    term = Term("ageing", shifts={"a": lambda x, p: p["m"] * x["t"]}, parameters=[Parameter("m")])
+    with pytest.raises(DomainError, match=r"^Expected a term without shifts= .*'ageing'.*vectorized=False"):
+        diagnose(simulator, Recording(x=X, y={"y": X["t"]}), [term], progress=False)
 
 
 def test_gradient_takes_2d_evaluations_a_row_and_only_when_needed(values):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchcal.display import NONE
 from torchcal.errors import DomainError, SimulatorError, TorchcalError
-from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories, Values
+from torchcal.simulators import ExternalSimulator, ODESimulator, Parameter, Simulator, Trajectories, Values
 
 __all__ = ["Term", "extend", "outer"]
 
@@ -371,6 +371,13 @@ def _extend_static(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
             raise DomainError(
                 f"Expected a term without rates for a static simulator. Got {term.name!r} (give shifts=, outputs= or "
                 "frees=, or write the model as an ODESimulator)."
+            )
+        plain = _plain(simulator, ())[0]
+        if term.shifts and isinstance(plain, ExternalSimulator) and plain.vectorized:
+            raise DomainError(
+                "Expected a term without shifts= for a vectorized ExternalSimulator, which takes each parameter as one "
+                f"number for all conditions. Got {term.name!r} (give the simulator vectorized=False, or the code a "
+                "switch: a parameter with a neutral value, which a term frees)."
             )
     parameters = _parameters(simulator, terms)
     if not any(term.shifts or term.outputs for term in terms):
