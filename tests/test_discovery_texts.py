@@ -408,3 +408,16 @@ def test_a_term_that_frees_what_is_free_is_told():
     assert "slope frees what is calibrated already, and was no candidate" in d.identifiability
     with pytest.raises(tc.errors.DomainError, match=r"without the parameters that candidates free\. Got 'k'"):
         tc.diagnose(base, tc.Recording(x=x, y=y), [tc.Term("slope", frees=("k",))], fixed={"k": 1.0}, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("shares", "told"),
+    [((0.4, 0.35, 0.2), "3 hypotheses explain it about as well, and"),
+     ((0.6, 0.3, 0.05), "3 hypotheses explain it with probabilities from 0.60 to 0.05, and"),
+     ((0.3, 0.3), "2 hypotheses explain it about as well, and these data cannot exclude either"),
+     ((0.9, 0.05), "b0 explains it best (probability 0.90); these data cannot exclude the other.")],
+)  # fmt: skip
+def test_how_well_tied_hypotheses_do_is_their_probability(shares, told):
+    names = [f"b{k}" for k in range(len(shares))]
+    rows = [row((name,), share) for name, share in zip(names, shares, strict=True)]
+    assert told in said(finding("ambiguous", tied=[[name] for name in names], ranking=rows))

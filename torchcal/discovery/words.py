@@ -323,8 +323,9 @@ def _ambiguous(d: Any) -> list[str]:
         told += f"exclude {others}."
     else:
         which = "either" if len(known) == 2 else "any"
-        alike = min(filter(None, shares), default=1.0) > AS_WELL * shares[best]
-        well = "about as well" if alike else "more or less well"
+        least = min(filter(None, shares), default=1.0)
+        range_ = f"with probabilities from {shares[best]:.2f} to {least:.2f}"
+        well = "about as well" if least > AS_WELL * shares[best] else range_
         told = f"{len(known)} hypotheses explain it {well}, and these data cannot exclude {which} of them."
     parts = [where_in_words(d), told]
     sets = [set(tied) for tied in known]
