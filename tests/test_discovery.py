@@ -657,6 +657,16 @@ def test_a_hold_out_is_chosen_before_the_fit():
     assert estimate_of(none, "bias force.b").value == pytest.approx(estimate_of(own, "bias force.b").value, rel=1e-6)
 
 
+@pytest.mark.parametrize(("bounds", "most"), [({}, math.inf), ({"low": 1.0, "high": 4.0}, 1.5)])
+def test_model_error_in_a_parameter_is_no_wider_than_its_bounds_allow(bounds, most):
+    """Between two bounds no density has an sd above half their distance; the likeliest one is about 2.1 here."""
+    x = torch.linspace(0, 20, 60, dtype=F64)
+    base = tc.Simulator(lambda x, p: p["c"] + p["m"] * x, [tc.Parameter("c", **bounds), tc.Parameter("m")])
+    d = quiet(base, tc.Recording(x=x, y=2.5 + x + 3 * torch.sin(2 * x), noise=0.1), [])
+    (width,) = [row.sd for row in d.embedded if row.parameter == "c"]
+    assert width == pytest.approx(min(most, 3 / math.sqrt(2)), rel=0.08)
+
+
 def test_a_hold_out_of_numpy_and_lists():
     body, motion, library = pushed(0.08)
     mask = [k >= 90 for k in range(101)]

@@ -5,11 +5,13 @@ polynomial chaos of the output). Its likelihood is the marginal Gaussian one,
 
 .. math:: r_i \\sim N\\big(0,\\; s_i^2 + (\\partial f_i/\\partial\\lambda_j)^2 \\sigma_j^2\\big)
 
-with the noise sd s_i. A full embedding, with all coefficients inferred, is `torchcal.calibrate`.
+with the noise sd s_i. Of a parameter with two bounds σ_j is at most half their distance, the largest sd of any density
+between them (Popoviciu 1935). A full embedding, with all coefficients inferred, is `torchcal.calibrate`.
 
 Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 17, 28-29.
 """
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -62,7 +64,9 @@ def embed_each(found: Fitted, noise: Noise, parameters: list[str] | None = None)
         size = float(slope2.max())
         if size <= 0:
             continue
-        variance = float(r2.max()) / size * GRID.square()
+        q = found.problem.parameters[found.free[k]]
+        most = math.inf if q.low is None or q.high is None else 0.5 * (q.high - q.low)
+        variance = (float(r2.max()) / size * GRID.square()).clamp_max(most**2)
         total = s2 + variance[:, None] * slope2
         logs = -0.5 * (total.log() + r2 / total).sum(-1)
         best = int(logs.argmax())
