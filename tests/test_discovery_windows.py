@@ -307,6 +307,8 @@ def test_a_term_that_bends_to_a_dip_is_no_name(seed):
     assert what in ("something unknown", "a change of G")
     low, high = (float(end) for end in place.split(" < V < "))
     assert 1.0 < low < 1.2 < high < 1.4
+    places = [(place.kind, place.target, place.driver) for place in d.where]
+    assert len(set(places)) == len(places)
     if d.verdict == "unexplained":  # the place is where it is, not where the best term of the list would act
         assert d.where[0].spans == (pytest.approx((low, high), abs=1e-3),)
 

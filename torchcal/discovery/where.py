@@ -87,10 +87,11 @@ def locate(search: Search, best: Model | None, *, named: bool = False) -> Table[
         places.sort(key=lambda place: (place.channel.kind, place.channel.target) not in own)
         if not places or (places[0].channel.kind, places[0].channel.target) not in own:
             rows.append(_contributed(search, best, [place.driver for place in places]))
-    seen = set()
+    seen: set[tuple[str, str]] = set()
+    told = {(row.kind, row.target, row.driver) for row in rows}
     for place in places:
         key = (place.channel.kind, place.channel.target)
-        if key in seen:
+        if key in seen or (*key, place.driver) in told:
             continue
         seen.add(key)
         extent = _extent(place.channel.drivers[place.driver])
