@@ -18,7 +18,7 @@ from torchcal.discovery.own_noise import (
 )
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.search import Search
-from torchcal.discovery.verdict import base_alone
+from torchcal.discovery.verdict import WHITE, base_alone
 from torchcal.discovery.windows import refit_local
 
 __all__ = ["settle", "with_all"]
@@ -57,10 +57,13 @@ def settle(search: Search, observed: Problem, confidence: float) -> tuple[Search
 def _again(search: Search, observed: Problem, detected: bool, confidence: float) -> tuple[Search, bool]:
     """Refit once more where others of the observed data turn out to be outliers of the best model, or noise to grow."""
     seen = [search.problem.keep]
-    for _ in range(ROUNDS):
+    for number in range(ROUNDS):
         if search.stop.is_set():
             break
-        sticking = outliers(search, observed.keep) if detected else None
+        # What a model misses that leaves more than noise may be that: such ones tell once, or each tells others.
+        best = search.leader
+        clear = number == 0 or best is None or search.examine(best).p_value >= WHITE
+        sticking = outliers(search, observed.keep) if detected and clear else None
         unit = other_growth(search) if detected else None
         if sticking is not None and any(torch.equal(keep, observed.keep & ~sticking) for keep in seen):
             sticking = None
