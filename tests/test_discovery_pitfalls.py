@@ -509,6 +509,31 @@ def test_a_share_of_a_value_that_spans_decades_is_no_physics_among_several_condi
     assert alarms <= 1
 
 
+@pytest.mark.parametrize("bent", [0.0, 0.02])
+def test_an_effect_that_is_large_in_noise_that_grows_is_named_and_its_absence_is_not(bent):
+    """A turnover over five decades, read to 3 %: what the base misses of the largest values looked like their noise, so
+    that the larger the effect was the less it had a name."""
+    supply, T = (grid.ravel() for grid in np.meshgrid(np.logspace(0, 2.5, 14), np.linspace(0, 40, 5)))
+    base = tc.Simulator(
+        lambda x, p: p["a"] * x["C"] ** p["m"] * torch.exp(p["E"] * (x["T"] - 20) / 10),
+        [tc.Parameter("a", low=0.0, initial=1.0), tc.Parameter("m", initial=1.2), tc.Parameter("E", initial=0.5)],
+    )
+    terms = [
+        tc.Term("blank", outputs={"y": lambda x, p, y: y + p["f"]}, parameters=[tc.Parameter("f")]),
+        tc.Term("optimum", shifts={"E": lambda x, p: -p["e"] * (x["T"] - 20)}, parameters=[tc.Parameter("e")]),
+        tc.Term("acclimation", shifts={"m": lambda x, p: p["k"] * (x["T"] - 20)}, parameters=[tc.Parameter("k")]),
+        tc.Term("satiation", shifts={"m": lambda x, p: -p["s"] * torch.log(x["C"])}, parameters=[tc.Parameter("s")]),
+    ]
+    found = []
+    for seed in range(6):
+        y = 0.8 * supply**1.5 * np.exp((0.7 - bent * (T - 20)) * (T - 20) / 10)
+        y = y * (1 + 0.03 * np.random.default_rng(seed).standard_normal(len(y)))
+        d = diagnose(base, tc.Recording(x={"C": supply, "T": T}, y={"y": y}), terms)
+        found.append((d.verdict, d.terms))
+    expected = ("named", ["optimum"]) if bent else ("consistent", [])
+    assert found.count(expected) >= 5
+
+
 def test_a_misfit_that_grows_with_the_value_is_not_noise_that_does():
     # A peak's missing asymmetry, coarsely sampled: most where the peak is high. Once it is named, its noise is even.
     x = torch.linspace(-5, 5, 30, dtype=F64)

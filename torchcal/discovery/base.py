@@ -79,12 +79,12 @@ def calibrate_base(
             "stiff model replace a fast state by its equilibrium, or give max_step=."
         )
     found = _unwound(_sharpen(found))
+    found, units = _grown(found, unit)
     if not exact and not clean:
         whole = found
         for _ in range(3):
             given = recording.noise if isinstance(recording.noise, Tensor) else None
-            units = (growing(found) if unit is None else unit)[found.problem.index]
-            bad = spikes(found.problem, found.residual / units, given)
+            bad = spikes(found.problem, found.residual / units[found.problem.index], given)
             if not bool(bad.any()):
                 break
             keep = found.problem.keep.clone()
@@ -92,19 +92,31 @@ def calibrate_base(
             if float(keep.sum()) < (1 - MOST) * whole.problem.n:  # so many are none
                 found = whole
                 break
-            found = _again(found, keep)
-    units = growing(found) if unit is None else unit
+            found, units = _grown(_again(found, keep), unit)
     noise = estimate(found.problem, found.residual, found.jacobian, recording.noise, units)
     base = refit(found, noise.whitening(found.problem))
     if not exact:
-        for _ in range(1 if unit is not None else GROWTHS):  # what large data hide of small ones, their weights show
-            before, units = units, growing(base, units) if unit is None else unit
-            noise = estimate(base.problem, base.residual, base.jacobian, recording.noise, units)
-            base = refit(base, noise.whitening(base.problem))
-            if torch.allclose(units, before):
-                break
-        base = _sharpen(base)
+        base, units = _grown(base, unit, units)
+        noise = estimate(base.problem, base.residual, base.jacobian, recording.noise, units)
+        base = _sharpen(refit(base, noise.whitening(base.problem)))
     return base, noise
+
+
+def _grown(found: Fitted, unit: Tensor | None, units: Tensor | None = None) -> tuple[Fitted, Tensor]:
+    """A fit and how its noise grows, ``(n_total,)``, each by the other; ``unit`` where that is known.
+
+    What large data leave hides how little small ones scatter, until they are weighed so.
+    """
+    units = torch.ones_like(found.problem.recording.y) if units is None else units
+    if unit is not None:
+        return found, unit
+    for _ in range(GROWTHS):
+        before, units = units, growing(found, units)
+        if torch.allclose(units, before):
+            break
+        noise = estimate(found.problem, found.residual, found.jacobian, None, units)
+        found = refit(found, noise.whitening(found.problem))
+    return found, units
 
 
 def growing(found: Fitted, unit: Tensor | None = None) -> Tensor:

@@ -35,7 +35,10 @@ FLOOR = 1e-7
 #: Fewest data of an output whose noise may grow with it; the log-likelihood that this must gain; the sd at zero that
 #: are tried, in those at the largest output; the ratio of the largest sd to the smallest below which nothing is gained;
 #: and as how many independent data differences of neighbours count.
-FEWEST, GROWS, OFFSETS, LITTLE, INDEPENDENT = 20, 3.0, (0.001, 0.003, 0.01, 0.03, 0.1, 0.3), 4.0, 0.6
+FEWEST, GROWS, LITTLE, INDEPENDENT = 20, 3.0, 4.0, 0.6
+OFFSETS = (1e-5, 3e-5, 1e-4, 3e-4, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3)
+#: Least share of a datum's own noise that smooth curves leave of it.
+LEVERAGE = 0.1
 #: Ratio of the largest to the smallest sd of an output from which on both are told.
 VARIES = 1.05
 #: How much larger the noise found may be than the noise given before the given one is doubted.
@@ -296,7 +299,8 @@ def _fastest(
         return r[:0], slice(0, 0)
     if problem.order is None:
         basis, size = _beyond(problem, places, design, unit), unit[problem.index[places]]
-        return r - size * (basis @ (basis.T @ (r / size))), slice(None)
+        left = (1 - basis.square().sum(1)).clamp_min(LEVERAGE).sqrt()  # what the curves leave of the noise of a datum
+        return (r - size * (basis @ (basis.T @ (r / size)))) / left, slice(None)
     at = problem.order[problem.condition_of[places]]
     at = at if bool((at.diff() > 0).all()) else torch.arange(len(r), dtype=torch.float64)
     share = (at[1:-1] - at[:-2]) / (at[2:] - at[:-2])

@@ -51,6 +51,8 @@ LIKELIER = 3.0
 ROUNDING = 0.01
 #: Share of the search's noise sd below which a model's own takes its place.
 OUTDATED = 0.8
+#: Mean relative difference of the noise's sd in its unit, in logarithms, from which on it grows otherwise.
+OTHERWISE = 0.5
 
 
 def suited(search: "Search", models: Sequence[Model]) -> Noise:
@@ -158,8 +160,10 @@ def other_growth(search: "Search") -> Tensor | None:
     if search.unit is not None or not search.noise.open or best is None or not explains(search):
         return None
     unit = growing(best.found, search.noise.unit)
+    before = search.noise.unit
     same = all(
-        bool((unit[here] == 1).all()) == bool((search.noise.unit[here] == 1).all())
+        bool((unit[here] == 1).all()) == bool((before[here] == 1).all())
+        and float((unit[here] / before[here]).log().abs().mean()) <= OTHERWISE
         for here in (mine(search.problem, output) for output in range(len(search.problem.recording.outputs)))
     )
     return None if same else unit
