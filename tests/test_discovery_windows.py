@@ -381,6 +381,25 @@ def test_what_changes_a_factor_of_the_base_in_a_range_is_no_name(seed, depth):
     assert 180 < span[0] < 220 < span[1] < 260
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_bend_that_is_in_no_list_is_no_window_of_a_curved_term(seed):
+    """Extinction that grows from an airmass of 2.2 on: a curved term that begins at 2.4 was named there (seed 1)."""
+    rng = np.random.default_rng(seed)
+    X, colour = (grid.ravel() for grid in np.meshgrid(np.linspace(1, 3, 20), np.linspace(-0.3, 1.5, 5)))
+    m = 20.1 + 0.25 * X + 0.07 * colour + 0.07 * np.maximum(X - 2.2, 0) + 0.004 * rng.standard_normal(100)
+    base = tc.Simulator(
+        lambda x, p: p["z"] + p["k"] * x["X"] + p["c"] * x["col"],
+        [tc.Parameter("z", initial=20.0), tc.Parameter("k", initial=0.2), tc.Parameter("c", initial=0.05)],
+    )
+    terms = [
+        tc.Term("curved airmass", shifts={"k": lambda x, p: p["a"] * (x["X"] - 1) ** 2}, parameters=[A]),
+        tc.Term("second order", shifts={"k": lambda x, p: p["a"] * x["col"]}, parameters=[A]),
+    ]
+    d = diagnose(base, tc.Recording(x={"X": X, "col": colour}, y={"m": m}, noise=0.004), terms)
+    assert d.settings.get("region") is None
+    assert d.verdict == "unexplained" or ["none of these"] in d.tied
+
+
 def test_a_window_that_leaves_something_is_not_the_best_one():
     """A spring that stiffens between two ends: another term that begins in the middle was named in its place."""
     recording = recorded(lambda t, x, v: -2.0 * x**3 if -0.75 < x < 0.5 else 0.0, n=240)

@@ -9,7 +9,7 @@ A term whose window leaves something is tried in all others: from the base alone
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchcal.discovery.candidates import Candidate, prepare
 from torchcal.discovery.channels import channels
-from torchcal.discovery.local import EDGE, WIDTH_OF_EDGE, WIDTHS, Span, is_window, localised
+from torchcal.discovery.local import EDGE, ENDS, WIDTH_OF_EDGE, WIDTHS, Span, is_window, localised
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.own_noise import likeliest_alone
 from torchcal.discovery.search import BETTER, Search
@@ -209,8 +209,8 @@ def _is_constant(search: Search, candidate: Candidate) -> bool:
 
 
 def _wanted(search: Search, model: Model, where: Places, prior: float) -> tuple[list[Hypothetical], float]:
-    """A constant in a model's window, with steep edges and with edges to fit; an open window closed as well. And the
-    least χ² of all their beginnings, for linear."""
+    """A constant in a model's window, with steep edges and with edges to fit; an open window closed as well, and with a
+    change that grows from its end. And the least χ² of all their beginnings, for linear."""
     w = model.window
     if w is None:
         return [], math.inf
@@ -225,12 +225,17 @@ def _wanted(search: Search, model: Model, where: Places, prior: float) -> tuple[
         last = w.low if math.isfinite(w.low) else w.high  # the end that it has, which need not be one of the data
         cuts = sorted({*cuts[1:], last}) if math.isfinite(w.low) else sorted({*cuts[:-1], last})
         ends += [list(itertools.combinations(cuts, 2))] if len(cuts) > 1 else []
+    constant = _constant(where, search.problem.in_time)
+    shapes = [(constant, chosen, edge) for chosen in ends for edge in (False, True)]
+    if len(ends) > 1:
+        grows = _distance(w.driver, ENDS["from" if math.isfinite(w.low) else "to"], span, search.problem.in_time)
+        shapes.append((_constant(where, search.problem.in_time, grows), ends[0], False))
     found, least = [], math.inf
-    for chosen, edge in itertools.product(ends, (False, True)):
+    for change, chosen, edge in shapes:
         low, high = chosen[0]
         near = span.edged(low, high)
         local = localised(
-            _constant(where, search.problem.in_time), w.driver, low, high, near,
+            change, w.driver, low, high, near,
             static=not search.problem.in_time, edge=edge,
         )  # fmt: skip
         try:
@@ -262,13 +267,29 @@ def _anywhere(search: Search, model: Model) -> Hypothetical | None:
     return Hypothetical(model.numbers, candidate, begin, model.log_prior, window)
 
 
-def _constant(where: Places, in_time: bool) -> Term:
-    """A constant change of its own in every one of some places."""
+def _distance(driver: str, end: str, span: Span, in_time: bool) -> Callable[..., Any]:
+    """How far a driver is beyond an end of a window, in its range; of what a term's functions are given."""
+
+    def beyond(*given: Any) -> Any:
+        if in_time:
+            t, s, p, u = given[:4]
+            d = t if driver == "t" else s[driver] if driver in s else u[driver]
+        else:
+            x, p = given[:2]
+            d = x[driver] if isinstance(x, Mapping) else x
+        return span.distance(d, p[end]) / span.size
+
+    return beyond
+
+
+def _constant(where: Places, in_time: bool, grows: Callable[..., Any] | None = None) -> Term:
+    """A constant change of its own in every one of some places, or one that grows in proportion to something."""
     number = itertools.count(1)
 
     def added() -> Callable[..., Any]:
         name = f"c{next(number)}"
-        return lambda *given: given[2 if in_time else 1][name]
+        constant = lambda *given: given[2 if in_time else 1][name]  # noqa: E731
+        return constant if grows is None else lambda *given: constant(*given) * grows(*given)
 
     def shown() -> Callable[..., Any]:
         own = added()
