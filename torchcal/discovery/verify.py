@@ -51,9 +51,10 @@ def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None
             got = repr(holdout) if isinstance(holdout, str | int) else type(holdout).__name__
             raise DomainError(f"Expected holdout as None, False, a share or a bool array. Got {got}.") from error
         if mask.dtype != torch.bool or mask.shape not in ((recording.n,), recording.y.shape):
+            several = f" or, one output after another, ({len(recording.y)},)" if len(recording.outputs) > 1 else ""
             raise DomainError(
-                f"Expected holdout as False, a share, or a bool array, True where held out, of shape ({recording.n},) or, "
-                f"one output after another, ({len(recording.y)},). Got {mask.dtype} of shape {tuple(mask.shape)}."
+                f"Expected holdout as False, a share, or a bool array of shape ({recording.n},){several}, True where "
+                f"held out. Got {mask.dtype} of shape {tuple(mask.shape)}."
             )
         mask = mask.repeat(len(recording.outputs)) if len(mask) == recording.n and len(recording.outputs) > 1 else mask
         if int((recording.observed & ~mask).sum()) <= parameters or not bool((recording.observed & mask).any()):
