@@ -707,6 +707,19 @@ def test_an_output_that_alone_tells_a_parameter_is_not_held_out():
         quiet(base, recording, [], holdout=torch.ones(20, 2, dtype=torch.bool))
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_threshold_that_the_rest_of_the_data_tells_is_no_reason_to_refuse_a_hold_out(seed):
+    """At a wild starting value it lies beyond them; where it is calibrated it does not."""
+    x = torch.linspace(0, 10, 60, dtype=F64)
+    base = tc.Simulator(
+        lambda x, p: p["a"] * x + p["b"] * torch.relu(x - p["x0"]),
+        [tc.Parameter("a"), tc.Parameter("b"), tc.Parameter("x0", initial=5.0)],
+    )
+    noise = 0.05 * torch.randn(60, generator=torch.Generator().manual_seed(seed), dtype=F64)
+    d = quiet(base, tc.Recording(x=x, y=x + 2 * torch.relu(x - 4) + noise, noise=0.05), [], holdout=x > 7.5, seed=seed)
+    assert d.before.held_out.rmse < 0.2
+
+
 def test_a_name_that_predicts_worse_is_withdrawn(monkeypatch):
     from torchcal.discovery import verify
 

@@ -381,6 +381,26 @@ def test_what_changes_a_factor_of_the_base_in_a_range_is_no_name(seed, depth):
     assert 180 < span[0] < 220 < span[1] < 260
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_gain_of_the_list_is_no_nameless_one(seed):
+    """The base has moved since the candidates were screened, and its slopes with it: both are taken where it stands."""
+    rng = np.random.default_rng(seed)
+    x, w = np.linspace(0, 10, 100), rng.uniform(0, 10, 100)
+    y = (8 * np.exp(-0.6 * x) + 3 * np.tanh(0.6 * x)) * (1 - 0.25 * ((w > 4) & (w < 7)))
+    base = tc.Simulator(
+        lambda x, p: p["A"] * torch.exp(-p["k"] * x["x"]) + p["c"] * torch.tanh(p["k"] * x["x"]),
+        [tc.Parameter("A", initial=5.0), tc.Parameter("k", low=0.0, initial=0.5), tc.Parameter("c", initial=1.0)],
+    )
+    terms = [
+        tc.Term("gain", outputs={"y": lambda x, p, y: y * (1 + p["a"])}, parameters=[A]),
+        tc.Term("quench", outputs={"y": lambda x, p, y: y - p["a"] * y**2}, parameters=[A]),
+    ]
+    recording = tc.Recording(x={"x": x, "W": w}, y={"y": y + 0.05 * rng.standard_normal(100)}, noise=0.05)
+    d, search = searched(base, recording, terms)
+    assert d.terms == ["gain"]
+    assert not any(model.names == ("a change of the gain of y",) for model in search.nameless)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_bend_that_is_in_no_list_is_no_window_of_a_curved_term(seed):
     """Extinction that grows from an airmass of 2.2 on: a curved term that begins at 2.4 was named there (seed 1)."""

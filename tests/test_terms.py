@@ -343,6 +343,13 @@ def test_a_term_that_returns_no_tensor_is_blamed_by_name(static: bool, where: di
         run()
 
 
+def test_a_term_may_return_a_table_or_a_number_of_numpy() -> None:
+    for returned in (np.full(3, 0.5), np.float32(0.5), np.int64(2)):
+        term = tc.Term("table", shifts={"m": lambda x, p, r=returned: r}, parameters=[tc.Parameter("e")])
+        found = extend(line(), [term]).at(X, ["q"])(tensor(2.0, 1.5, 0.0))
+        close(found, (2.0 + torch.as_tensor(returned)) * X["t"] ** 2)
+
+
 def test_an_extended_static_simulator_is_calibrated() -> None:
     t = tensor(0.5, 1.0, 2.0)
     recorded = tc.Recording(x={"t": t, "h": X["h"]}, y={"q": 2.0 * (1 + 0.3 * X["h"].log()) * t**2})

@@ -81,7 +81,7 @@ def calibrate_base(
     found = _unwound(_sharpen(found))
     found, units = _grown(found, unit)
     if not exact and not clean:
-        whole = found
+        whole = found, units
         for _ in range(3):
             given = recording.noise if isinstance(recording.noise, Tensor) else None
             bad = spikes(found.problem, found.residual / units[found.problem.index], given)
@@ -89,8 +89,8 @@ def calibrate_base(
                 break
             keep = found.problem.keep.clone()
             keep[found.problem.index[bad]] = False
-            if float(keep.sum()) < (1 - MOST) * whole.problem.n:  # so many are none
-                found = whole
+            if float(keep.sum()) < (1 - MOST) * whole[0].problem.n:  # so many are none
+                found, units = whole
                 break
             found, units = _grown(_again(found, keep), unit)
     noise = estimate(found.problem, found.residual, found.jacobian, recording.noise, units)

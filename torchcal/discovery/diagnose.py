@@ -128,11 +128,8 @@ def diagnose(
             raise DomainError(f"Expected the term {term.name!r} on outputs of {recording.outputs}. Got {unknown}.")
         extend(simulator, [term])  # raises for names that do not fit, before any long work
     mask = verify.choose(recording, holdout, len(free))
-    begin = starts(problem, 2, seed, held)  # at zero nothing may move
-    for values in begin:
+    for values in starts(problem, 2, seed, held):  # at zero nothing may move
         check_repeats(problem, values)
-    if mask is not None and holdout is not None:
-        verify.check_left(problem, begin, free, mask)
     bar = tqdm(disable=not progress, desc="diagnose", unit="step", leave=False)
 
     def tick(text: str) -> None:
@@ -144,6 +141,8 @@ def diagnose(
         with search.stop.listening():
             tick("calibrate the base")
             search.calibrate_base()
+            if holdout is not None and mask is not None:
+                verify.check_left(search.base, mask)
             if holdout is None and mask is not None and _beyond_prediction(search, search.base, mask):
                 mask = verify.within(recording)
             search, detected = settle(search, problem, confidence)

@@ -13,7 +13,9 @@ from torchcal.display import DECADES, placed
 from torchcal.simulators import Parameter
 from torchcal.terms import Term
 
-__all__ = ["EDGE", "ENDS", "SHORT", "WIDTHS", "Span", "beyond", "force", "is_window", "localised", "region_text"]
+__all__ = [
+    "EDGE", "ENDS", "SHORT", "WIDTHS", "Span", "beyond", "driver_at", "force", "is_window", "localised", "region_text",
+]  # fmt: skip
 
 #: Width of a window's edges, as a share of the driver's range: wide enough for a fit to move them; and the limits
 #: between which it is fitted, from nearly a step.
@@ -103,12 +105,10 @@ def localised(
         least, most = (STEP if static else WIDTHS[0]) * size, WIDTHS[1] * size
         ends.append(Parameter(WIDTH_OF_EDGE, low=least, high=most, initial=EDGE * size, transform="log"))
 
-    def inside(d: Tensor, p: Mapping[str, Any]) -> Any:
-        return force(span, d, p)
+    at = driver_at(driver, static=static)
 
     def now(t: Any, s: Any, p: Any, u: Any) -> Any:
-        d = t + term.began(p) if driver == "t" else s[driver] if driver in s else u[driver]  # windows are on the clock
-        return inside(d, p)
+        return force(span, at(t + term.began(p), s, p, u), p)  # windows are on the clock
 
     def moving(function: Callable[..., Any]) -> Callable[..., Any]:
         return lambda t, s, p, u: now(t, s, p, u) * function(t, s, p, u)
@@ -120,10 +120,10 @@ def localised(
         return observe
 
     def still(function: Callable[..., Any]) -> Callable[..., Any]:
-        return lambda x, p: inside(x[driver] if isinstance(x, Mapping) else x, p) * function(x, p)
+        return lambda x, p: force(span, at(x), p) * function(x, p)
 
     def seeing(function: Callable[..., Any]) -> Callable[..., Any]:
-        return lambda x, p, y: y + inside(x[driver] if isinstance(x, Mapping) else x, p) * (function(x, p, y) - y)
+        return lambda x, p, y: y + force(span, at(x), p) * (function(x, p, y) - y)
 
     around = still if static else moving
     return Term(
@@ -137,6 +137,19 @@ def localised(
         scales=term.scales,
         elapsed=term.elapsed,
     )
+
+
+def driver_at(driver: str, *, static: bool) -> Callable[..., Any]:
+    """A driver's value, of what a term's functions are given."""
+
+    def value(*given: Any) -> Any:
+        if static:
+            x = given[0]
+            return x[driver] if isinstance(x, Mapping) else x
+        t, s, _, u = given[:4]
+        return t if driver == "t" else s[driver] if driver in s else u[driver]
+
+    return value
 
 
 def force(span: Span, d: Tensor, p: Mapping[str, Any]) -> Any:

@@ -9,7 +9,7 @@ A term whose window leaves something is tried in all others: from the base alone
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchcal.discovery.candidates import Candidate, prepare
 from torchcal.discovery.channels import channels
-from torchcal.discovery.local import EDGE, ENDS, WIDTH_OF_EDGE, WIDTHS, Span, is_window, localised
+from torchcal.discovery.local import EDGE, ENDS, WIDTH_OF_EDGE, WIDTHS, Span, driver_at, is_window, localised
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.own_noise import likeliest_alone
 from torchcal.discovery.search import BETTER, Search
@@ -75,20 +75,21 @@ def refit_nameless(search: Search) -> None:
 
 @dataclass(eq=False)
 class _Changes:
-    """Constant changes that leading terms in windows are held against.
+    """Changes without a name that leading terms in windows are held against: constant ones, and such as grow from the
+    end of an open window.
 
     Attributes:
         search: Whose terms these are.
         prior: Log prior probability of each change.
         named: Places where a constant of the list has a name.
-        elsewhere: Parameters of the base and gains of outputs, which change whatever acts there.
+        elsewhere: Parameters of the base and gains of outputs, which change whatever acts there, with their effects.
         tried: Places and windows from which one has been refitted.
     """
 
     search: Search
     prior: float
     named: set[Places | None]
-    elsewhere: list[Places]
+    elsewhere: dict[Places, Tensor]
     tried: set[tuple[Places, str, float, float]] = field(default_factory=set)
 
     @classmethod
@@ -113,7 +114,9 @@ class _Changes:
             if where is None or window is None:
                 continue
             others = []
-            for place in dict.fromkeys([where, *self.elsewhere]):
+            mine = _effect(search, _constant(where, search.problem.in_time))
+            fresh = [k for k, own in self.elsewhere.items() if mine is None or not _within(own, mine)]
+            for place in dict.fromkeys([where, *fresh]):
                 key = (place, window.driver, window.low, window.high)
                 if (place, window.driver) in wanted or key in self.tried or place in self.named:
                     continue
@@ -129,24 +132,33 @@ class _Changes:
         search.nameless += [one for one in _refitted(search, every) if one is not None and one.physical]
 
 
-def _elsewhere(search: Search) -> list[Places]:
-    """Every calibrated parameter of the base, and the gain of every output, but what is the same as another or as a
-    candidate of the list."""
+def _elsewhere(search: Search) -> dict[Places, Tensor]:
+    """Every calibrated parameter of the base, and the gain of every output, with its effect ``(n, 1)``; but what is the
+    same as another or as a candidate of the list."""
     problem = search.base.problem
     simulator = problem.simulator
     declared = simulator.ode.parameters if isinstance(simulator, Trajectories) else problem.parameters
     free = [problem.parameters[i].name for i in search.base.free]
     names = [q.name for q in declared if any(one == q.name or one.startswith(f"{q.name}[") for one in free)]
-    listed = [c.tangents[0] for c in search.candidates if c.tangents.shape[::2] == (1, 1)]
-    found: list[Places] = []
+    alone = [c.terms[0] for c in search.candidates if c.tangents.shape[::2] == (1, 1)]
+    listed = [effect for term in alone if (effect := _effect(search, term)) is not None]
+    found: dict[Places, Tensor] = {}
     for place in [("shifts", name) for name in names] + [("gains", name) for name in search.problem.recording.outputs]:
-        with suppress(SimulatorError, DomainError):
-            change = _constant((place,), search.problem.in_time)
-            own = prepare(problem, search.base, [change], search.fixed, {}).tangents[0]
-            if own.norm() > 0 and not any(_within(own, other) for other in listed):
-                found.append((place,))
-                listed.append(own)
+        own = _effect(search, _constant((place,), search.problem.in_time))
+        if own is not None and own.norm() > 0 and not any(_within(own, other) for other in listed):
+            found[(place,)] = own
+            listed.append(own)
     return found
+
+
+def _effect(search: Search, term: Term) -> Tensor | None:
+    """What the amplitudes of a term without shapes do to the data, ``(n, amplitudes)``, at the base as it stands: that
+    has moved with the noise since the candidates' own tangents. None where it cannot be taken."""
+    try:
+        tangents = prepare(search.base.problem, search.base, [term], search.fixed, {}).tangents
+    except (SimulatorError, DomainError):
+        return None
+    return tangents[0] if len(tangents) == 1 else None
 
 
 def _within(own: Tensor, plane: Tensor) -> bool:
@@ -197,15 +209,8 @@ def _is_constant(search: Search, candidate: Candidate) -> bool:
     where = _places(candidate)
     if where is None or candidate.tangents.shape[::2] != (1, 1):
         return False
-    try:
-        # Both at the base as it stands, which has moved with the noise since the candidate's own tangents.
-        now, constant = (
-            prepare(search.base.problem, search.base, [one], search.fixed, {}).tangents
-            for one in (term, _constant(where, search.problem.in_time))
-        )
-    except (SimulatorError, DomainError):
-        return False
-    return now.shape[::2] == (1, 1) and _within(now[0], constant[0])
+    now, constant = (_effect(search, one) for one in (term, _constant(where, search.problem.in_time)))
+    return now is not None and constant is not None and now.shape[1] == 1 and _within(now, constant)
 
 
 def _wanted(search: Search, model: Model, where: Places, prior: float) -> tuple[list[Hypothetical], float]:
@@ -269,17 +274,8 @@ def _anywhere(search: Search, model: Model) -> Hypothetical | None:
 
 def _distance(driver: str, end: str, span: Span, in_time: bool) -> Callable[..., Any]:
     """How far a driver is beyond an end of a window, in its range; of what a term's functions are given."""
-
-    def beyond(*given: Any) -> Any:
-        if in_time:
-            t, s, p, u = given[:4]
-            d = t if driver == "t" else s[driver] if driver in s else u[driver]
-        else:
-            x, p = given[:2]
-            d = x[driver] if isinstance(x, Mapping) else x
-        return span.distance(d, p[end]) / span.size
-
-    return beyond
+    at = driver_at(driver, static=not in_time)
+    return lambda *given: span.distance(at(*given), given[2 if in_time else 1][end]) / span.size
 
 
 def _constant(where: Places, in_time: bool, grows: Callable[..., Any] | None = None) -> Term:
@@ -305,7 +301,8 @@ def _constant(where: Places, in_time: bool, grows: Callable[..., Any] | None = N
     for kind, name in where:
         place, change = how[kind]
         kinds.setdefault(place, {})[name] = change()
-    what = " and ".join(f"a change of {name}" for kind, name in where if kind == "shifts")
+    of = {"shifts": "a change of {}", "gains": "a change of the gain of {}"}
+    what = " and ".join(of[kind].format(name) for kind, name in where if kind in of)
     return Term(what or "something unknown", **kinds, parameters=[Parameter(f"c{i}") for i in range(1, next(number))])
 
 

@@ -272,6 +272,8 @@ def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor, before
                 size.append(f[problem.index[places]][inside] / used.max())
             e, size_of = torch.cat(left).abs(), torch.cat(size)
             told = (INDEPENDENT if problem.order is not None else 1.0) * len(e)
+        seen = e > 0  # what is exact, a blank set to zero, is no measure of noise
+        e, size_of, told = e[seen], size_of[seen], told * float(seen.double().mean())
         if len(e) < FEWEST or not float(used.max()) > 0 or not float(e.sum()) > 0:
             continue
         best = GROWS - told * math.log(float(e.sum()))

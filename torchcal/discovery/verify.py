@@ -11,7 +11,6 @@ from torch import Tensor
 from torchcal.data import Recording
 from torchcal.discovery.fitting import Fitted, fit
 from torchcal.discovery.noise import Noise
-from torchcal.discovery.problem import Problem
 from torchcal.discovery.records import Score
 from torchcal.errors import DomainError
 
@@ -97,21 +96,19 @@ def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None
     return mask.repeat(len(recording.outputs))
 
 
-def check_left(problem: Problem, values: Tensor, free: list[int], mask: Tensor) -> None:
-    """Raise DomainError where only the data in ``mask`` tell a parameter: what then predicts them has seen them.
+def check_left(found: Fitted, mask: Tensor) -> None:
+    """Raise DomainError where only data in ``mask`` tell a parameter of a fit: what then predicts them has seen them.
 
-    Such are the initial states of a run that is held out whole, and its parameters with ``per_run=True``. ``values``
-    (H, P) are where the slopes are taken.
+    Such are the initial states of a run that is held out whole, and its parameters with ``per_run=True``.
     """
-    slope = problem.evaluate(values, free)[1].abs()
-    kept = ~mask[problem.index]
-    alone = (slope[:, kept].amax(1) == 0) & (slope.amax(1) > 0)
+    slope, kept = found.jacobian.abs(), ~mask[found.problem.index]
+    alone = (slope[kept].amax(0) == 0) & (slope.amax(0) > 0)
     if bool(alone.any()):
-        name = problem.parameters[free[int(alone.any(0).nonzero()[0, 0])]].name
+        name = found.problem.parameters[found.free[int(alone.nonzero()[0, 0])]].name
         raise DomainError(
             f"Expected holdout to leave data for every parameter. Got only held-out data for {name!r}, which cannot "
-            "predict themselves (hold out a part of that run or range, give its initial states, or hold the parameter "
-            "with fixed=)."
+            "predict themselves (hold out a part of them, or hold the parameter with fixed=; an initial state may be "
+            "given with its run)."
         )
 
 

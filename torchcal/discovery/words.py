@@ -324,8 +324,8 @@ def _ambiguous(d: Any) -> list[str]:
     else:
         which = "either" if len(known) == 2 else "any"
         least = min(filter(None, shares), default=1.0)
-        range_ = f"with probabilities from {shares[best]:.2f} to {least:.2f}"
-        well = "about as well" if least > AS_WELL * shares[best] else range_
+        unequal = f"with probabilities from {shares[best]:.2f} to {least:.2f}"
+        well = "about as well" if least > AS_WELL * shares[best] else unequal
         told = f"{len(known)} hypotheses explain it {well}, and these data cannot exclude {which} of them."
     parts = [where_in_words(d), told]
     sets = [set(tied) for tied in known]

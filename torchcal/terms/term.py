@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from torchcal.display import NONE
@@ -219,6 +221,8 @@ class Term:
                 f"Expected a tensor from every function of the term {self.name!r}. One of them raised "
                 f"{type(error).__name__}: {error}. It was given {known}."
             ) from error
+        if isinstance(result, np.ndarray | np.generic):
+            result = torch.as_tensor(result)
         if not isinstance(result, Tensor | int | float):
             raise SimulatorError(
                 f"Expected a tensor from every function of the term {self.name!r}. One of them returned "
@@ -360,6 +364,7 @@ def _sensed(name: str, function: Function, sensors: Sequence[Term], shifted: Fun
 
 
 def _extend_static(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
+    plain, every = _plain(simulator, terms)
     for term in terms:
         if term.elapsed:
             raise DomainError(
@@ -372,7 +377,6 @@ def _extend_static(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
                 f"Expected a term without rates for a static simulator. Got {term.name!r} (give shifts=, outputs= or "
                 "frees=, or write the model as an ODESimulator)."
             )
-        plain = _plain(simulator, ())[0]
         if term.shifts and isinstance(plain, ExternalSimulator) and plain.vectorized:
             raise DomainError(
                 "Expected a term without shifts= for a vectorized ExternalSimulator, which takes each parameter as one "
@@ -384,7 +388,6 @@ def _extend_static(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
         freed = copy.copy(simulator)
         freed.parameters = parameters
         return freed
-    plain, every = _plain(simulator, terms)
 
     def function(x: Any, p: dict[str, Tensor]) -> Any:
         moved = _shifted(every, p, lambda own: (x, own))
