@@ -98,24 +98,37 @@ def test_a_base_that_only_a_combination_of_can_be_told_still_gets_its_candidates
     assert float(d.ranking[0].estimates[0].value) == pytest.approx(0.04, abs=0.004)
 
 
-def test_what_the_base_has_everywhere_may_be_missing_in_a_window():
+def beyond_six(effect, name, term):
+    """A line that changes from x = 6 on, and one candidate."""
     rng = np.random.default_rng(25)
     x = torch.linspace(0, 10, 120, dtype=F64)
-    y = 1.0 + 0.5 * x - 0.4 * (x > 6) + 0.02 * torch.as_tensor(rng.standard_normal(120))
+    y = 1.0 + 0.5 * x
+    y = y + (x > 6) * effect(y) + 0.02 * torch.as_tensor(rng.standard_normal(120))
     base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
-    offset = tc.Term("offset", outputs={"y": lambda x, p, y: y + p["o"]}, parameters=[tc.Parameter("o")])
-    d = diagnose(base, tc.Recording(x=x, y=y, noise=0.02), [offset])
-    assert d.terms == ["offset"]
+    terms = [tc.Term(name, outputs={"y": term}, parameters=[tc.Parameter("c")])]
+    return diagnose(base, tc.Recording(x=x, y=y, noise=0.02), terms)
+
+
+def test_what_the_base_has_everywhere_may_be_missing_in_a_window():
+    d = beyond_six(lambda y: -0.15 * y, "gain", lambda x, p, y: y * (1 + p["c"]))
+    assert d.terms == ["gain"]
     best = d.ranking[0]
     assert best.region is not None
-    assert float(best.estimates[0].value) == pytest.approx(-0.4, abs=0.08)
-    assert f"offset, where {best.region}" in str(d).splitlines()[0]
+    assert float(best.estimates[0].value) == pytest.approx(-0.15, abs=0.02)
+    assert f"gain, where {best.region}" in str(d).splitlines()[0]
     # Everywhere it is in the base, and said to be.
-    assert "offset, where it acts everywhere, cannot be told from the parameters of the base" in d.identifiability
+    assert "gain, where it acts everywhere, cannot be told from the parameters of the base" in d.identifiability
     # The sentence is about what was accepted.
     words = " ".join(str(d).split())
-    assert f"offset, where {best.region}" in words
+    assert f"gain, where {best.region}" in words
     assert str(best.estimates[0]) in words
+
+
+def test_an_offset_in_a_part_of_a_range_may_be_anything():
+    d = beyond_six(lambda y: -0.4, "offset", lambda x, p, y: y + p["c"])
+    assert d.tied == [["offset"], ["none of these"]]
+    assert d.ranking[0].region is not None
+    assert float(d.ranking[0].estimates[0].value) == pytest.approx(-0.4, abs=0.08)
 
 
 @pytest.mark.slow
