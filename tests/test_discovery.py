@@ -526,8 +526,8 @@ def test_an_effect_in_a_region_is_found_there():
     assert d.ranking[0].region is not None
     assert "where" in str(d).splitlines()[0]
     # The improved simulator carries the region and begins at the estimates.
-    assert [q.name for q in d.improved.parameters][:5] == [
-        "k", "c", "bias force.b", "bias force.window from", "bias force.window to"
+    assert [q.name for q in d.improved.parameters] == [
+        "k", "c", "bias force.b", "bias force.window from", "bias force.window to", "bias force.window edge"
     ]  # fmt: skip
     assert d.improved.parameters[3].initial == pytest.approx(low)
 

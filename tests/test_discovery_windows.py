@@ -13,10 +13,14 @@ from scipy.integrate import solve_ivp
 
 import torchcal as tc
 from torchcal.discovery.doubts import CLEARLY, doubt
-from torchcal.discovery.nameless import _where_possible, refit_nameless
+from torchcal.discovery.local import Span, localised
+from torchcal.discovery.nameless import _elsewhere, _where_possible, refit_nameless
+from torchcal.discovery.problem import Problem
 from torchcal.discovery.screen import Window
+from torchcal.discovery.search import Search
 from torchcal.discovery.windows import _beyond_the_edge
 from torchcal.errors import SimulatorError
+from torchcal.terms import extend
 
 F64 = torch.float64
 NOISE = 0.01
@@ -487,6 +491,16 @@ def test_a_term_of_two_equations_is_held_against_a_change_of_both(reaction):
     assert (best.window.low, best.window.high) == pytest.approx((5.0, 9.0), abs=0.7)
     assert d.verdict in ("named", "ambiguous")
     assert ["second channel"] in (d.tied or [d.terms])
+
+
+def test_the_windows_of_a_base_are_no_parameters_that_change():
+    base, recording, (second,) = reactor()
+    local = localised(second, "t", 5.0, 9.0, Span(0.0, 20.0, False), static=False, edge=True)
+    problem = Problem.of(extend(base, [local]), recording)
+    search = Search(problem, [], {}, 0, 4, 1, lambda text: None)
+    search.calibrate_base()
+    shifted = {name for (kind, name), in _elsewhere(search, []) if kind == "shifts"}
+    assert shifted == {"in", "k", "out", "second channel.k2"}
 
 
 def test_a_nameless_change_that_the_simulator_does_not_take_is_left_out():

@@ -102,30 +102,31 @@ def calibrate_base(
     return base, noise
 
 
-def _grown(found: Fitted, unit: Tensor | None, units: Tensor | None = None) -> tuple[Fitted, Tensor]:
-    """A fit and how its noise grows, ``(n_total,)``, each by the other; ``unit`` where that is known.
+def _grown(found: Fitted, known: Tensor | None, before: Tensor | None = None) -> tuple[Fitted, Tensor]:
+    """A fit and how its noise grows, ``(n_total,)``, each by the other; as ``known`` where it is, else from ``before``.
 
     What large data leave hides how little small ones scatter, until they are weighed so.
     """
-    units = torch.ones_like(found.problem.recording.y) if units is None else units
-    if unit is not None:
-        return found, unit
+    unit = torch.ones_like(found.problem.recording.y) if before is None else before
+    if known is not None:
+        return found, known
     for _ in range(GROWTHS):
-        before, units = units, growing(found, units)
-        if torch.allclose(units, before):
+        before, unit = unit, growing(found, unit)
+        if torch.allclose(unit, before):
             break
-        noise = estimate(found.problem, found.residual, found.jacobian, None, units)
+        noise = estimate(found.problem, found.residual, found.jacobian, None, unit)
         found = refit(found, noise.whitening(found.problem))
-    return found, units
+    return found, unit
 
 
-def growing(found: Fitted, unit: Tensor | None = None) -> Tensor:
-    """How unknown noise grows with the outputs, by the residual of a fit, ``(n_total,)``; see `growth`."""
+def growing(found: Fitted, before: Tensor) -> Tensor:
+    """How unknown noise grows with the outputs, by the residual of a fit weighed by what was found before,
+    ``(n_total,)``; see `growth`."""
     if found.problem.recording.noise is not None:
         return torch.ones_like(found.problem.recording.y)
     whole = dataclasses.replace(found.problem, keep=torch.ones_like(found.problem.keep))
     f = whole.evaluate(found.values[None], [], found.warm)[0][0]
-    return growth(found.problem, found.residual, found.jacobian, f, unit)
+    return growth(found.problem, found.residual, found.jacobian, f, before)
 
 
 def _from_starts(problem: Problem, begin: Tensor, free: list[int], rough: Tensor, outputs: Tensor) -> Fitted | None:

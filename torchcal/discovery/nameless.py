@@ -22,6 +22,7 @@ from torchcal.discovery.channels import channels
 from torchcal.discovery.local import EDGE, ENDS, WIDTH_OF_EDGE, WIDTHS, Span, driver_at, is_window, localised
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.own_noise import likeliest_alone
+from torchcal.discovery.problem import is_value_of
 from torchcal.discovery.search import BETTER, Search
 from torchcal.discovery.verdict import PLAINLY_WHITE
 from torchcal.discovery.windows import long_enough, stepped
@@ -58,7 +59,6 @@ def refit_nameless(search: Search) -> None:
         lead = likeliest_alone(search) or lead
     if lead.window is None:
         return
-    search.constants = {i for i, candidate in enumerate(search.candidates) if _is_constant(search, candidate)}
     changes = _Changes.of(search)
     changes.hold_against(lead)
     outdone = any(one.weight > lead.weight for one in search.nameless)
@@ -94,14 +94,16 @@ class _Changes:
 
     @classmethod
     def of(cls, search: Search) -> "_Changes":
-        """Those of a search that knows its constants."""
+        """Those of a search, whose constants are told to it."""
         problem = search.base.problem
         count = len({(c.kind, c.target) for c in channels(problem, search.base) if c.kind in problem.kinds})
         prior = math.log(PRIOR["none"] / max(count, 1)) - math.log(3.0 * len(search.drivers()))
+        alone = {i: c for i, c in enumerate(search.candidates) if c.tangents.shape[::2] == (1, 1)}
+        listed = {i: own for i, c in alone.items() if (own := _effect(search, c.terms[0])) is not None}
+        search.constants = {i for i, own in listed.items() if _is_constant(search, alone[i], own)}
         # That of an instrument in a part of its range has no name.
-        listed = (search.candidates[i] for i in search.constants)
-        named = {_places(candidate) for candidate in listed if not candidate.terms[0].outputs}
-        return cls(search, prior, named, _elsewhere(search))
+        named = {_places(alone[i]) for i in search.constants if not alone[i].terms[0].outputs}
+        return cls(search, prior, named, _elsewhere(search, list(listed.values())))
 
     def hold_against(self, lead: Model) -> None:
         """Refit changes beside the leading terms in windows: where these act, but not in places that a constant of the
@@ -132,22 +134,19 @@ class _Changes:
         search.nameless += [one for one in _refitted(search, every) if one is not None and one.physical]
 
 
-def _elsewhere(search: Search) -> dict[Places, Tensor]:
-    """Every calibrated parameter of the base, and the gain of every output, with its effect ``(n, 1)``; but what is the
-    same as another or as a candidate of the list."""
+def _elsewhere(search: Search, listed: list[Tensor]) -> dict[Places, Tensor]:
+    """Every calibrated parameter of the base that is no window's, and the gain of every output, with its effect
+    ``(n, 1)``; but what is the same as another or as an effect of the list."""
     problem = search.base.problem
     simulator = problem.simulator
     declared = simulator.ode.parameters if isinstance(simulator, Trajectories) else problem.parameters
     free = [problem.parameters[i].name for i in search.base.free]
-    names = [q.name for q in declared if any(one == q.name or one.startswith(f"{q.name}[") for one in free)]
-    alone = [c.terms[0] for c in search.candidates if c.tangents.shape[::2] == (1, 1)]
-    listed = [effect for term in alone if (effect := _effect(search, term)) is not None]
+    names = [q.name for q in declared if not is_window(q.name) and any(is_value_of(one, q.name) for one in free)]
     found: dict[Places, Tensor] = {}
     for place in [("shifts", name) for name in names] + [("gains", name) for name in search.problem.recording.outputs]:
         own = _effect(search, _constant((place,), search.problem.in_time))
-        if own is not None and own.norm() > 0 and not any(_within(own, other) for other in listed):
+        if own is not None and own.norm() > 0 and not any(_within(own, other) for other in (*listed, *found.values())):
             found[(place,)] = own
-            listed.append(own)
     return found
 
 
@@ -203,14 +202,11 @@ def _places(candidate: Candidate) -> Places | None:
     return places if places and not term.states and not term.frees else None
 
 
-def _is_constant(search: Search, candidate: Candidate) -> bool:
-    """Whether a term of the list is a constant change."""
-    (term,) = candidate.terms
+def _is_constant(search: Search, candidate: Candidate, own: Tensor) -> bool:
+    """Whether a candidate with an effect ``(n, 1)`` is a constant change."""
     where = _places(candidate)
-    if where is None or candidate.tangents.shape[::2] != (1, 1):
-        return False
-    now, constant = (_effect(search, one) for one in (term, _constant(where, search.problem.in_time)))
-    return now is not None and constant is not None and now.shape[1] == 1 and _within(now, constant)
+    constant = None if where is None else _effect(search, _constant(where, search.problem.in_time))
+    return constant is not None and own.shape[1] == 1 and _within(own, constant)
 
 
 def _wanted(search: Search, model: Model, where: Places, prior: float) -> tuple[list[Hypothetical], float]:

@@ -245,7 +245,7 @@ def _beyond(problem: Problem, places: Tensor, design: Tensor, unit: Tensor, *, e
     return orthonormal(wide, most=int(0.6 * len(places)))
 
 
-def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor, before: Tensor | None = None) -> Tensor:
+def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor, before: Tensor) -> Tensor:
     """Noise sd in units of its median, ``(n_total,)``: 1, or growing with the model's output where the scatter does.
 
     An sd of a + |f| / max |f| is taken for the best of a few a where it makes the fastest part of the residual much
@@ -254,7 +254,6 @@ def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor, before
     those of all data, used or not, ``(n_total,)``; ``before`` is what was found before, by which data are weighed.
     """
     unit = torch.ones_like(problem.recording.y)
-    before = unit if before is None else before
     f, replicated = f.abs(), _replicates(problem)
     for output in range(len(problem.recording.outputs)):
         parts = [places for places in problem.recorded if int(problem.output_of[places[0]]) == output]

@@ -12,7 +12,7 @@ from torchcal.data import Recording
 from torchcal.errors import SimulatorError
 from torchcal.simulators import Parameter, Simulator, Solution, Trajectories
 
-__all__ = ["Problem", "Whitening"]
+__all__ = ["Problem", "Whitening", "is_value_of"]
 
 #: Combinations of all levels of all conditions, in the number of rows, up to which these are a grid.
 GRID = 2.0
@@ -212,3 +212,8 @@ class Problem:
     def kinds(self) -> tuple[str, str]:
         """Kinds of channels that something unknown is sought in."""
         return ("equation", "output") if self.in_time else ("parameter", "output")
+
+
+def is_value_of(name: str, parameter: str) -> bool:
+    """Whether a name is that of a parameter, or of its value in one run."""
+    return name == parameter or name.startswith(f"{parameter}[")

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchcal.discovery.explain import removed
 from torchcal.discovery.model import Model
+from torchcal.discovery.problem import is_value_of
 from torchcal.discovery.records import Location, MissingRate, NeededShift, Table
 from torchcal.discovery.search import Search
 from torchcal.discovery.structure import Place
@@ -114,15 +115,10 @@ def _own_places(search: Search, model: Model) -> set[tuple[str, str]]:
             own |= {("output", name if name in outputs else outputs[0]) for name in term.outputs}  # no name is y
         else:
             for name in (*term.shifts, *term.frees):
-                mine = {key for key in known if key[0] == "parameter" and _is_of(key[1], name)}
-                acted = {("equation", state) for c in inside if _is_of(c.target, name) for state in c.rates}
+                mine = {key for key in known if key[0] == "parameter" and is_value_of(key[1], name)}
+                acted = {("equation", state) for c in inside if is_value_of(c.target, name) for state in c.rates}
                 own |= mine or acted
     return own
-
-
-def _is_of(target: str, name: str) -> bool:
-    """Whether a parameter's name is this one, or of its value in one run."""
-    return target == name or target.startswith(f"{name}[")
 
 
 def _contributed(search: Search, model: Model, drivers: Sequence[str]) -> Location:
