@@ -575,6 +575,26 @@ def test_missing_rate_forgives_what_the_base_can_do():
     assert score.missing_error(result_of("consistent"), truth, case) is None
 
 
+def test_missing_rate_of_a_parameter_in_time_is_what_it_does_to_every_rate():
+    """A reaction whose rate constant falls: both species' rates are compared, up to a constant change of it."""
+    t = np.linspace(0, 4, 41)
+    a, b = np.exp(-0.5 * t), np.exp(-0.3 * t) - np.exp(-0.5 * t)
+    lost = 0.2 * np.sin(t) * a
+    case = {"runs": [{"time": t.tolist(), "inputs": {}}]}
+    truth = answer_of("outside", ["poisoned catalyst"], family="batch reactor", parameters={"k1": 0.5, "k2": 0.3},
+                      states=[{"A": a.tolist(), "B": b.tolist()}],
+                      added=[[{"A": lost.tolist(), "B": (-lost).tolist()}]])  # fmt: skip
+
+    def said(along, kind="parameter", target="k1"):
+        missing = {"kind": kind, "target": target, "driver": "t", "time": t.tolist(), "along": list(along)}
+        return score.missing_error(result_of("unexplained", missing=missing), truth, case)
+
+    assert said(-0.2 * np.sin(t) + 0.1) == pytest.approx(0, abs=1e-5)
+    assert said(-0.1 * np.sin(t)) == pytest.approx(0.5, abs=1e-5)
+    assert said(0.1 * np.sin(t), target="k2") > 0.9
+    assert said(lost, "equation", "A") == pytest.approx(0, abs=1e-5)
+
+
 def test_table_and_peers(tmp_path):
     answers = {
         "a": answer_of("library", ["cubic stiffness"], 2.0),

@@ -11,7 +11,7 @@ from torchcal.discovery.base import calibrate_base
 from torchcal.discovery.fitting import fit, refit, starts
 from torchcal.discovery.noise import GRID, Noise
 from torchcal.discovery.problem import Problem
-from torchcal.discovery.structure import Residual, _noise_draws
+from torchcal.discovery.residual import Residual, _noise_draws
 
 F64 = torch.float64
 

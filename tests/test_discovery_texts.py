@@ -13,8 +13,8 @@ import torchcal as tc
 from torchcal.discovery import doubts, explain, local, where, words
 from torchcal.discovery import where_in_words as where_text
 from torchcal.discovery.channels import Channel
+from torchcal.discovery.places import Place
 from torchcal.discovery.records import Estimate, Experiment, Hypothesis, Limit, Location, Table
-from torchcal.discovery.structure import Place
 from torchcal.discovery.where_in_words import where_in_words
 from torchcal.report import diagnosis_page
 

@@ -24,7 +24,7 @@ What the numbers mean:
 - *region F1*: overlap of the samples in the reported and in the planted region; 0 where nothing was found.
 - *held-out ratio*: RMSE against the noise-free truth on held-out samples, with the named term over without.
 - *missing rate*: relative L2 error of the estimated missing rate, after what the base's own parameters can make up
-  for is taken out of both.
+  for is taken out of both; of a parameter in time, of what its shift does to every rate.
 
 Intervals are Wilson's, 95 %.
 """
@@ -270,13 +270,19 @@ def missing_error(result: Mapping[str, Any], answer: Mapping[str, Any], case: Ma
         t = np.asarray(run["time"])
         if not here.any():
             continue
-        parts = [part[place] for part in answer["added"][number] if place in part]
-        true = np.sum(parts, axis=0) if parts else np.zeros_like(t)
         s = {name: np.asarray(values) for name, values in answer["states"][number].items()}
         u = {name: np.asarray(values) for name, values in run["inputs"].items()}
-        wanted.append(true)
-        found.append(np.interp(t, time[here], along[here]))
-        base.append(_slopes(lambda q, s=s, u=u, t=t: _at(family, place, t, s, q, u), p, len(t)))
+        shift = np.interp(t, time[here], along[here])
+        places = list(family.states) if estimate["kind"] == "parameter" else [place]
+        for name in places:
+            parts = [part[name] for part in answer["added"][number] if name in part]
+            wanted.append(np.sum(parts, axis=0) if parts else np.zeros_like(t))
+            if estimate["kind"] == "parameter":  # what it does to the rate
+                moved = {**p, estimate["target"]: p[estimate["target"]] + shift}
+                found.append(_at(family, name, t, s, moved, u) - _at(family, name, t, s, p, u))
+            else:
+                found.append(shift)
+            base.append(_slopes(lambda q, name=name, s=s, u=u, t=t: _at(family, name, t, s, q, u), p, len(t)))
     return _relative(np.concatenate(found), np.concatenate(wanted), np.concatenate(base))
 
 

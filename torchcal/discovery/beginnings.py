@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchcal.discovery.candidates import Candidate, base_columns
 from torchcal.discovery.fitting import Fitted, fit, follow_slopes, starts
+from torchcal.discovery.residual import Residual
 from torchcal.discovery.screen import Screening
-from torchcal.discovery.structure import Residual
 
 __all__ = ["BENT", "beginnings", "first_guess", "is_far", "larger_effects", "learned", "make_up"]
 

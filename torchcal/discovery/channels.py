@@ -37,6 +37,7 @@ class Channel:
         matrix: Response of the n used data to a unit change at each point, ``(n, K)``; or its diagonal ``(n,)`` where
             each point is a datum.
         rates: Of a parameter of differential equations, by equation what a unit change does to its rate, ``(K,)``.
+        usual: Of an equation, the r.m.s. along the trajectory of its rate, or of what one parameter adds to that.
     """
 
     kind: str
@@ -46,6 +47,7 @@ class Channel:
     time: Tensor
     matrix: Tensor
     rates: dict[str, Tensor] = field(default_factory=dict)
+    usual: float = math.inf
 
     def response(self, profile: Tensor) -> Tensor:
         """Change of the data by a change ``profile`` (K, m) along the points, ``(n, m)``."""
@@ -193,6 +195,10 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
         labels += [("parameter", names[i], problem.parameters[i].unit) for i in own]
         given = definitions(bound, found.values, states)
         rates = _bin_means(bins, count, bound.rates_by(found.values[None], states, own)[0])
+        real = bound.grid.h > 0
+        net = (states[0].diff(dim=1)[real] / bound.grid.h[real][:, None]).square().mean(0).sqrt()
+        parts = (rates * found.values[own]).square().mean(0).sqrt()  # which may balance
+        usual = torch.cat([net[:, None], parts], dim=1).amax(1).tolist()
         for m, (kind, target, unit) in enumerate(labels):
             if kind == "equation" and target in given:
                 continue
@@ -200,7 +206,8 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
             if kind == "parameter":
                 changes = zip(bound.ode.states, rates[:, :, m - size].unbind(-1), strict=True)
                 moved = {name: rate for name, rate in changes if name not in given and bool((rate != 0).any())}
-            list_.append(Channel(kind, target, unit, drivers, time, response[:, :, m], moved))
+            own_rate = usual[m] if kind == "equation" else math.inf
+            list_.append(Channel(kind, target, unit, drivers, time, response[:, :, m], moved, own_rate))
         at_data = problem.drivers_at_data(found.values[None], found.warm)
         at_data = _by_run(problem, at_data, bound.grid.run_of[problem.condition_of])
     else:

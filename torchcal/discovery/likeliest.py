@@ -16,7 +16,8 @@ from torchcal.discovery.channels import channels
 from torchcal.discovery.fitting import Fitted, refit, weighed
 from torchcal.discovery.noise import GRID, LEAST, Noise, estimate, least, log_prior, mine, orthonormal
 from torchcal.discovery.problem import Problem, Whitening
-from torchcal.discovery.structure import Residual, evidences, responses_of
+from torchcal.discovery.residual import Residual
+from torchcal.discovery.structure import evidences, responses_of
 
 __all__ = ["Tangents", "alone", "log_likelihood", "log_normal", "settled", "with_unknown"]
 

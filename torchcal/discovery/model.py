@@ -7,8 +7,9 @@ from torch import Tensor
 from torchcal.discovery.candidates import Candidate
 from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.local import region_text
+from torchcal.discovery.residual import Residual
 from torchcal.discovery.screen import Window
-from torchcal.discovery.structure import Residual, Structure
+from torchcal.discovery.structure import Structure
 
 __all__ = ["PRIOR", "Hypothetical", "Model"]
 

@@ -302,8 +302,9 @@ class MissingRate:
     """A non-parametric estimate of what is missing, as a smooth function of one driver or an oscillation along it.
 
     Attributes:
-        kind: ``"equation"``: a rate added to an equation; ``"output"``: a shift of an output.
-        target: Name of that equation (its state) or output.
+        kind: ``"equation"``: a rate added to an equation; ``"output"``: a shift of an output; ``"parameter"``: a shift
+            of a parameter.
+        target: Name of that equation (its state), output or parameter.
         driver: What it is drawn against.
         values: Driver values, ascending, ``(m,)``.
         rate: Estimate there, ``(m,)``, in ``unit``.

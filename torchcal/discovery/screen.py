@@ -17,7 +17,7 @@ from torch import Tensor
 from torchcal.discovery.candidates import Candidate
 from torchcal.discovery.channels import responses
 from torchcal.discovery.local import SHORT, Span
-from torchcal.discovery.structure import Residual
+from torchcal.discovery.residual import Residual
 from torchcal.simulators import Trajectories
 
 __all__ = ["Screening", "Window", "contributions", "screen", "windows", "windows_of"]

@@ -20,9 +20,10 @@ from torchcal.discovery.noise import LEAST, Noise
 from torchcal.discovery.own_noise import suited
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.refits import Refit, refit_all
+from torchcal.discovery.residual import Residual
 from torchcal.discovery.screen import Screening, Window, screen, windows
 from torchcal.discovery.stop import Stop
-from torchcal.discovery.structure import Residual, Structure, analyse
+from torchcal.discovery.structure import Structure, analyse
 from torchcal.discovery.verify import HeldOut, held_out_fit
 from torchcal.errors import SimulatorError
 from torchcal.terms import Term

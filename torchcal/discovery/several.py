@@ -11,9 +11,9 @@ from torchcal.discovery.beginnings import is_far, make_up
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare, replaces
 from torchcal.discovery.explain import removed
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
+from torchcal.discovery.residual import Residual
 from torchcal.discovery.screen import screen
 from torchcal.discovery.search import Search
-from torchcal.discovery.structure import Residual
 from torchcal.discovery.verdict import PLAINLY_WHITE
 from torchcal.errors import DomainError, SimulatorError
 

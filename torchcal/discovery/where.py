@@ -8,16 +8,18 @@ from torch import Tensor
 
 from torchcal.discovery.explain import removed
 from torchcal.discovery.model import Model
+from torchcal.discovery.places import Place
 from torchcal.discovery.problem import is_value_of
 from torchcal.discovery.records import Location, MissingRate, NeededShift, Table
 from torchcal.discovery.search import Search
-from torchcal.discovery.structure import Place
 from torchcal.terms import Term
 
 __all__ = ["locate", "missing_rate", "needed_shifts"]
 
-#: Share of an output's evidence that counts beside an equation's.
-OUTPUT_SHARE = 0.9
+#: Shares of the evidence for an output, and for a parameter of several equations, that count beside an equation's.
+OUTPUT_SHARE, SEVERAL_SHARE = 0.8, 0.9
+#: Sd beyond a bound from which on a parameter is not within it.
+SURELY = 2.0
 #: A span begins where the estimated change exceeds this share of its largest magnitude.
 SPAN_LEVEL = 0.3
 #: Log evidence from which on a place is listed, and how many are.
@@ -169,34 +171,64 @@ def needed_shifts(search: Search) -> list[NeededShift]:
 
 
 def _by_plausibility(search: Search) -> list[Place]:
-    """Places by falling evidence; in time an output's must be clearly larger than an equation's.
+    """Places by falling evidence, where it counts in full in time only for one equation.
 
-    A change of an output can copy whatever any equation does to that output, and instruments err in simple ways.
+    A change of an output can copy whatever any equation does to that output, and instruments err in simple ways: but a
+    fast ripple is no wave of a rate that would be larger than all else there. A parameter that acts in several
+    equations moves them together.
     """
     def weight(place: Place) -> float:
-        return place.evidence * (OUTPUT_SHARE if place.channel.kind == "output" and search.problem.in_time else 1.0)
+        return place.evidence * (_plausible(search, place) if search.problem.in_time else 1.0)
 
     return sorted(search.structure.places, key=lambda place: -weight(place))
 
 
+def _plausible(search: Search, place: Place) -> float:
+    """Share of the evidence for a place in time that counts."""
+    if place.channel.kind == "output":
+        return OUTPUT_SHARE
+    if place.period is not None and _larger_than_all(search, place):
+        return OUTPUT_SHARE**2
+    return SEVERAL_SHARE if len(place.channel.rates) > 1 else 1.0
+
+
+def _larger_than_all(search: Search, place: Place) -> bool:
+    """Whether a change is larger than the base's own rate in an equation that it acts in."""
+    usual = {c.target: c.usual for c in search.structure.channels if c.kind == "equation"}
+    ones = torch.ones_like(place.profile)
+    acts = place.channel.rates if place.channel.kind == "parameter" else {place.channel.target: ones}
+    return any(float((place.profile * by).abs().max()) > usual.get(name, math.inf) for name, by in acts.items())
+
+
+def _possible(search: Search, place: Place) -> bool:
+    """Whether a parameter stays within its bounds, wherever its shift is told."""
+    parameters = {q.name: (q, value) for q, value in
+                  zip(search.base.problem.parameters, search.base.values.tolist(), strict=True)}  # fmt: skip
+    parameter, value = parameters[place.channel.target]
+    low = -math.inf if parameter.low is None else parameter.low
+    high = math.inf if parameter.high is None else parameter.high
+    moved, open_by = value + place.profile, SURELY * place.sd
+    return not bool(((moved + open_by < low) | (moved - open_by > high)).any())
+
+
 def missing_rate(search: Search) -> MissingRate | None:
-    """The best unknown change, smooth or a wave, of one equation or output, or of one parameter of a static simulator.
+    """The best unknown change, smooth or a wave, of one equation, output or parameter.
 
     A parameter that changes in time and acts in one equation is a missing rate of that equation, in one run: what it
     does to the rate depends on the states too, which differ between runs at the same time.
     """
-    kinds = search.problem.kinds
     for place in _by_plausibility(search):
         channel = place.channel
         if place.evidence <= 0:
             return None
         kind, target, unit, size = channel.kind, channel.target, channel.unit, torch.ones_like(place.profile)
-        if kind not in kinds:
-            if place.driver != "t" or len(channel.rates) != 1 or len(search.problem.recording.runs or ()) > 1:
+        if kind == "parameter" and search.problem.in_time:
+            if not channel.rates or not _possible(search, place):
                 continue
-            kind = "equation"
-            target, size = next(iter(channel.rates.items()))
-            unit = next((c.unit for c in search.structure.channels if (c.kind, c.target) == (kind, target)), None)
+            if place.driver == "t" and len(channel.rates) == 1 and len(search.problem.recording.runs or ()) == 1:
+                kind = "equation"
+                target, size = next(iter(channel.rates.items()))
+                unit = next((c.unit for c in search.structure.channels if (c.kind, c.target) == (kind, target)), None)
         values, rate, sd = channel.drivers[place.driver], place.profile * size, place.sd * size.abs()
         order = values.argsort(stable=True)
         return MissingRate(

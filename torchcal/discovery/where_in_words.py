@@ -40,8 +40,8 @@ def where_in_words(d: Any) -> str:
     if place.period is not None:
         return (
             f"The mismatch sits in the {place.kind} {place.target} and oscillates with {place.driver} (period "
-            f"{place.period:.3g}): a wave there removes {share_in_words(place.share)} of the misfit beyond noise."
-            f"{_embedded(d)}"
+            f"{place.period:.3g}): a wave there removes {share_in_words(place.share)} of the misfit beyond noise"
+            f"{_elsewhere(d)}.{_embedded(d)}"
         )
     return (
         f"The mismatch sits in the {place.kind} {place.target} and varies with {place.driver}{largest}: a smooth "

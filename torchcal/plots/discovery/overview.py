@@ -204,7 +204,7 @@ def figure_parts(diagnosis: Any) -> list[FigurePart]:
             FigurePart(
                 "missing",
                 "What is missing, without a formula",
-                f"A smooth estimate of what is missing, ±2 sd, as a function of {called(missing.driver)}, up to what "
+                f"An estimate of what is missing, ±2 sd, as a function of {called(missing.driver)}, up to what "
                 "a change of the base's own parameters does.",
                 lambda fig: _ignore(missing_rate(missing, ax=fig.subplots(), units=units)),
                 6.0,

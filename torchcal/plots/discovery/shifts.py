@@ -12,6 +12,10 @@ from torchcal.plots.discovery.pieces import ACCEPTED, Look, as_numbers, draw_key
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+#: Difference of the runs at the same time, as a share of the range, up to which one curve shows them all; and how many
+#: runs the legend names.
+SAME, NAMED_RUNS = 0.02, 6
+
 
 def needed_shift(
     needed: Any,
@@ -69,11 +73,12 @@ def missing_rate(
     labels: Mapping[str, str] | None = None,
     legend: bool = True,
 ) -> "Axes":
-    """What is missing, as a smooth function of one driver, with a band of ±2 sd.
+    """What is missing, as a function of one driver, with a band of ±2 sd; a curve for every run where runs differ.
 
     Args:
         missing: With ``kind`` (``"equation"``, ``"output"`` or ``"parameter"``), ``target``, ``driver``,
-            ``values``, ``rate`` and ``sd`` ``(m,)``, and ``unit``.
+            ``values``, ``rate`` and ``sd`` ``(m,)``, and ``unit``; ``time`` and ``along``, where it is drawn against
+            time, run after run.
         ax: Where to draw; a new figure by default.
         units: Units by name.
         labels: How to write names on the axes, by name.
@@ -92,11 +97,38 @@ def missing_rate(
     ax.axhline(0.0, color="0.35", lw=0.7, zorder=1)
     if is_log(x):
         ax.set_xscale("log")
-    ax.fill_between(x, rate - 2 * sd, rate + 2 * sd, color=style.MODEL_ERROR_BAND, lw=0, label="±2 sd", zorder=2)
-    ax.plot(x, rate, color=ACCEPTED, lw=1.5, label="estimate", zorder=3)
+    curves = _by_run(missing, x, rate, sd)
+    for number, (at, height, wide) in enumerate(curves):
+        alone = len(curves) == 1
+        color, dashes = (ACCEPTED, "-") if alone else style.CYCLE[number % len(style.CYCLE)]
+        name = "estimate" if alone else f"run {number + 1}" if number < NAMED_RUNS else None
+        ax.fill_between(
+            at, height - 2 * wide, height + 2 * wide, lw=0, zorder=2, color=style.MODEL_ERROR_BAND if alone else color,
+            alpha=None if alone else 0.15, label="±2 sd" if number == 0 else None,
+        )  # fmt: skip
+        ax.plot(at, height, color=color, ls=dashes, lw=1.5, label=name, zorder=3)
     target = look.shown(missing.target)
     what = f"missing rate of d{target}/dt" if missing.kind == "equation" else f"missing shift of {target}"
     finish(ax, look.axis(missing.driver), what + (f" [{plain(missing.unit)}]" if missing.unit else ""), "")
     if legend:
         draw_key(ax)
     return ax
+
+
+def _by_run(
+    missing: Any, x: np.ndarray, rate: np.ndarray, sd: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Curves along time of runs that differ at the same time; otherwise the one."""
+    if missing.driver != "t":
+        return [(x, rate, sd)]
+    time, along = as_numbers(missing.time, "time", len(x)), as_numbers(missing.along, "along", len(x))
+    ends = np.flatnonzero(np.diff(time) < 0) + 1
+    pieces = list(zip(np.split(time, ends), np.split(along, ends), strict=True))
+    first = pieces[0]
+    apart = max((np.max(np.abs(a - np.interp(t, *first))[(t >= first[0][0]) & (t <= first[0][-1])], initial=0.0)
+                 for t, a in pieces), default=0.0)  # fmt: skip
+    if apart <= SAME * np.ptp(rate):
+        return [(x, rate, sd)]
+    wide = np.empty_like(sd)
+    wide[np.argsort(time, kind="stable")] = sd
+    return [(t, a, w) for (t, a), w in zip(pieces, np.split(wide, ends), strict=True)]
