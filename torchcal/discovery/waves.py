@@ -54,13 +54,14 @@ class Waves:
         responses = residual.found.whitening(channel.response(features.flatten(1)))
         columns = residual.project(responses).reshape(-1, *features.shape[1:]).movedim(1, 0)  # (F, n, m)
         size = columns.square().sum((1, 2)).sqrt()
-        if not bool(size.isfinite().all()) or float(size.max()) <= 1e-9 * float(responses.norm()):
+        seen = size > 1e-9 * float(responses.norm())  # the others are rounding
+        if not bool(size.isfinite().all()) or not bool(seen.any()):
             return None
-        scale = (size / math.sqrt(columns.shape[2])).clamp_min(1e-300)
+        scale = (size / math.sqrt(columns.shape[2])).where(seen, torch.inf)
         columns = columns / scale[:, None, None]
         values, v = torch.linalg.eigh(columns.mT @ columns)
         s = values.clamp_min(0.0).sqrt()
-        there = s > SMALL * s.amax(1, keepdim=True)
+        there = (s > SMALL * s.amax(1, keepdim=True)) & seen[:, None]
         along = (v.mT @ (columns.mT @ residuals)) / s.where(there, torch.inf)[..., None]
         return cls(channel, frequencies, s.masked_fill(~there, 0.0), along)
 
