@@ -1,6 +1,7 @@
 """Every way to write a term, in time and for static simulators, and what `extend` makes of it."""
 
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -454,13 +455,28 @@ def test_elapsed_time_counts_from_the_first_sample(elapsed: str | None, ends: tu
 
 
 @pytest.mark.parametrize(("elapsed", "length"), [(None, 10.0), ("run", 10.0), ("recording", 1010.0)])
-def test_durations_are_measured_on_what_they_count_in(elapsed: str | None, length: float) -> None:
-    time = np.linspace(0.0, 10.0, 11)
+@pytest.mark.parametrize("samples", [3, 11, 1001])
+def test_durations_are_measured_on_what_they_count_in(elapsed: str | None, length: float, samples: int) -> None:
+    time = np.linspace(0.0, 10.0, samples)
     runs = [tc.Run(time=clock + time, outputs={"x": 0 * time}) for clock in (200.0, 1200.0)]
     term = tc.Term("rise", equation="x", rate=grows, parameters=[tc.Parameter("q"), tc.Parameter("tau")],
                    scales={"tau": "t"}, elapsed=elapsed)  # fmt: skip
     tau = sized(term, {"t": 10.0}, tc.Recording(runs=runs)).parameters[1]
-    assert (tau.low, tau.high) == pytest.approx((0.02 * length, length))
+    shortest = min(0.02 * length, 0.1 * 10.0 / (samples - 1))  # of a gap between samples, if that is less
+    assert (tau.low, tau.high) == pytest.approx((shortest, length))
+
+
+def test_what_parameters_are_in_nature_is_checked() -> None:
+    def made(**more: Any) -> tc.Term:
+        return tc.Term("rise", equation="x", rate=grows, parameters=[tc.Parameter("q"), tc.Parameter("tau")], **more)
+
+    assert made().expected == {}
+    assert made(expected={"q": (1, 0.25)}).expected == {"q": (1.0, 0.25)}
+    with pytest.raises(DomainError, match=r"parameters \['q', 'tau'\] of the term 'rise'. Got 'gain'"):
+        made(expected={"gain": (1.0, 0.2)})
+    for bad in (1.0, (1.0,), (1.0, 0.0), (1.0, -1.0), (math.nan, 1.0), ("1", 1.0), (True, 1.0)):
+        with pytest.raises(DomainError, match=r"\(value, sd\)\} of the term 'rise', finite, with sd > 0"):
+            made(expected={"q": bad})
 
 
 def test_what_a_copy_of_p_knows_of_elapsed_time() -> None:

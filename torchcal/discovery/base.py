@@ -12,13 +12,17 @@ from torchcal.discovery.fitting import Fitted, fit, follow_slopes, refit, starts
 from torchcal.discovery.noise import Noise, estimate, growth
 from torchcal.discovery.outliers import spikes
 from torchcal.discovery.problem import Problem
+from torchcal.discovery.sharpen import SOLVER_SHARE, sharpen
 from torchcal.errors import ConvergenceError, DomainError, SimulatorError
 from torchcal.simulators import Trajectories
 
 __all__ = ["calibrate_base", "growing"]
 
-#: The solver's error against the noise.
-SOLVER_SHARE = 0.05
+#: How often steps are chosen anew at most.
+HALVED = 7
+#: The solver's error at the first starting value, in the data's spread, from which on the fit begins with shorter
+#: steps, and how often they are halved for that at most.
+WRONG, EARLY = 0.1, 2
 #: Difference of χ² up to which an initial angle in another turn gives the same fit.
 SAME_FIT = 0.01
 #: Share of the data that may be outliers.
@@ -60,6 +64,7 @@ def calibrate_base(
     begin = starts(problem, num_starts, seed, held)
     for i, value in held.items():
         begin[:, i] = value
+    problem = _steady(problem, begin[:1])
     found = _from_starts(problem, begin, free, rough, outputs)
     for _ in range(STEEP):
         simulator = problem.simulator
@@ -100,6 +105,18 @@ def calibrate_base(
         noise = estimate(base.problem, base.residual, base.jacobian, recording.noise, units)
         base = _sharpen(refit(base, noise.whitening(base.problem)))
     return base, noise
+
+
+def _steady(problem: Problem, begin: Tensor) -> Problem:
+    """With shorter steps where a starting value ``(1, P)`` has a finite solution that is far off with these."""
+    simulator = problem.simulator
+    if not isinstance(simulator, Trajectories):
+        return problem
+    try:
+        finer = simulator.settled(begin, WRONG * problem.recording.spread, halvings=EARLY)
+    except SimulatorError:  # it is not the fit: what follows looks at that
+        return problem
+    return dataclasses.replace(problem, simulator=finer)
 
 
 def _grown(found: Fitted, known: Tensor | None, before: Tensor | None = None) -> tuple[Fitted, Tensor]:
@@ -188,32 +205,19 @@ def _again(found: Fitted, keep: Tensor) -> Fitted:
 def _sharpen(found: Fitted) -> Fitted:
     """Shorten time steps, where they err, until the solver's error is small against the noise."""
     recording = found.problem.recording
-    for number in range(8):
-        simulator = found.problem.simulator
-        if not isinstance(simulator, Trajectories) or simulator.ode.max_step is not None:
-            return found
+
+    def allowed(now: Fitted) -> Tensor:
         if isinstance(recording.noise, Tensor):
-            allowed = SOLVER_SHARE * recording.noise[found.problem.index]
-        else:
-            size = found.residual.square().mean().sqrt()
-            allowed = SOLVER_SHARE * torch.maximum(size, 1e-6 * recording.spread[found.problem.index])
-        finer = simulator.refined(2)
-        y = finer.outputs_of(found.values[None], finer.solve(found.values[None]))[0, found.problem.index]
-        error = (y - found.y).abs()
-        if bool((error <= allowed).all()):
-            return found
-        if number == 7:
-            break
-        excess = 2.0 * float((error / allowed).max())
-        if math.isfinite(excess):
-            finer = simulator.focused(found.values, simulator.solve(found.values[None], found.warm), excess)
-        problem = dataclasses.replace(found.problem, simulator=finer)
-        whitening = found.whitening
-        again = fit(problem, whitening, found.values[None], found.free)
-        found = found if again is None else again
+            return SOLVER_SHARE * recording.noise[now.problem.index]
+        size = now.residual.square().mean().sqrt()
+        return SOLVER_SHARE * torch.maximum(size, 1e-6 * recording.spread[now.problem.index])
+
+    found, error = sharpen(found, allowed, rounds=HALVED)
+    if not error:
+        return found
     raise SimulatorError(
         "Expected the solution to settle when time steps are halved. Got a change of "
-        f"{float(error.max()):.3g} after 7 times, with {_point(found.problem, found.values, found.free)} (a stiff or "
+        f"{error:.3g} after {HALVED} times, with {_point(found.problem, found.values, found.free)} (a stiff or "
         "discontinuous model: smooth it, give max_step=, or rescale it; or a fit that an initial= far from the truth "
         "led astray)."
     )

@@ -23,8 +23,9 @@ __all__ = ["Candidate", "base_columns", "check_repeats", "drivers_scale", "prepa
 GRID_POINTS = (1, 9, 5, 4)
 #: Of a shape measured on a driver's scale, how many more lie at the driver's own values: thresholds do.
 DRIVER_POINTS = (0, 7, 3, 2)
-#: Range of a shape parameter measured on a driver's scale.
-SCALE_RANGE = (0.02, 1.0)
+#: Range of a shape parameter measured on a driver's scale; on that of time it begins at a share of the usual gap
+#: between samples where that is less: lags and delays may be as fast as these show, however long the recording.
+SCALE_RANGE, OF_A_GAP = (0.02, 1.0), 0.1
 #: Difference of two evaluations, relative to the largest output, up to which a simulator repeats itself.
 JITTER = 1e-4
 #: Change of the outputs, relative to their size, that counts as none.
@@ -155,6 +156,8 @@ def sized(term: Term, scale: Mapping[str, float], recording: Recording) -> Term:
     if "t" in scale and term.elapsed == "recording":
         times = [run.time for run in recording.runs or ()]
         scale = {**scale, "t": float(max(time[-1] for time in times) - min(time[0] for time in times))}
+    steps = [run.time.diff() for run in recording.runs or () if len(run.time) > 1]
+    gaps = [float(torch.cat(steps).median())] if steps else []
     parameters = []
     for parameter in term.parameters:
         driver = term.scales.get(parameter.name)
@@ -168,6 +171,8 @@ def sized(term: Term, scale: Mapping[str, float], recording: Recording) -> Term:
             )
         size = scale[driver] or 1.0
         low, high = (part * size for part in SCALE_RANGE)
+        if driver == "t":
+            low = min([low, *(OF_A_GAP * gap for gap in gaps)])
         parameters.append(dataclasses.replace(parameter, low=low, high=high, initial=None, neutral=None))
     return dataclasses.replace(term, parameters=tuple(parameters))
 

@@ -136,6 +136,7 @@ def localised(
         description=term.description,
         scales=term.scales,
         elapsed=term.elapsed,
+        expected=term.expected,
     )
 
 

@@ -188,7 +188,9 @@ class Problem:
     def guess(self, found: Solution | None, count: int) -> Solution | None:
         """Another problem's only solution as a warm start of this one, so many times; None where it is none."""
         bound = self.simulator
-        if found is None or not isinstance(bound, Trajectories) or found.states.shape[-1] != len(bound.ode.states):
+        if found is None or not isinstance(bound, Trajectories):
+            return None
+        if found.states.shape[-2:] != (bound.grid.t.shape[1], len(bound.ode.states)):  # other steps, or other states
             return None
         return found.repeated(count)
 

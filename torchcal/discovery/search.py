@@ -22,6 +22,7 @@ from torchcal.discovery.problem import Problem
 from torchcal.discovery.refits import Refit, refit_all
 from torchcal.discovery.residual import Residual
 from torchcal.discovery.screen import Screening, Window, screen, windows
+from torchcal.discovery.sharpen import SOLVER_SHARE, accurate, sharpen
 from torchcal.discovery.stop import Stop
 from torchcal.discovery.structure import Structure, analyse
 from torchcal.discovery.verify import HeldOut, held_out_fit
@@ -36,6 +37,8 @@ UNPHYSICAL = math.log(1e-3)
 MOST = 40
 #: Refitted in any case: this many, and those with at least this share of the largest score.
 FEW, CHANCE = 6, 0.2
+#: Log evidence that a refit must gain for its time steps to be looked at, and how often they are chosen anew at most.
+WORTH, ROUNDS = 3.0, 3
 #: Log evidence by which something unknown must explain the base's residual better than any noise, to be there.
 CLEARLY = 5.0
 #: Share of the best log evidence below which a model is not fitted again when the noise estimate has changed.
@@ -285,9 +288,20 @@ class Search:
             refit_all(jobs, take, self.executor)
         return [
             None if fitted is None
-            else self._judge(Model(one.numbers, one.candidate, fitted, 0.0, one.prior, True, window=one.window))
+            else self._judge(Model(one.numbers, one.candidate, self._settled(fitted), 0.0, one.prior, True,
+                                   window=one.window))
             for one, fitted in zip(wanted, found, strict=True)
         ]  # fmt: skip
+
+    def _settled(self, found: Fitted) -> Fitted:
+        """A fit with time steps that are short enough for it: what a term brings may be faster than the base."""
+        sd = self.noise.sd[found.problem.index]
+        if self.exact or self.gain(found.chi2) < WORTH or accurate(found, sd):
+            return found
+        try:
+            return sharpen(found, lambda now: SOLVER_SHARE * sd, rounds=ROUNDS)[0]
+        except SimulatorError:
+            return found
 
     def _judge(self, model: Model) -> Model:
         """Evidence, bounds, where it acts and what speaks against it."""
@@ -320,7 +334,7 @@ class Search:
         else:
             model.note = ""
         parameters = len([i for i in candidate.own if names[i] not in off])
-        model.price = -0.5 * parameters * math.log(self.problem.n) + (UNPHYSICAL if new else 0.0)
+        model.price = -0.5 * parameters * math.log(self.problem.n) + (UNPHYSICAL if new else 0.0) + _expected(model)
         model.log_evidence = self.gain(found.chi2) + model.price
         return model
 
@@ -368,6 +382,20 @@ class Search:
             model.residual = Residual(model.found, self.noise, seed=self.seed, draws=500)
             model.structure = analyse(model.residual)
         return model.structure
+
+
+def _expected(model: Model) -> float:
+    """Log density of a model's estimates where its terms say what these are in nature, relative to its largest."""
+    known = {term.full(name): told for term in model.candidate.terms for name, told in term.expected.items()}
+    if not known:
+        return 0.0
+    found = model.found
+    values, spread = found.by_name, dict(zip(found.by_name, found.sd().tolist(), strict=True))
+    total = 0.0
+    for name, (value, sd) in known.items():
+        own = spread[name] if math.isfinite(spread[name]) else math.inf
+        total -= 0.5 * (values[name] - value) ** 2 / (sd**2 + own**2)
+    return total
 
 
 def alike(u: Tensor, v: Tensor) -> bool:

@@ -196,9 +196,21 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     # One alone is not sure enough, or it had been named; and where several do what something unknown there would do.
     rival = any(m.weight > best.weight - BEHIND for m in search.nameless)
     local = rival and all(model.window is not None for model in decision.tied_models)
-    if len(decision.tied) < 2 or decision.none > 1 - UNKNOWN or local:
+    if len(decision.tied) < 2 or decision.none > min(1 - UNKNOWN, _second(decision, ranked)) or local:
         decision.tied.append(list(NONE))
     return decision
+
+
+def _second(decision: Decision, ranked: Sequence[Model]) -> float:
+    """Probability of the second likeliest of the tied hypotheses, wherever it acts; another name of one has its own."""
+    shares: dict[frozenset[str], float] = {}
+    for model in ranked:
+        names = frozenset(model.names)
+        shares[names] = shares.get(names, 0.0) + decision.probability[id(model)]
+    known = [shares.get(frozenset(tied)) for tied in decision.tied]
+    best = max((share for share in known if share is not None), default=0.0)
+    told = sorted(best if share is None else share for share in known)
+    return told[-2] if len(told) > 1 else 1.0
 
 
 def base_alone(search: Search) -> float:

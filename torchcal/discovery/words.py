@@ -346,6 +346,8 @@ def _ambiguous(d: Any) -> list[str]:
         parts.append(re.sub(r"\bit ", "the best of them ", d.settings["doubt"], count=1))
     if len(known) < len(d.tied):
         parts.append(f"Nor can they exclude something that is not in the library (probability {unknown:.2f}).")
+    elif unknown >= LISTED:
+        parts.append(f"Something that is not in the library has a probability of {unknown:.2f}.")
     if d.experiment is not None:
         parts += _experiment(d)
     elif sum(any(row.refitted and set(row.terms) == set(tied) for row in d.ranking) for tied in known) > 1:

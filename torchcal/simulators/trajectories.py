@@ -111,16 +111,15 @@ class Trajectories(Simulator):
         """The same with shorter steps."""
         return Trajectories(self.ode, self.recording, subdivide=self.subdivide * factor, denser=self.denser)
 
-    def focused(self, values: Tensor, states: Tensor, excess: float) -> "Trajectories":
-        """The same with shorter steps where they err, for an error that is smaller by some factor.
-
-        The error of a step of order 5, from two of half its length, is spread such that the fewest steps have the
-        wanted sum of errors.
+    def step_errors(self, values: Tensor, states: Tensor) -> Tensor:
+        """Error of every step by itself, from two of half its length, as a share of the largest value of its state.
 
         Args:
             values: Parameter values, ``(d,)``.
             states: Their trajectory, ``(1, R, nodes, S)``.
-            excess: By what the error must fall.
+
+        Returns:
+            That of the worst state, ``(R, K)``.
         """
         runs, size = len(self.runs), states.shape[-1]
         t, h, u = self.grid.flat
@@ -135,7 +134,20 @@ class Trajectories(Simulator):
         twice = self.steps.step(half, t + 0.5 * h, 0.5 * h, p, inputs(middle, last))
         once = self.steps.step(begin, t, h, p, u)
         scale = states[0].abs().amax(dim=(0, 1)).clamp_min(1e-300)
-        error = ((twice - once)[0].abs() / scale).amax(-1).reshape(runs, -1)
+        return ((twice - once)[0].abs() / scale).amax(-1).reshape(runs, -1)
+
+    def focused(self, values: Tensor, states: Tensor, excess: float) -> "Trajectories":
+        """The same with shorter steps where they err, for an error that is smaller by some factor.
+
+        The error of a step of order 5, from two of half its length, is spread such that the fewest steps have the
+        wanted sum of errors.
+
+        Args:
+            values: Parameter values, ``(d,)``.
+            states: Their trajectory, ``(1, R, nodes, S)``.
+            excess: By what the error must fall.
+        """
+        runs, error = len(self.runs), self.step_errors(values, states)
         number = [self.grid.steps_between(r) for r in range(runs)]
         gaps = []
         for r, counts in enumerate(number):

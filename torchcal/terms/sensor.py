@@ -16,6 +16,8 @@ __all__ = ["sensor"]
 
 #: A first-order instrument shows 90 % of a step after ln 10 time constants.
 RESPONSE = math.log(10.0)
+#: An instrument shows the signal late, and all of it: the share of it, and how far its estimate may be off.
+NATURE = (1.0, 0.25)
 
 Signal = Callable[..., Any]
 
@@ -32,12 +34,13 @@ def sensor(
     r"""Errors of the instrument behind every output: offset, gain, non-linearity, saturation, drift, lag and delay.
 
     A lag is an instrument of first order, :math:`y + a (z - y)` with :math:`\dot z = (y - z) \ln 10 / t_{90}`: a = 1 in
-    nature, and t90 is the time to 90 % of a step. A delay by D (a = 1 in nature) is the Padé approximant
+    nature, with an sd of 0.25 as its prior, and t90 is the time to 90 % of a step. A delay by D, with the same a, is
+    the Padé approximant
 
-    .. math:: e^{-D s} \approx \frac{1 - D s/3}{1 + 2 D s/3 + (D s)^2/6},
+    .. math:: e^{-D s} \approx \frac{1 - 2 D s/5 + (D s)^2/20}{1 + 3 D s/5 + 3 (D s)^2/20 + (D s)^3/60},
 
-    within 3 % for signals of angular frequencies up to 1.2/D. Its poles, of magnitude 2.45/D, allow longer time steps
-    than those of the all-pass of the same order, 3.46/D.
+    within 3 % for signals of angular frequencies up to 2.5/D, that is periods from 2.5 D on. Its poles are of magnitude
+    4.1/D and less.
 
     Args:
         outputs: Names of the outputs. Lag and delay follow the state of the same name; for an output that is a
@@ -166,12 +169,16 @@ def _dynamic(output: str, unit: str, time: str, given: Signal) -> list[Term]:
         return found
 
     lag, delay = f"lag of {output}", f"delay of {output}"
-    shown, slope = f"{lag}: shown", f"{delay}: slope"
-    smooth = f"{delay}: smooth"
+    shown = f"{lag}: shown"
+    smooth, slope, bend = (f"{delay}: {part}" for part in ("smooth", "slope", "bend"))
 
-    def bend(t: Any, s: Any, p: Any, u: Any) -> Any:
-        wanted = signal(t, s, p, u) - s[smooth] - p["D"] * s[slope] / 1.5
-        return 6.0 * wanted / p["D"].square()
+    def jerk(t: Any, s: Any, p: Any, u: Any) -> Any:
+        D = p["D"]
+        wanted = signal(t, s, p, u) - s[smooth] - D * (0.6 * s[slope] + 0.15 * D * s[bend])
+        return 60.0 * wanted / D**3
+
+    def late(s: Any, p: Any) -> Any:
+        return s[smooth] - p["D"] * (0.4 * s[slope] - 0.05 * p["D"] * s[bend])
 
     return [
         Term(lag,
@@ -179,13 +186,16 @@ def _dynamic(output: str, unit: str, time: str, given: Signal) -> list[Term]:
              states={shown: unit}, initial={shown: first},
              outputs={output: lambda t, s, p, u, y: y + p["a"] * (s[shown] - y)},
              parameters=[amplitude("a", "1", low=0.0, high=1.5), shape("t90", time)], scales={"t90": "t"},
+             expected={"a": NATURE},
              formula=f"{output} → {output} + a (z - {output}), dz/dt = 2.303 ({output} - z)/t90",
              description="The instrument follows with a response time t90 (to 90 % of a step); a = 1 in nature."),
         Term(delay,
-             rates={smooth: lambda t, s, p, u: s[slope], slope: bend},
-             states={smooth: unit, slope: f"{unit}/{time}"}, initial={smooth: first, slope: 0.0},
-             outputs={output: lambda t, s, p, u, y: y + p["a"] * (s[smooth] - p["D"] * s[slope] / 3.0 - y)},
+             rates={smooth: lambda t, s, p, u: s[slope], slope: lambda t, s, p, u: s[bend], bend: jerk},
+             states={smooth: unit, slope: f"{unit}/{time}", bend: f"{unit}/{time}^2"},
+             initial={smooth: first, slope: 0.0, bend: 0.0},
+             outputs={output: lambda t, s, p, u, y: y + p["a"] * (late(s, p) - y)},
              parameters=[amplitude("a", "1", low=0.0, high=1.5), shape("D", time)], scales={"D": "t"},
+             expected={"a": NATURE},
              formula=f"{output}(t) → {output}(t) + a ({output}(t - D) - {output}(t)), exp(-Ds) by its Padé approximant",
              description="The signal arrives after a dead time D; a = 1 in nature."),
     ]  # fmt: skip

@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -26,6 +27,10 @@ class _Own(Values):
         began = outer if isinstance(outer, Values) else Values({}, None, None)
         super().__init__({**outer, **own}, began.first, began.start)
         self.outer = outer
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def outer(p: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -58,8 +63,11 @@ class Term:
         description: One plain sentence.
         scales: For shape parameters without bounds: the state, input, condition or output (``"t"`` for time) on
             whose scale they are measured; they are then sought between 0.02 and 1 of its largest magnitude,
-            durations (``"t"``) of the longest run's length, of the whole recording's where ``elapsed`` is that. A
+            durations (``"t"``) of the longest run's length, of the whole recording's where ``elapsed`` is that, and
+            from a tenth of the usual gap between samples where that is less. A
             moment on the recording's clock needs bounds of its own, or ``elapsed``.
+        expected: What parameters are in nature, ``{parameter: (value, sd)}``: a hypothesis whose estimate lies apart
+            from that, for its own sd too, is the less likely, by a normal density.
         elapsed: For what begins at nothing and goes on, whatever the clock says: t in its functions counts from the
             first sample of the ``"recording"``, or of each ``"run"``. By default t is the recording's own.
 
@@ -82,6 +90,7 @@ class Term:
     description: str
     scales: dict[str, str] = field(default_factory=dict)
     elapsed: str | None = None
+    expected: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     def __init__(
         self,
@@ -100,6 +109,7 @@ class Term:
         description: str = "",
         scales: Mapping[str, str] | None = None,
         elapsed: str | None = None,
+        expected: Mapping[str, tuple[float, float]] | None = None,
     ) -> None:
         if not isinstance(name, str) or not name:
             raise DomainError(f"Expected a term's name (a non-empty string). Got {name!r}.")
@@ -157,6 +167,14 @@ class Term:
             raise DomainError(
                 f'Expected elapsed="recording", "run" or None for the term {name!r}. Got {elapsed!r}.'
             )
+        for own, known in (expected or {}).items():
+            if own not in names:
+                raise DomainError(f"Expected values of parameters {names} of the term {name!r}. Got {own!r}.")
+            if not (isinstance(known, Sequence) and len(known) == 2 and all(map(_is_finite, known)) and known[1] > 0):
+                raise DomainError(
+                    f"Expected expected={{{own!r}: (value, sd)}} of the term {name!r}, finite, with sd > 0. Got "
+                    f"{known!r}."
+                )
         put = object.__setattr__
         put(self, "name", name)
         put(self, "rates", every)
@@ -170,6 +188,7 @@ class Term:
         put(self, "description", description)
         put(self, "scales", dict(scales or {}))
         put(self, "elapsed", elapsed)
+        put(self, "expected", {key: (float(value), float(sd)) for key, (value, sd) in (expected or {}).items()})
 
     def __repr__(self) -> str:
         return f"Term({self.name!r}: {', '.join([p.name for p in self.parameters] + list(self.frees))})"

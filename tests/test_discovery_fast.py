@@ -1,0 +1,155 @@
+"""What is faster than the sampling: durations that a term may have, and time steps short enough for it."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+import torchcal as tc
+from torchcal.discovery.problem import Problem
+from torchcal.discovery.search import Search
+from torchcal.discovery.sharpen import accurate, sharpen
+from torchcal.discovery.verdict import Decision, _second
+
+F64 = torch.float64
+END, COUNT, GAIN, LOSS = 60.0, 91, 0.5, 0.2
+
+
+def heated(tau: float | None = None, *, gain: float = GAIN) -> tc.ODESimulator:
+    """A body with a heater, whose heat comes late where a time is given."""
+    body = [tc.Parameter("g", unit="K/s", low=0.0, initial=0.4), tc.Parameter("k", unit="1/s", low=0.0, initial=0.15)]
+    if tau is None:
+        return tc.ODESimulator(lambda t, s, p, u: {"T": p["g"] * u["P"] - p["k"] * s["T"]}, {"T": "K"}, body)
+    late = [tc.Parameter("g2", low=0.0, initial=gain), tc.Parameter("tau", low=0.9 * tau, high=1.1 * tau)]
+    return tc.ODESimulator(
+        lambda t, s, p, u: {
+            "T": p["g"] * u["P"] + p["g2"] * s["z"] - p["k"] * s["T"],
+            "z": (u["P"] - s["z"]) / p["tau"],
+        },
+        {"T": "K", "z": ""}, [*body, *late], observe=("T",),
+    )  # fmt: skip
+
+
+def recorded(tau: float, *, sd: float = 0.02, seed: int = 0) -> tc.Recording:
+    """Of such a heater, whose power is a square wave with the ramps of its samples."""
+    t = np.linspace(0.0, END, COUNT)
+    power = 1.0 + np.sign(np.sin(2 * np.pi * t / 9.0 + 0.1))
+
+    def rates(now, s):
+        now_power = np.interp(now, t, power)
+        return [GAIN * s[1] - LOSS * s[0], (now_power - s[1]) / tau]
+
+    y = solve_ivp(rates, (0, END), [0.0, 0.0], t_eval=t, rtol=1e-9, atol=1e-11, max_step=t[1] / 4, method="LSODA").y[0]
+    noisy = torch.tensor(y) + sd * torch.randn(COUNT, generator=torch.Generator().manual_seed(seed), dtype=F64)
+    run = tc.Run(time=torch.tensor(t), outputs={"T": noisy}, inputs={"P": torch.tensor(power)}, initial={"T": 0.0})
+    return tc.Recording(runs=[run], noise=sd)
+
+
+@pytest.mark.parametrize("share", [0.25, 0.6])
+def test_a_lag_shorter_than_the_gaps_between_samples_is_found_and_not_biased(share):
+    """With the base's steps, one in a gap, its time would be off by several of its sd."""
+    tau = share * END / (COUNT - 1)
+    candidates = tc.terms.thermal(temperature="T", ambient=0.0, heater="P")
+    d = tc.diagnose(heated(), recorded(tau), candidates, progress=False)
+    assert (d.verdict, d.terms) == ("named", ["heater lag"])
+    row = next(r for r in d.ranking if r.terms == ("heater lag",))
+    told = {e.name: e for e in row.estimates}["heater lag.tau"]
+    assert abs(told.value - tau) < 3 * told.sd
+    assert told.sd < tau
+    assert not told.at_bound
+
+
+def test_a_base_that_is_stiffer_than_its_samples_begins_with_steps_that_do():
+    """At the user's own values its solution with one step in a gap is far off, and a gain of 0 would hide that."""
+    tau = 0.3 * END / (COUNT - 1)
+    base = heated(tau)
+    fixed = {"g": 0.0}  # all heat comes late
+    d = tc.diagnose(base, recorded(tau), [], fixed=fixed, progress=False)
+    assert d.verdict == "consistent"
+    found = {e.name: e.value for e in d.base.estimates}
+    assert found["g2"] == pytest.approx(GAIN, rel=0.05)
+
+
+def test_steps_are_chosen_anew_until_halving_them_changes_nothing():
+    tau = 0.3 * END / (COUNT - 1)
+    search = Search(Problem.of(heated(), recorded(tau)), [], {}, 0, 4, 1, lambda text: None, None)
+    search.calibrate_base()
+    base, sd = search.base, search.noise.sd[search.base.problem.index]
+    assert accurate(base, sd)
+    same, left = sharpen(base, lambda now: 0.05 * sd, rounds=3)
+    assert same is base
+    assert left == 0.0
+    strict = 1e-8 * sd
+    finer, left = sharpen(base, lambda now: strict, rounds=6)
+    assert left == 0.0
+    assert finer.problem.simulator.num_steps > base.problem.simulator.num_steps
+    assert not accurate(base, 1e-9 * sd)
+    _, left = sharpen(base, lambda now: 1e-13 * sd, rounds=1)
+    assert left > 0  # it says by how much
+
+
+def shares(**given: float) -> tuple[Decision, list]:
+    decision, models = Decision(), []
+    for names, share in given.items():
+        model = SimpleNamespace(names=tuple(names.split("_")[0].split("+")))
+        decision.probability[id(model)] = share
+        models.append(model)
+    decision.tied = [list(names) for names in dict.fromkeys(model.names for model in models)]
+    return decision, models
+
+
+def test_the_second_of_tied_hypotheses_counts_wherever_it_acts():
+    decision, models = shares(a=0.5, b_here=0.1, b_there=0.15, c=0.2)
+    assert _second(decision, models) == pytest.approx(0.25)
+    decision, models = shares(a_here=0.5, a_there=0.3)
+    assert _second(decision, models) == 1.0  # no other
+    decision.tied.append(["another name of a"])
+    assert _second(decision, models) == pytest.approx(0.8)
+
+
+def test_something_unknown_that_is_likelier_than_the_second_is_tied_with_them():
+    """A stiffness that follows the drive, in no list: all that is listed acts for it in some window."""
+    g = torch.Generator().manual_seed(0)
+    x = torch.linspace(0, 1, 60, dtype=F64)
+    y = 1 + x + 0.05 * torch.sin(9 * x) * x + 0.02 * torch.randn(60, generator=g, dtype=F64)
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, parameters=[tc.Parameter("a"), tc.Parameter("b")])
+    powers = [
+        tc.Term(f"power {k}", outputs={"y": lambda x, p, y, k=k: y + p["c"] * x**k}, parameters=[tc.Parameter("c")])
+        for k in (2, 3, 6)
+    ]
+    d = tc.diagnose(line, tc.Recording(x=x, y=y, noise=0.02), powers, progress=False)
+    unknown = sum(row.probability for row in d.ranking if row.terms == ("none of these",))
+    if d.verdict == "ambiguous":
+        known = sorted(sum(r.probability for r in d.ranking if list(r.terms) == t) for t in d.tied if t[0][0] == "p")
+        assert (["none of these"] in d.tied) is (len(known) < 2 or unknown > min(0.3, known[-2]))
+        told = str(d).replace("\n", " ")
+        assert "not in the library" in told
+    assert d.verdict in ("ambiguous", "unexplained")
+
+
+def test_an_estimate_apart_from_what_nature_has_costs_by_a_normal_density():
+    g = torch.Generator().manual_seed(1)
+    x = torch.linspace(0, 1, 50, dtype=F64)
+    y = 1 + x + 0.4 * x**2 + 0.01 * torch.randn(50, generator=g, dtype=F64)
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, parameters=[tc.Parameter("a"), tc.Parameter("b")])
+
+    def evidence(**more) -> tuple[float, float, float]:
+        bend = tc.Term("bend", outputs={"y": lambda x, p, y: y + p["c"] * x**2}, parameters=[tc.Parameter("c")], **more)
+        d = tc.diagnose(line, tc.Recording(x=x, y=y, noise=0.01), [bend], progress=False)
+        row = next(r for r in d.ranking if r.terms == ("bend",))
+        return row.log_evidence, row.estimates[0].value, row.estimates[0].sd
+
+    plain, value, sd = evidence()
+    told, same, _ = evidence(expected={"c": (1.0, 0.2)})
+    assert same == pytest.approx(value)  # it weighs, and does not move
+    assert told - plain == pytest.approx(-0.5 * (value - 1.0) ** 2 / (0.2**2 + sd**2), rel=1e-6)
+
+
+def test_a_partial_delay_is_less_likely_than_a_whole_one():
+    for name in ("lag of x", "delay of x"):
+        (term,) = (t for t in tc.terms.sensor(outputs=("x",)) if t.name == name)
+        assert term.expected == {"a": (1.0, 0.25)}
+        assert dataclasses.replace(term, description="").expected == term.expected
