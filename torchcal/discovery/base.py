@@ -114,7 +114,7 @@ def _steady(problem: Problem, begin: Tensor) -> Problem:
         return problem
     try:
         finer = simulator.settled(begin, WRONG * problem.recording.spread, halvings=EARLY)
-    except SimulatorError:  # it is not the fit: what follows looks at that
+    except (SimulatorError, DomainError):  # it is not the fit: what follows looks at that
         return problem
     return dataclasses.replace(problem, simulator=finer)
 

@@ -26,7 +26,7 @@ from torchcal.discovery.sharpen import SOLVER_SHARE, accurate, sharpen
 from torchcal.discovery.stop import Stop
 from torchcal.discovery.structure import Structure, analyse
 from torchcal.discovery.verify import HeldOut, held_out_fit
-from torchcal.errors import SimulatorError
+from torchcal.errors import DomainError, SimulatorError
 from torchcal.terms import Term
 
 __all__ = ["BETTER", "Search", "alike"]
@@ -300,7 +300,7 @@ class Search:
             return found
         try:
             return sharpen(found, lambda now: SOLVER_SHARE * sd, rounds=ROUNDS)[0]
-        except SimulatorError:
+        except (SimulatorError, DomainError):  # with steps so short, or with too many of them
             return found
 
     def _judge(self, model: Model) -> Model:
