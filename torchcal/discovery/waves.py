@@ -95,9 +95,9 @@ def _run_of(channel: Channel) -> Tensor:
 
 def _waves(channel: Channel, frequencies: Tensor) -> Tensor:
     """Cosine and sine in every run, ``(K, F, 2 runs)``."""
-    angle = 2 * math.pi * channel.time[:, None] * frequencies
-    each = [(run == r).to(torch.float64)[:, None] for run in [_run_of(channel)] for r in run.unique()]
-    return torch.stack([part for mine in each for part in (mine * angle.cos(), mine * angle.sin())], dim=-1)
+    angle, run = 2 * math.pi * channel.time[:, None] * frequencies, _run_of(channel)
+    each = [(run == r)[:, None] for r in run.unique()]
+    return torch.stack([mine * wave for mine in each for wave in (angle.cos(), angle.sin())], dim=-1)
 
 
 def wave_places(
