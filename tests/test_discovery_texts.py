@@ -244,6 +244,22 @@ def test_limits_that_are_left_out_are_counted(count, told):
     assert said(finding("consistent", detection_limit=limits)).endswith(told)
 
 
+@pytest.mark.parametrize(("p", "told"), [(0.5, "no sign"), (0.02, "no sure sign"), (0.001, "base alone remains likelier")])
+def test_no_sign_is_told_with_what_chance_has_to_do_for_it(p, told):
+    d = finding("consistent", p_detect=p, noise=SimpleNamespace(source="given", correlation={}))
+    assert told in said(d)
+
+
+def test_a_probability_below_what_names_is_told_below_it():
+    d = finding("ambiguous", tied=[["drag"], list(words.NONE)], ranking=[row(["drag"], 0.8496), row(words.NONE, 0.15)])
+    assert "has a probability of 0.84, which is too little" in said(d)
+
+
+def test_what_was_not_refitted_has_removed_nothing_that_is_known():
+    table = Table([Hypothesis(words.NONE, 1.0, 0.4), row(["drag"], 0.6)], ("terms", "misfit_removed"))
+    assert [line.split()[-1] for line in str(table).splitlines()[1:]] == ["-", "0.9"]
+
+
 @pytest.mark.parametrize(("separation", "told"), [(12.34, "12.3"), (99.96, "100"), (35e4, "more than 100")])
 def test_no_distance_is_told_by_thousands(separation, told):
     experiment = Experiment("longer", separation)
@@ -414,6 +430,7 @@ def test_a_term_that_frees_what_is_free_is_told():
     ("shares", "told"),
     [((0.4, 0.35, 0.2), "3 hypotheses explain it about as well, and"),
      ((0.6, 0.3, 0.05), "3 hypotheses explain it with probabilities from 0.60 to 0.05, and"),
+     ((0.6, 0.3, 0.0002), "3 hypotheses explain it with probabilities from 0.60 to < 0.001, and"),
      ((0.3, 0.3), "2 hypotheses explain it about as well, and these data cannot exclude either"),
      ((0.9, 0.05), "b0 explains it best (probability 0.90); these data cannot exclude the other.")],
 )  # fmt: skip

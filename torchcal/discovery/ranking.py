@@ -49,7 +49,8 @@ def ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[Hy
         elif (i,) not in fitted:
             rows.append(_screened(search, i))
     rows.append(
-        Hypothesis((), 0.0, decision.base, p_white=search.structure.p_value, refitted=True, note="the base alone")
+        Hypothesis((), 0.0, decision.base, misfit_removed=0.0, p_white=search.structure.p_value, refitted=True,
+                   note="the base alone")
     )
     if not search.exact:
         evidence = decision.none_evidence - math.log(PRIOR["none"])
@@ -103,6 +104,9 @@ def _alias(search: Search, i: int, model: Model, share: float) -> Hypothesis:
 def _screened(search: Search, i: int) -> Hypothesis:
     """A candidate that was not refitted, or could not be."""
     candidate = search.candidates[i]
-    note = "" if candidate.blind or search.screening.best[i] >= 0 else "already in the base model"
+    nothing = not candidate.blind and search.screening.best[i] < 0
+    note = "already in the base model" if nothing else ""
     note = "no fit from any starting value" if i in search.failed else note
-    return Hypothesis((candidate.name,), -math.inf, 0.0, score=search.screening.score(i), note=note)
+    removed = 0.0 if nothing else None
+    score = search.screening.score(i)
+    return Hypothesis((candidate.name,), -math.inf, 0.0, misfit_removed=removed, score=score, note=note)

@@ -162,7 +162,7 @@ class Hypothesis:
         probability: Among all hypotheses considered.
         estimates: Of the terms' parameters.
         physical: Whether signs and ranges are physically possible.
-        misfit_removed: Share of the squared misfit beyond noise that it removes.
+        misfit_removed: Share of the squared misfit beyond noise that it removes; None where nobody knows.
         p_white: Probability of so much structure in what is left by noise alone.
         held_out_rmse: RMSE on held-out data; None where it was not tried, as for what is improbable.
         score: Screening statistic z of its tangent.
@@ -177,7 +177,7 @@ class Hypothesis:
     probability: float
     estimates: tuple[Estimate, ...] = ()
     physical: bool = True
-    misfit_removed: float = 0.0
+    misfit_removed: float | None = None
     p_white: float | None = None
     held_out_rmse: float | None = None
     score: float | None = None

@@ -29,6 +29,8 @@ MORE, LIMITS = 4, 6
 BESIDE = 0.005
 #: Share of the misfit that something can remove at most and be no name: all but what is less than that.
 NEARLY_ALL = 0.999
+#: Probability by noise alone below which what is taken for noise is told to be no common one.
+SELDOM = 0.05
 #: A parameter depends on what acts beside it when that moves it by more than this many of its sd.
 MOVED = 2.0
 
@@ -152,6 +154,8 @@ def _consistent(d: Any) -> list[str]:
     # Of what is seen with one sign alone the table tells.
     limits = [one for one in d.detection_limit if math.isfinite(one.smallest) and not one.sign]
     nothing = "There is no sign of missing physics." + _yet(d)
+    if d.p_detect < SELDOM:
+        nothing = "There is no sure sign of missing physics: by chance noise does as much now and then." + _yet(d)
     if d.p_detect < 1 - d.confidence:
         nothing = "Yet the base alone remains likelier than all that was tried beside it."
         if d.noise.source == "estimated" and max(d.noise.correlation.values(), default=0.0) >= SLOW:
@@ -311,7 +315,7 @@ def _ambiguous(d: Any) -> list[str]:
         sure = sum(row.probability for row in d.ranking if set(known[0]) <= set(row.terms))
         return [
             where_in_words(d),
-            f"{_and(known[0])}, the best explanation in the library, has a probability of {sure:.2f}, which is too "
+            f"{_and(known[0])}, the best explanation in the library, has a probability of {math.floor(100 * sure) / 100:.2f}, which is too "
             f"little for a name: something that is not in the library has {unknown:.2f}, other terms and the base "
             f"alone have {max(1 - sure - unknown, 0.0):.2f} together. {_would_tell(d, known[0])}",
         ]
@@ -324,7 +328,7 @@ def _ambiguous(d: Any) -> list[str]:
     else:
         which = "either" if len(known) == 2 else "any"
         least = min(filter(None, shares), default=1.0)
-        unequal = f"with probabilities from {shares[best]:.2f} to {least:.2f}"
+        unequal = f"with probabilities from {shares[best]:.2f} to {_probability(least)}"
         well = "about as well" if least > AS_WELL * shares[best] else unequal
         told = f"{len(known)} hypotheses explain it {well}, and these data cannot exclude {which} of them."
     parts = [where_in_words(d), told]
