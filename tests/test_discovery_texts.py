@@ -244,7 +244,9 @@ def test_limits_that_are_left_out_are_counted(count, told):
     assert said(finding("consistent", detection_limit=limits)).endswith(told)
 
 
-@pytest.mark.parametrize(("p", "told"), [(0.5, "no sign"), (0.02, "no sure sign"), (0.001, "base alone remains likelier")])
+@pytest.mark.parametrize(
+    ("p", "told"), [(0.5, "no sign"), (0.02, "no sure sign"), (0.001, "base alone remains likelier")]
+)
 def test_no_sign_is_told_with_what_chance_has_to_do_for_it(p, told):
     d = finding("consistent", p_detect=p, noise=SimpleNamespace(source="given", correlation={}))
     assert told in said(d)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 import torchcal as tc
 from torchcal.errors import DomainError, RecordingError, SimulatorError
-from torchcal.simulators import Solution, Trajectories, steps
+from torchcal.simulators import Solution, Trajectories, focused, settled, steps
 from torchcal.simulators.recurrence import recur
 from torchcal.terms import extend
 
@@ -101,7 +101,7 @@ def test_runs_of_unequal_length_agree_with_scipy(hold: str) -> None:
         run_of(np.array([1.0, 1.1, 1.7, 3.0, 3.2]), {"x": -0.5, "v": 2.0}, hold),
     ]
     bound = oscillator().bind(tc.Recording(runs=runs))
-    fine = bound.settled(tensor(4.0, 0.2)[None], torch.full((26,), 1e-7, dtype=F64))
+    fine = settled(bound, tensor(4.0, 0.2)[None], torch.full((26,), 1e-7, dtype=F64))
     found = fine.at(fine.x)(tensor(4.0, 0.2))
     exact = np.concatenate([truth(runs[0], (1.0, 0.0), 4.0, 0.2)[0], truth(runs[1], (-0.5, 2.0), 4.0, 0.2)[0]])
     assert np.abs(found.numpy() - exact).max() < 1e-6
@@ -144,13 +144,13 @@ def test_steps_are_halved_until_the_solution_settles() -> None:
     coarse = oscillator().bind(recording)
     point = tensor(30.0, 0.1)[None]
     allowed = torch.full((60,), 1e-4, dtype=F64)
-    fine = coarse.settled(point, allowed)
+    fine = settled(coarse, point, allowed)
     assert fine.num_steps > coarse.num_steps
     finest = fine.refined(4)
     errors = [(b.at(b.x)(point) - finest.at(finest.x)(point)).abs().max() for b in (coarse, fine)]
     assert errors[0] > 1e-4
     assert errors[1] < 1.1e-4
-    assert oscillator(max_step=0.3).bind(recording).settled(point, 1e-12 * allowed).num_steps < 200
+    assert settled(oscillator(max_step=0.3).bind(recording), point, 1e-12 * allowed).num_steps < 200
 
 
 def test_shorter_steps_where_they_err(star: tc.ODESimulator) -> None:
@@ -171,7 +171,7 @@ def test_shorter_steps_where_they_err(star: tc.ODESimulator) -> None:
         error = float((steps.outputs_of(values[None], states)[0] - torch.as_tensor(exact)).abs().max())
         if error < 1e-4:
             break
-        steps = steps.focused(values, states, 2 * error / 1e-4)
+        steps = focused(steps, values, states, 2 * error / 1e-4)
     assert error < 1e-4
     even = bound.refined(math.ceil(2 * steps.num_steps / bound.num_steps))
     assert even.num_steps > 1.9 * steps.num_steps
@@ -196,8 +196,8 @@ def test_a_stiff_model_is_refined_or_told_apart_clearly() -> None:
     point, allowed = tensor(900.0)[None], torch.full((20,), 1e-5, dtype=F64)
     exact = solve_ivp(lambda t, s: -900 * (s - np.cos(t)), (0, 3), [1.0], "Radau", t, rtol=1e-9, atol=1e-11).y[0]
     assert np.abs(bound.at(bound.x)(point)[0].numpy() - exact).max() > 1e3  # the coarse steps are unstable
-    settled = bound.settled(point, allowed)
-    assert np.abs(settled.at(settled.x)(point)[0].numpy() - exact).max() < 2e-5
+    found = settled(bound, point, allowed)
+    assert np.abs(found.at(found.x)(point)[0].numpy() - exact).max() < 2e-5
 
     switching = tc.ODESimulator(
         lambda t, s, p, u: {"c": p["k"] * torch.sign(torch.sin(9.0 * t)).expand(s["c"].shape)},
@@ -205,7 +205,7 @@ def test_a_stiff_model_is_refined_or_told_apart_clearly() -> None:
         [tc.Parameter("k")],
     )
     with pytest.raises(SimulatorError, match=r"settle when time steps are halved.*smooth it"):
-        switching.bind(recording).settled(tensor(1.0)[None], 0.1 * allowed)
+        settled(switching.bind(recording), tensor(1.0)[None], 0.1 * allowed)
 
 
 def test_a_solution_that_blows_up_is_infinite_and_raises_nothing() -> None:

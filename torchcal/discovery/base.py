@@ -13,8 +13,8 @@ from torchcal.discovery.noise import Noise, estimate, growth
 from torchcal.discovery.outliers import spikes
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.sharpen import SOLVER_SHARE, sharpen
-from torchcal.errors import ConvergenceError, DomainError, SimulatorError
-from torchcal.simulators import Trajectories
+from torchcal.errors import ConvergenceError, SimulatorError
+from torchcal.simulators import Trajectories, workable
 
 __all__ = ["calibrate_base", "growing"]
 
@@ -27,8 +27,6 @@ WRONG, EARLY = 0.1, 2
 SAME_FIT = 0.01
 #: Share of the data that may be outliers.
 MOST = 0.2
-#: How often steps are made four times shorter where no starting value has a finite solution.
-STEEP = 3
 #: How often noise that grows is estimated from what it leaves when it is weighed.
 GROWTHS = 4
 
@@ -66,22 +64,11 @@ def calibrate_base(
         begin[:, i] = value
     problem = _steady(problem, begin[:1])
     found = _from_starts(problem, begin, free, rough, outputs)
-    for _ in range(STEEP):
-        simulator = problem.simulator
-        if found is not None or not isinstance(simulator, Trajectories) or simulator.ode.max_step is not None:
-            break
-        try:  # too stiff, perhaps, for steps so long
-            problem = dataclasses.replace(problem, simulator=simulator.refined(4))
-        except DomainError:  # more steps than anyone can take
-            break
-        if bool(torch.isfinite(problem.evaluate(begin[:1], free)[0]).all()):
-            found = _from_starts(problem, begin, free, rough, outputs)
     if found is None:
         raise ConvergenceError(
             f"Expected finite outputs of the base at one of {num_starts} starting values at least. Got none, the first "
             f"with {_point(problem, begin[0], free)}. Give initial= near the truth, or bounds, to the parameters (a "
-            "rate is about 1 over the time in which something happens); look at the runs' initial values; and of a "
-            "stiff model replace a fast state by its equilibrium, or give max_step=."
+            "rate is about 1 over the time in which something happens), and look at the runs' initial values."
         )
     found = _unwound(_sharpen(found))
     found, units = _grown(found, unit)
@@ -108,15 +95,11 @@ def calibrate_base(
 
 
 def _steady(problem: Problem, begin: Tensor) -> Problem:
-    """With shorter steps where a starting value ``(1, P)`` has a finite solution that is far off with these."""
+    """With steps that do for a starting value ``(1, P)``, roughly."""
     simulator = problem.simulator
     if not isinstance(simulator, Trajectories):
         return problem
-    try:
-        finer = simulator.settled(begin, WRONG * problem.recording.spread, halvings=EARLY)
-    except (SimulatorError, DomainError):  # it is not the fit: what follows looks at that
-        return problem
-    return dataclasses.replace(problem, simulator=finer)
+    return problem.with_simulator(workable(simulator, begin, WRONG * problem.recording.spread, halvings=EARLY))
 
 
 def _grown(found: Fitted, known: Tensor | None, before: Tensor | None = None) -> tuple[Fitted, Tensor]:
@@ -217,9 +200,8 @@ def _sharpen(found: Fitted) -> Fitted:
         return found
     raise SimulatorError(
         "Expected the solution to settle when time steps are halved. Got a change of "
-        f"{error:.3g} after {HALVED} times, with {_point(found.problem, found.values, found.free)} (a stiff or "
-        "discontinuous model: smooth it, give max_step=, or rescale it; or a fit that an initial= far from the truth "
-        "led astray)."
+        f"{error:.3g} after {HALVED} times, with {_point(found.problem, found.values, found.free)} (a discontinuous "
+        "model: smooth it, or give max_step=; or a fit that an initial= far from the truth led astray)."
     )
 
 

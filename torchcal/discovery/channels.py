@@ -182,7 +182,7 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
         own = [i for i in found.free if names[i] not in bound.initial_names and not is_window(names[i])]
         size = len(bound.ode.states)
         _, _, by_parameter = bound.steps.derivatives(found.values[None], states, own)
-        kicks = torch.diag_embed(bound.grid.h[..., None].expand(-1, -1, size))
+        kicks = bound.steps.kicks(found.values[None], states)[0]
         forcing = torch.cat([kicks, by_parameter[0]], dim=-1)
         response, drivers, time = responses(problem, found, forcing)
         bins, count = _binning(bound)

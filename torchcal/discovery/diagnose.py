@@ -377,7 +377,8 @@ def _in_order(search: Search, best: Model) -> list[str]:
 
 def _solver(simulator: Simulator) -> str:
     if isinstance(simulator, Trajectories):
-        return f"classical Runge–Kutta, {simulator.num_steps} steps a run"
+        method = "Radau IIA (implicit)" if simulator.implicit else "classical Runge–Kutta"
+        return f"{method}, {simulator.num_steps} steps a run"
     return "static"
 
 

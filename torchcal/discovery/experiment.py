@@ -15,7 +15,7 @@ from torchcal.discovery.noise import Noise
 from torchcal.discovery.problem import Problem, Whitening
 from torchcal.discovery.records import Experiment
 from torchcal.errors import TorchcalError
-from torchcal.simulators import Trajectories
+from torchcal.simulators import Trajectories, settled
 
 __all__ = ["propose"]
 
@@ -153,10 +153,10 @@ def _bearable(models: Sequence[Model], recording: Recording, noise: Noise) -> bo
         if isinstance(simulator, Trajectories):
             bound, values = _there(model.found, simulator, recording)
             try:
-                settled = bound.settled(values, SETTLED * _sd(recording, noise), halvings=HALVINGS)
+                there = settled(bound, values, SETTLED * _sd(recording, noise), halvings=HALVINGS)
             except TorchcalError:
                 return False
-            if not bool(torch.isfinite(settled.outputs_of(values, settled.solve(values))).all()):
+            if not bool(torch.isfinite(there.outputs_of(values, there.solve(values))).all()):
                 return False
     return True
 

@@ -288,18 +288,21 @@ class Search:
             refit_all(jobs, take, self.executor)
         return [
             None if fitted is None
-            else self._judge(Model(one.numbers, one.candidate, self._settled(fitted), 0.0, one.prior, True,
+            else self._judge(Model(one.numbers, one.candidate, self._settled(fitted, one.window), 0.0, one.prior, True,
                                    window=one.window))
             for one, fitted in zip(wanted, found, strict=True)
         ]  # fmt: skip
 
-    def _settled(self, found: Fitted) -> Fitted:
-        """A fit with time steps that are short enough for it: what a term brings may be faster than the base."""
+    def _settled(self, found: Fitted, window: Window | None) -> Fitted:
+        """A fit with time steps that are short enough for it: what a term brings may be faster than the base.
+
+        The edge of a window may lie within a step: shorter ones would only move it.
+        """
         sd = self.noise.sd[found.problem.index]
-        if self.exact or self.gain(found.chi2) < WORTH or accurate(found, sd):
+        if self.exact or window is not None or self.gain(found.chi2) < WORTH or accurate(found, sd):
             return found
         try:
-            return sharpen(found, lambda now: SOLVER_SHARE * sd, rounds=ROUNDS)[0]
+            return sharpen(found, lambda now: SOLVER_SHARE * sd, rounds=ROUNDS, patient=False)[0]
         except (SimulatorError, DomainError):  # with steps so short, or with too many of them
             return found
 

@@ -313,9 +313,10 @@ def _ambiguous(d: Any) -> list[str]:
         if d.settings.get("doubt"):
             return [where_in_words(d), f"{_hypothesis(d, known[0])} explains it best. {d.settings['doubt']}"]
         sure = sum(row.probability for row in d.ranking if set(known[0]) <= set(row.terms))
+        told = math.floor(100 * sure) / 100  # and never what would be enough
         return [
             where_in_words(d),
-            f"{_and(known[0])}, the best explanation in the library, has a probability of {math.floor(100 * sure) / 100:.2f}, which is too "
+            f"{_and(known[0])}, the best explanation in the library, has a probability of {told:.2f}, which is too "
             f"little for a name: something that is not in the library has {unknown:.2f}, other terms and the base "
             f"alone have {max(1 - sure - unknown, 0.0):.2f} together. {_would_tell(d, known[0])}",
         ]

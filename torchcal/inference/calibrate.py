@@ -35,7 +35,7 @@ from torchcal.priors import Flat
 from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results import Calibration, MapEstimate
 from torchcal.results.in_time import check_nodes_in_time
-from torchcal.simulators import Scaling, Simulator, Trajectories
+from torchcal.simulators import Scaling, Simulator, Trajectories, settled
 
 __all__ = ["calibrate"]
 
@@ -217,7 +217,7 @@ def _settled(propagate: NISP, alpha: Tensor, recording: Recording) -> Simulator:
         return simulator
     with torch.no_grad():
         nodes = propagate.with_held(propagate.parameters_at(alpha, propagate.nodes))
-    return simulator.settled(nodes.cpu(), allowed_solver_error(recording))
+    return settled(simulator, nodes.cpu(), allowed_solver_error(recording))
 
 
 def _check_propagation(propagate: NISP, alpha: Tensor, samples: Tensor | None) -> PropagationCheck | None:

@@ -15,7 +15,7 @@ from torchcal.inference.randomness import preserve_random_state
 from torchcal.inference.tangent import minimise_by_tangents
 from torchcal.priors import Flat
 from torchcal.propagation import NISP
-from torchcal.simulators import Parameter, Scaling, Simulator, Trajectories, free_parameters
+from torchcal.simulators import Parameter, Scaling, Simulator, Trajectories, free_parameters, settled
 
 __all__ = ["LeastSquares", "allowed_solver_error", "least_squares", "plain_propagation"]
 
@@ -58,7 +58,7 @@ def least_squares(
     for _ in range(4):
         values = found.scaling.physical(found.scaled)
         held = plain_propagation(simulator, recording, fixed, found.scaling)
-        finer = simulator.settled(held.with_held(values)[None], allowed_solver_error(recording))
+        finer = settled(simulator, held.with_held(values)[None], allowed_solver_error(recording))
         if finer is simulator:
             break
         simulator = finer

@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from torchcal import likelihoods
 from torchcal.checks import whole
@@ -15,7 +14,7 @@ from torchcal.inference.fitting import allowed_solver_error
 from torchcal.models import Problem
 from torchcal.priors import CoefficientPrior
 from torchcal.propagation import NISP
-from torchcal.simulators import Parameter, Scaling, Simulator, Trajectories, free_parameters
+from torchcal.simulators import Parameter, Scaling, Simulator, Trajectories, free_parameters, workable
 
 __all__ = ["PriorMaker", "check_inputs", "check_run", "embedded_problem"]
 
@@ -62,7 +61,7 @@ def check_inputs(
         for parameter in free:
             if parameter.initial is not None:
                 guess[simulator.names.index(parameter.name)] = parameter.initial
-        simulator = _begin(simulator, guess[None], 100 * allowed_solver_error(recording))
+        simulator = workable(simulator, guess[None], 100 * allowed_solver_error(recording))
     count = simulator.check(recording.x, values, recording.outputs)
     if count != len(recording.y):
         raise SimulatorError(
@@ -70,21 +69,6 @@ def check_inputs(
             f"{len(recording.outputs)} outputs). Got {count} from the simulator."
         )
     return simulator, free
-
-
-def _begin(simulator: Trajectories, guess: Tensor, allowed: Tensor) -> Trajectories:
-    """Steps with which the solution at the first guess is finite and roughly right, if any are."""
-    if simulator.ode.max_step is not None:
-        return simulator
-    finer = simulator
-    while not bool(torch.isfinite(finer.outputs_of(guess, finer.solve(guess))).all()):
-        if finer.subdivide >= 64 * simulator.subdivide:
-            return simulator
-        finer = finer.refined(4)
-    try:
-        return finer.settled(guess, allowed)
-    except SimulatorError:  # the estimate may lie elsewhere; there it must settle
-        return finer
 
 
 def check_run(num_starts: int, device: torch.device | str | None) -> None:

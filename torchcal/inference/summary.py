@@ -233,7 +233,9 @@ def settings_of(problem: Problem, fit: LeastSquares, embedding: str, seed: int, 
     propagate = problem.propagate
     choice = propagate.rule_choice
     simulator = propagate.simulator
-    in_time = {"subdivide": simulator.subdivide} if isinstance(simulator, Trajectories) else {}
+    in_time = {}
+    if isinstance(simulator, Trajectories):
+        in_time = {"subdivide": simulator.subdivide, "implicit": simulator.implicit}
     return {
         **in_time,
         "embedding": embedding,

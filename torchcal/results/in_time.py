@@ -13,7 +13,7 @@ from torchcal.data.run import change, convert
 from torchcal.errors import DomainError, PropagationWarning, warn
 from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results.base import conditions
-from torchcal.simulators import Conditions, Simulator, Trajectories
+from torchcal.simulators import Conditions, Simulator, Trajectories, settled
 
 __all__ = ["NODE_TOLERANCE", "check_nodes_in_time", "propagation_in_time"]
 
@@ -98,7 +98,7 @@ def propagation_in_time(propagate: NISP, recording: Recording, x: Any, alpha: Te
         xi = propagate.nodes
         values = propagate.with_held(propagate.parameters_at(alpha.to(xi), xi)).to(device="cpu", dtype=torch.float64)
         spread = recording.spread[:: recording.n]
-        other = other.settled(values[:, columns], 1e-3 * spread.cpu().repeat_interleave(other.recording.n))
+        other = settled(other, values[:, columns], 1e-3 * spread.cpu().repeat_interleave(other.recording.n))
     return propagate.copy(x=where, simulator=_Elsewhere(bound, other, columns, picks))
 
 

@@ -404,8 +404,10 @@ def _propagation(
     if recording.runs is None and isinstance(simulator, ODESimulator | Trajectories):
         raise RecordingError("Expected a static simulator for a static recording. Got one in time (give the other).")
     simulator = simulator.bind(recording)
-    if isinstance(simulator, Trajectories) and settings.get("subdivide", 1) > simulator.subdivide:
-        simulator = Trajectories(simulator.ode, recording, subdivide=settings["subdivide"])
+    if isinstance(simulator, Trajectories):
+        subdivide = max(settings.get("subdivide", 1), simulator.subdivide)
+        implicit = settings.get("implicit", simulator.implicit)
+        simulator = Trajectories(simulator.ode, recording, subdivide=subdivide, implicit=implicit)
     propagate = NISP(
         simulator,
         embedding,

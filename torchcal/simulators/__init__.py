@@ -9,6 +9,14 @@ from torchcal.simulators.ode import ODESimulator
 from torchcal.simulators.parameter import Parameter, Scaling, free_parameters
 from torchcal.simulators.solution import Solution
 from torchcal.simulators.static import Conditions, Linearisation, Simulator, check_parameters
+from torchcal.simulators.stepping import (
+    focused,
+    may_change,
+    settled,
+    settled_implicitly,
+    step_errors,
+    workable,
+)
 from torchcal.simulators.surrogate import PolynomialSurrogate
 from torchcal.simulators.trajectories import Trajectories
 
@@ -28,5 +36,11 @@ __all__ = [
     "Values",
     "build_surrogate",
     "check_parameters",
+    "focused",
     "free_parameters",
+    "may_change",
+    "settled",
+    "settled_implicitly",
+    "step_errors",
+    "workable",
 ]

@@ -53,6 +53,7 @@ class ODESimulator(Simulator):
         observe: Sequence[str] | Mapping[str, Callable[..., Any]] | None = None,
         initial: Mapping[str, float | str | Callable[..., Any]] | None = None,
         max_step: float | None = None,
+        stiff: bool | None = None,
     ) -> None:
         if not callable(rates):
             raise DomainError(f"Expected rates as a function f(t, s, p, u). Got {type(rates).__name__}.")
@@ -68,6 +69,7 @@ class ODESimulator(Simulator):
         self.degree = None
         self.initial = dict(initial or {})
         self.max_step = max_step
+        self.stiff = stiff
         if unknown := [name for name in self.initial if name not in self.states]:
             raise DomainError(f"Expected initial values of states {list(self.states)}. Got {unknown}.")
         for name, value in self.initial.items():

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchcal.errors import SimulatorError
 from torchcal.simulators.grid import Grid
-from torchcal.simulators.layout import Layout
+from torchcal.simulators.layout import Layout, Values
 from torchcal.simulators.parameter import spans
 from torchcal.simulators.recurrence import recur
 from torchcal.simulators.shooting import begun, close_gaps
@@ -22,7 +22,7 @@ from torchcal.simulators.shooting import begun, close_gaps
 if TYPE_CHECKING:
     from torchcal.simulators.ode import ODESimulator
 
-__all__ = ["POINTS", "Steps"]
+__all__ = ["COPIED", "POINTS", "Steps"]
 
 #: Points whose derivatives are computed at once: about what a processor's cache holds.
 POINTS = 2**15
@@ -43,7 +43,10 @@ class Steps:
         ode: Has the rates.
         layout: What each parameter value is.
         grid: Where steps begin and how long they are.
+        order: The error of a step falls with its length to this power.
     """
+
+    order = 5
 
     ode: "ODESimulator"
     layout: Layout
@@ -80,7 +83,7 @@ class Steps:
                 ) from error
         return torch.stack(columns, dim=-1)
 
-    def step(self, s: Tensor, t: Tensor, h: Tensor, p: dict[str, Tensor], u: dict[str, Tensor]) -> Tensor:
+    def step(self, s: Tensor, t: Tensor, h: Tensor, p: Values, u: dict[str, Tensor]) -> Tensor:
         """One Runge–Kutta step of every point ``(H, M, states)``; t, h ``(M,)``, u ``(3, M)``."""
         first, middle, last = ({name: table[i] for name, table in u.items()} for i in range(3))
         half, full = (0.5 * h)[:, None], h[:, None]
@@ -116,6 +119,11 @@ class Steps:
             flow, forcing = self.layout.derivatives(ends, begin, leaves, run_of, columns, copied=copies > 1)
         shape = (hyper, runs, steps, size)
         return ends[:hyper].detach().reshape(shape), flow.reshape(*shape, size), forcing.reshape(*shape, len(columns))
+
+    def kicks(self, values: Tensor, states: Tensor) -> Tensor:
+        """What a force of 1 in each equation, throughout a step, does to the end of the step, ``(H, R, K, S, S)``."""
+        size = states.shape[-1]
+        return torch.diag_embed(self.grid.h[..., None].expand(len(states), *self.grid.h.shape, size))
 
     def difference(self, values: Tensor) -> float:
         """Largest difference between the first steps taken one after another and all at once, relative to the states'.

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchcal.data import Recording
 from torchcal.errors import DomainError, RecordingError, SimulatorError
 from torchcal.simulators.grid import Grid
+from torchcal.simulators.implicit import ImplicitSteps
 from torchcal.simulators.layout import Layout
 from torchcal.simulators.solution import Solution
 from torchcal.simulators.static import Conditions, Linearisation, Simulator
@@ -22,8 +23,8 @@ __all__ = ["Trajectories"]
 
 #: Numbers of trajectories kept at once, 64 MiB.
 NUMBERS = 2**23
-#: How often steps are halved at most, and how much shorter they become at once where they err.
-HALVINGS, MOST_DENSER = 7, 16
+#: How much shorter steps are elsewhere at most, where those here differ.
+MOST_SHORTER = 16
 
 
 class Trajectories(Simulator):
@@ -34,6 +35,7 @@ class Trajectories(Simulator):
         recording: Made from runs.
         subdivide: Steps are this many times shorter than the coarsest that the samples allow.
         denser: The same for each gap between samples of each run, beside that.
+        implicit: Whether steps are implicit; by default where the simulator says that it is stiff.
 
     Attributes:
         grid: Its time steps.
@@ -48,6 +50,7 @@ class Trajectories(Simulator):
         *,
         subdivide: int = 1,
         denser: tuple[Tensor, ...] | None = None,
+        implicit: bool | None = None,
     ) -> None:
         if not isinstance(recording, Recording) or recording.runs is None:
             raise RecordingError(
@@ -63,12 +66,13 @@ class Trajectories(Simulator):
         self.recording = recording
         self.subdivide = subdivide
         self.denser = denser
+        self.implicit = bool(ode.stiff) if implicit is None else implicit
         self.degree = None
         self.runs = recording.runs
         self._states = tuple(ode.states)
         self.grid = Grid.of(self.runs, max_step=ode.max_step, subdivide=subdivide, denser=denser)
         self.layout = Layout(ode, recording, self.runs)
-        self.steps = Steps(ode, self.layout, self.grid)
+        self.steps = (ImplicitSteps if self.implicit else Steps)(ode, self.layout, self.grid)
         self.parameters = self.layout.parameters
         self.x = recording.x
 
@@ -93,111 +97,27 @@ class Trajectories(Simulator):
             return self
         if self.denser is not None:  # where steps must be short is another place there
             return self.elsewhere(recording)
-        return Trajectories(self.ode, recording, subdivide=self.subdivide)
+        return Trajectories(self.ode, recording, subdivide=self.subdivide, implicit=self.implicit)
 
     def elsewhere(self, recording: Recording) -> "Trajectories":
         """The same simulator for other runs, with steps no longer than these.
 
-        Where these differ, no longer than the shortest of them, but at most `MOST_DENSER` times shorter than usual.
+        Where these differ, no longer than the shortest of them, but at most `MOST_SHORTER` times shorter than usual.
         """
-        other = Trajectories(self.ode, recording)
+        other = Trajectories(self.ode, recording, implicit=self.implicit)
         shortest = self.grid.h.max() if self.denser is None else self.grid.h[self.grid.h > 0].min()
         share = math.ceil(float(other.grid.h.max() / shortest) * (1 - 1e-9))
         if self.denser is not None:
-            share = min(share, MOST_DENSER * self.subdivide)
+            share = min(share, MOST_SHORTER * self.subdivide)
         return other.refined(share) if share > 1 else other
 
     def refined(self, factor: int = 2) -> "Trajectories":
         """The same with shorter steps."""
-        return Trajectories(self.ode, self.recording, subdivide=self.subdivide * factor, denser=self.denser)
+        return self.with_steps(self.subdivide * factor, self.denser)
 
-    def step_errors(self, values: Tensor, states: Tensor) -> Tensor:
-        """Error of every step by itself, from two of half its length, as a share of the largest value of its state.
-
-        Args:
-            values: Parameter values, ``(d,)``.
-            states: Their trajectory, ``(1, R, nodes, S)``.
-
-        Returns:
-            That of the worst state, ``(R, K)``.
-        """
-        runs, size = len(self.runs), states.shape[-1]
-        t, h, u = self.grid.flat
-        first, middle, last = ({name: table[i] for name, table in u.items()} for i in range(3))
-
-        def inputs(a: dict[str, Tensor], b: dict[str, Tensor]) -> dict[str, Tensor]:
-            return {name: torch.stack([a[name], 0.5 * (a[name] + b[name]), b[name]]) for name in a}
-
-        p = self.layout.by_name(values[None], self.grid.step_run)
-        begin = states[:, :, :-1].reshape(1, -1, size)
-        half = self.steps.step(begin, t, 0.5 * h, p, inputs(first, middle))
-        twice = self.steps.step(half, t + 0.5 * h, 0.5 * h, p, inputs(middle, last))
-        once = self.steps.step(begin, t, h, p, u)
-        scale = states[0].abs().amax(dim=(0, 1)).clamp_min(1e-300)
-        return ((twice - once)[0].abs() / scale).amax(-1).reshape(runs, -1)
-
-    def focused(self, values: Tensor, states: Tensor, excess: float) -> "Trajectories":
-        """The same with shorter steps where they err, for an error that is smaller by some factor.
-
-        The error of a step of order 5, from two of half its length, is spread such that the fewest steps have the
-        wanted sum of errors.
-
-        Args:
-            values: Parameter values, ``(d,)``.
-            states: Their trajectory, ``(1, R, nodes, S)``.
-            excess: By what the error must fall.
-        """
-        runs, error = len(self.runs), self.step_errors(values, states)
-        number = [self.grid.steps_between(r) for r in range(runs)]
-        gaps = []
-        for r, counts in enumerate(number):
-            place = torch.arange(len(counts)).repeat_interleave(counts)
-            gaps.append(torch.zeros(len(counts), dtype=error.dtype).index_add_(0, place, error[r, : len(place)]))
-        every = torch.cat(gaps)
-        if not bool(torch.isfinite(every).all()) or not float(every.sum()) > 0:
-            return self.refined(2)
-        level = (every.sum() / excess / (every.pow(0.2) * torch.cat(number).double().pow(0.8)).sum()).pow(1.25)
-        factors = [
-            (gap / (count * level)).pow(0.2).ceil().clamp(1, MOST_DENSER).long()
-            for gap, count in zip(gaps, number, strict=True)
-        ]
-        if all(bool((factor == 1).all()) for factor in factors):
-            return self.refined(2)
-        old = self.denser or tuple(torch.ones_like(factor) for factor in factors)
-        denser = tuple(a * b for a, b in zip(old, factors, strict=True))
-        return Trajectories(self.ode, self.recording, subdivide=self.subdivide, denser=denser)
-
-    def settled(self, values: Tensor, allowed: Tensor, *, halvings: int = HALVINGS) -> "Trajectories":
-        """These trajectories, with steps so short that halving them changes no output by more than ``allowed``.
-
-        A solution that is infinite with both steps counts as settled. Where the simulator has a ``max_step``, the
-        steps stay as they are.
-
-        Args:
-            values: Parameter values to look at, ``(H, d)``, physical units.
-            allowed: Largest change of each output, ``(n_total,)``.
-            halvings: How often steps are halved at most.
-
-        Raises:
-            SimulatorError: If it still changes after as many halvings.
-        """
-        if self.ode.max_step is not None:
-            return self
-        here = self
-        y = here.outputs_of(values, here.solve(values))
-        for _ in range(halvings):
-            finer = here.refined(2)
-            z = finer.outputs_of(values, finer.solve(values))
-            change = torch.where(torch.isfinite(y) | torch.isfinite(z), (z - y).abs(), torch.zeros_like(y))
-            if bool((change <= allowed).all()):
-                return here
-            here, y = finer, z
-        share = float((change / allowed).nan_to_num(nan=math.inf).max())
-        raise SimulatorError(
-            f"Expected the solution to settle when time steps are halved. Got a change {share:.2g} times as large as "
-            f"allowed after {halvings} times (a stiff or discontinuous model: smooth it, rescale it, replace a fast "
-            "state by its equilibrium, or give max_step=)."
-        )
+    def with_steps(self, subdivide: int, denser: tuple[Tensor, ...] | None) -> "Trajectories":
+        """The same with steps of other lengths."""
+        return Trajectories(self.ode, self.recording, subdivide=subdivide, denser=denser, implicit=self.implicit)
 
     def check(self, x: Conditions, values: Tensor, outputs: Sequence[str] | None = None) -> int:
         """As for any simulator; rates must also be written elementwise, and with torch operations alone.

@@ -267,7 +267,8 @@ def extend(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
     """
     if isinstance(simulator, Trajectories):
         ode = _extend_ode(simulator.ode, terms)
-        return Trajectories(ode, simulator.recording, subdivide=simulator.subdivide, denser=simulator.denser)
+        return Trajectories(ode, simulator.recording, subdivide=simulator.subdivide, denser=simulator.denser,
+                            implicit=simulator.implicit)
     if not terms:
         return simulator
     if isinstance(simulator, ODESimulator):
@@ -360,6 +361,7 @@ def _extend_ode(simulator: ODESimulator, terms: Sequence[Term]) -> ODESimulator:
         observe=observe,
         initial=initial,
         max_step=simulator.max_step,
+        stiff=simulator.stiff,
     )
     extended.extended = plain, tuple(every)
     return extended

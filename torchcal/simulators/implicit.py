@@ -1,0 +1,168 @@
+"""Implicit Runge–Kutta steps, for states that follow others far faster than anything else happens."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchcal.simulators.layout import Values
+from torchcal.simulators.steps import COPIED, Steps
+
+__all__ = ["ImplicitSteps"]
+
+_ROOT = math.sqrt(6.0)
+#: Radau IIA of three stages (Hairer & Wanner, Solving Ordinary Differential Equations II, table IV.5.6): of order 5,
+#: and what decays within a fraction of a step is gone after it.
+NODES = ((4 - _ROOT) / 10, (4 + _ROOT) / 10, 1.0)
+WEIGHTS = (
+    ((88 - 7 * _ROOT) / 360, (296 - 169 * _ROOT) / 1800, (-2 + 3 * _ROOT) / 225),
+    ((296 + 169 * _ROOT) / 1800, (88 + 7 * _ROOT) / 360, (-2 - 3 * _ROOT) / 225),
+    ((16 - _ROOT) / 36, (16 + _ROOT) / 36, 1 / 9),
+)
+STAGES = len(NODES)
+#: Newton passes for the stages; corrections, relative to the state, after which the next would be rounding, and up to
+#: which a state is one where rounding keeps them from becoming smaller.
+PASSES, SMALL, ROUNDED = 12, 1e-7, 1e-5
+#: Share of a state's largest value below which it counts as that large.
+SMALLEST = 1e-9
+
+
+class ImplicitSteps(Steps):
+    r"""Steps of the Radau IIA method of order 5.
+
+    The stages :math:`Y_i = s + h \sum_j a_{ij} f(t + c_j h, Y_j)` of all points are solved together by Newton's method;
+    a point where it does not settle ends at NaN. Derivatives are those of the solved stages, by the implicit function
+    theorem: :math:`(1 - h A \otimes J)\, dY = ds + h A\, f_p\, dp`.
+    """
+
+    order = 6
+
+    def step(self, s: Tensor, t: Tensor, h: Tensor, p: Values, u: dict[str, Tensor]) -> Tensor:
+        """As `Steps.step`."""
+        return self._stages(s, t, h, p, u)[:, -1]
+
+    def ends(self, values: Tensor, states: Tensor) -> Tensor:
+        """As `Steps.ends`."""
+        t, h, u = self.grid.flat
+        begin, guess = _points(states[:, :, :-1]), _points(states[:, :, 1:])
+        found = self._stages(begin, t, h, self.layout.by_name(values, self.grid.step_run), u, guess)[:, -1]
+        return found.reshape(states[:, :, :-1].shape)
+
+    def derivatives(self, values: Tensor, states: Tensor, columns: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
+        """As `Steps.derivatives`."""
+        hyper, runs, _, size = states.shape
+        ends, flow, forcing = self._slopes(values, states, columns)
+        shape = (hyper, runs, self.grid.num_steps, size)
+        return ends.reshape(shape), flow.reshape(*shape, size), forcing.reshape(*shape, len(columns))
+
+    def kicks(self, values: Tensor, states: Tensor) -> Tensor:
+        """As `Steps.kicks`."""
+        hyper, runs, _, size = states.shape
+        by_force = self._slopes(values, states, (), forced=True)[2]
+        return by_force.reshape(hyper, runs, self.grid.num_steps, size, size)
+
+    def _slopes(
+        self, values: Tensor, states: Tensor, columns: Sequence[int], *, forced: bool = False
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Ends ``(H, M, S)`` of all steps and their derivatives by the states and by parameters, or by forces."""
+        size = states.shape[-1]
+        run_of = self.grid.step_run
+        t, h, u = self.grid.flat
+        begin, guess = _points(states[:, :, :-1]), _points(states[:, :, 1:])
+        stages = self._stages(begin, t, h, self.layout.by_name(values, run_of), u, guess)  # (H, 3, M, S)
+        every = run_of.repeat(STAGES)
+        flat = stages.flatten(1, 2)
+        with torch.enable_grad():
+            copies = size if flat.numel() <= COPIED else 1
+            leaf = flat.repeat(copies, 1, 1).requires_grad_(True)
+            leaves = self.layout.leaves(values.repeat(copies, 1), every, columns)
+            rates = self.rates(_times(t, h), leaf, leaves, _inputs(u))
+            slopes, pushes = self.layout.derivatives(rates, leaf, leaves, every, columns, copied=copies > 1)
+        matrix = _matrix(slopes.unflatten(1, (STAGES, -1)), h)
+        still = torch.eye(size, dtype=begin.dtype).expand(*begin.shape, size)
+        if forced:
+            push = torch.stack([c * h[:, None, None] * still for c in NODES], dim=2)
+        else:
+            a = torch.tensor(WEIGHTS, dtype=begin.dtype)
+            by_stage = pushes.unflatten(1, (STAGES, -1))  # (H, 3, M, S, C)
+            push = torch.einsum("ij,hjmsc->hmisc", a, by_stage) * h[:, None, None, None]
+        right = torch.cat([still.unsqueeze(2).expand(-1, -1, STAGES, -1, -1), push], dim=-1).flatten(2, 3)
+        found = torch.linalg.solve_ex(matrix, right)[0][:, :, -size:]
+        return stages[:, -1], found[..., :size], found[..., size:]
+
+    def _stages(
+        self, s: Tensor, t: Tensor, h: Tensor, p: Values, u: dict[str, Tensor], guess: Tensor | None = None
+    ) -> Tensor:
+        """States ``(H, 3, M, S)`` at the stages of steps from ``s`` (H, M, S), begun towards guessed ends."""
+        c = torch.tensor(NODES, dtype=s.dtype)[:, None, None]
+        a = torch.tensor(WEIGHTS, dtype=s.dtype)
+        base = s.unsqueeze(1)
+        moved = torch.zeros_like(base).expand(-1, STAGES, -1, -1) if guess is None else c * (guess - s).unsqueeze(1)
+        times, inputs = _times(t, h), _inputs(u)
+        size = s.shape[-1]
+        copies = size if moved.numel() <= COPIED else 1
+        tiled = _tiled(p, copies)
+        change, before = moved, math.inf
+        for _ in range(PASSES):
+            flat = (base + moved).flatten(1, 2)
+            with torch.enable_grad():
+                leaf = flat.detach().repeat(copies, 1, 1).requires_grad_(True)
+                rates = self.rates(times, leaf, tiled, inputs)
+                slopes, _ = self.layout.derivatives(rates, leaf, {}, times, (), copied=copies > 1)
+            f = rates[: len(s)].detach().unflatten(1, (STAGES, -1))
+            gap = h[:, None] * torch.einsum("ij,hjms->hims", a, f) - moved
+            matrix = _matrix(slopes.unflatten(1, (STAGES, -1)), h)
+            right = gap.transpose(1, 2).flatten(2, 3).unsqueeze(-1)
+            change = torch.linalg.solve_ex(matrix, right)[0].squeeze(-1).unflatten(2, (STAGES, size)).transpose(1, 2)
+            moved = moved + change
+            share = _share(change, base + moved)
+            worst = float(share.nan_to_num(nan=0.0).max())
+            if worst < SMALL or (worst < ROUNDED and worst > 0.5 * before):
+                break
+            before = worst
+        bad = ~(_share(change, base + moved) < ROUNDED)
+        return (base + moved).masked_fill(bad[:, None, :, None], math.nan)
+
+
+def _share(change: Tensor, states: Tensor) -> Tensor:
+    """Largest correction of the stages ``(H, 3, M, S)`` of each step, relative to its states, ``(H, M)``."""
+    near = states.abs().amax(1)
+    largest = near.nan_to_num(nan=0.0, posinf=0.0).amax(1, keepdim=True)
+    floor = (SMALLEST * largest).clamp_min(1e-300)
+    return (change.abs().amax(1) / torch.maximum(near, floor)).amax(-1)
+
+
+def _matrix(slopes: Tensor, h: Tensor) -> Tensor:
+    """1 − h A ⊗ J of every step, ``(H, M, 3 S, 3 S)``, of slopes ``(H, 3, M, S, S)``."""
+    a = torch.tensor(WEIGHTS, dtype=slopes.dtype)
+    size = slopes.shape[-1]
+    coupled = torch.einsum("ij,hjmab->hmiajb", a, slopes * h[:, None, None])
+    return torch.eye(STAGES * size, dtype=slopes.dtype) - coupled.flatten(4, 5).flatten(2, 3)
+
+
+def _points(states: Tensor) -> Tensor:
+    """States ``(H, R, K, S)`` as points ``(H, R K, S)``."""
+    return states.flatten(1, 2)
+
+
+def _times(t: Tensor, h: Tensor) -> Tensor:
+    """Of all stages, ``(3 M,)``."""
+    return torch.cat([t + c * h for c in NODES])
+
+
+def _inputs(u: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Inputs at all stages ``(3 M,)`` of those at begin, middle and end ``(3, M)``, by the parabola through them."""
+    return {
+        name: torch.cat(
+            [(1 - c) * (1 - 2 * c) * first + 4 * c * (1 - c) * middle + c * (2 * c - 1) * last for c in NODES]
+        )
+        for name, (first, middle, last) in u.items()
+    }
+
+
+def _tiled(p: Values, copies: int) -> Values:
+    """Parameters of points as those of their stages, so many times."""
+    start = p.start.repeat(STAGES) if isinstance(p.start, Tensor) else p.start
+    tiled = {name: v.repeat(copies, STAGES if v.shape[-1] > 1 else 1) for name, v in p.items()}
+    return Values(tiled, p.first, start)

@@ -1,0 +1,181 @@
+"""Time steps that do for a solution: short enough, and implicit where explicit ones would have to be too short."""
+
+import math
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from torchcal.errors import DomainError, SimulatorError
+from torchcal.simulators.trajectories import Trajectories
+
+__all__ = ["focused", "may_change", "settled", "settled_implicitly", "step_errors", "workable"]
+
+#: How often steps are halved at most; the same of implicit ones where they are tried in place of others.
+HALVINGS, FEW = 7, 3
+#: Factor by which halving steps must lessen the error, lest the model be stiff (16, where they are short enough).
+CONVERGING = 4.0
+#: How much shorter steps become at once where they err, and where no solution is finite.
+MOST_DENSER, SHORTER = 16, (4, 16, 64)
+
+
+def may_change(simulator: object) -> bool:
+    """Whether a simulator has time steps and leaves their choice to others."""
+    return isinstance(simulator, Trajectories) and simulator.ode.max_step is None
+
+
+def _implicitly(simulator: Trajectories) -> Trajectories | None:
+    """The same with implicit steps, the coarsest; None where they are implicit already, or must not be."""
+    if simulator.implicit or simulator.ode.stiff is not None or not may_change(simulator):
+        return None
+    return Trajectories(simulator.ode, simulator.recording, implicit=True)
+
+
+def settled(simulator: Trajectories, values: Tensor, allowed: Tensor, *, halvings: int = HALVINGS) -> Trajectories:
+    """The same with steps so short that halving them changes no output by more than is allowed.
+
+    Where halving them hardly lessens that, as of a stiff model, implicit steps are tried. A solution that is infinite
+    with both steps counts as settled. Where the simulator has a ``max_step``, the steps stay as they are.
+
+    Args:
+        simulator: In time.
+        values: Parameter values to look at, ``(H, d)``, physical units.
+        allowed: Largest change of each output, ``(n_total,)``.
+        halvings: How often steps are halved at most.
+
+    Raises:
+        SimulatorError: If it still changes after as many halvings.
+    """
+    if not may_change(simulator):
+        return simulator
+    here, share = simulator, math.inf
+    y = _outputs(here, values)
+    for number in range(halvings):
+        finer = here.refined(2)
+        z = _outputs(finer, values)
+        change = torch.where(torch.isfinite(y) | torch.isfinite(z), (z - y).abs(), torch.zeros_like(y))
+        if bool((change <= allowed).all()):
+            return here
+        before, share = share, float((change / allowed).nan_to_num(nan=math.inf).max())
+        if number == 1 and not share < before / CONVERGING:
+            other = settled_implicitly(simulator, values, allowed)
+            if other is not None:
+                return other
+        here, y = finer, z
+    raise SimulatorError(
+        f"Expected the solution to settle when time steps are halved. Got a change {share:.2g} times as large as "
+        f"allowed after {halvings} times (a discontinuous model, or one that grows without bounds: smooth it, rescale "
+        "it, or give max_step=)."
+    )
+
+
+def settled_implicitly(simulator: Trajectories, values: Tensor, allowed: Tensor) -> Trajectories | None:
+    """The same with implicit steps, where these settle on a finite solution, else None; arguments as of `settled`."""
+    other = _implicitly(simulator)
+    if other is None or not _finite(other, values):
+        return None
+    try:
+        return settled(other, values, allowed, halvings=FEW)
+    except (SimulatorError, DomainError):  # or more steps than anyone can take
+        return None
+
+
+def workable(simulator: Trajectories, values: Tensor, allowed: Tensor, *, halvings: int = HALVINGS) -> Trajectories:
+    """The same with steps with which the solution at some values is finite and settled, if there are any.
+
+    Where it settles with none it is the first with a finite solution, else the simulator itself. Arguments are those of
+    `settled`.
+    """
+    if not may_change(simulator):
+        return simulator
+    if not _finite(simulator, values):
+        other = settled_implicitly(simulator, values, allowed)
+        if other is not None:
+            return other
+    for finer in _shorter(simulator):
+        if _finite(finer, values):
+            try:
+                return settled(finer, values, allowed, halvings=halvings)
+            except (SimulatorError, DomainError):
+                return finer
+    return simulator
+
+
+def _shorter(simulator: Trajectories) -> Iterator[Trajectories]:
+    """The same, and with ever shorter steps."""
+    yield simulator
+    for factor in SHORTER:
+        try:
+            yield simulator.refined(factor)
+        except DomainError:  # more steps than anyone can take
+            return
+
+
+def _outputs(simulator: Trajectories, values: Tensor) -> Tensor:
+    return simulator.outputs_of(values, simulator.solve(values))
+
+
+def _finite(simulator: Trajectories, values: Tensor) -> bool:
+    return bool(torch.isfinite(_outputs(simulator, values)).all())
+
+
+def step_errors(simulator: Trajectories, values: Tensor, states: Tensor) -> Tensor:
+    """Error of every step by itself, from two of half its length, as a share of the largest value of its state.
+
+    Args:
+        simulator: In time.
+        values: Parameter values, ``(d,)``.
+        states: Their trajectory, ``(1, R, nodes, S)``.
+
+    Returns:
+        That of the worst state, ``(R, K)``.
+    """
+    runs, size = len(simulator.runs), states.shape[-1]
+    steps = simulator.steps
+    t, h, u = simulator.grid.flat
+    first, middle, last = ({name: table[i] for name, table in u.items()} for i in range(3))
+
+    def inputs(a: dict[str, Tensor], b: dict[str, Tensor]) -> dict[str, Tensor]:
+        return {name: torch.stack([a[name], 0.5 * (a[name] + b[name]), b[name]]) for name in a}
+
+    p = simulator.layout.by_name(values[None], simulator.grid.step_run)
+    begin = states[:, :, :-1].reshape(1, -1, size)
+    half = steps.step(begin, t, 0.5 * h, p, inputs(first, middle))
+    twice = steps.step(half, t + 0.5 * h, 0.5 * h, p, inputs(middle, last))
+    once = steps.step(begin, t, h, p, u)
+    scale = states[0].abs().amax(dim=(0, 1)).clamp_min(1e-300)
+    return ((twice - once)[0].abs() / scale).amax(-1).reshape(runs, -1)
+
+
+def focused(simulator: Trajectories, values: Tensor, states: Tensor, excess: float) -> Trajectories:
+    """The same with shorter steps where they err, for an error that is smaller by some factor.
+
+    The error of a step, from two of half its length, is spread such that the fewest steps have the wanted sum of
+    errors.
+
+    Args:
+        simulator: In time.
+        values: Parameter values, ``(d,)``.
+        states: Their trajectory, ``(1, R, nodes, S)``.
+        excess: By what the error must fall.
+    """
+    runs, error = len(simulator.runs), step_errors(simulator, values, states)
+    number = [simulator.grid.steps_between(r) for r in range(runs)]
+    gaps = []
+    for r, counts in enumerate(number):
+        place = torch.arange(len(counts)).repeat_interleave(counts)
+        gaps.append(torch.zeros(len(counts), dtype=error.dtype).index_add_(0, place, error[r, : len(place)]))
+    every = torch.cat(gaps)
+    if not bool(torch.isfinite(every).all()) or not float(every.sum()) > 0:
+        return simulator.refined(2)
+    share = 1.0 / simulator.steps.order
+    spread = every.pow(share) * torch.cat(number).double().pow(1.0 - share)
+    level = (every.sum() / excess / spread.sum()).pow(1.0 / (1.0 - share))
+    factors = [
+        (gap / (count * level)).pow(share).ceil().clamp(1, MOST_DENSER).long()
+        for gap, count in zip(gaps, number, strict=True)
+    ]
+    if all(bool((factor == 1).all()) for factor in factors):
+        return simulator.refined(2)
+    old = simulator.denser or tuple(torch.ones_like(factor) for factor in factors)
+    return simulator.with_steps(simulator.subdivide, tuple(a * b for a, b in zip(old, factors, strict=True)))
