@@ -9,10 +9,13 @@ import torch
 from scipy.integrate import solve_ivp
 
 import torchcal as tc
+from torchcal.discovery.base import calibrate_base
+from torchcal.discovery.candidates import drivers_scale, prepare
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.search import Search
 from torchcal.discovery.sharpen import accurate, sharpen
 from torchcal.discovery.verdict import Decision, _second
+from torchcal.simulators.steps import Steps
 
 F64 = torch.float64
 END, COUNT, GAIN, LOSS = 60.0, 91, 0.5, 0.2
@@ -153,3 +156,20 @@ def test_a_partial_delay_is_less_likely_than_a_whole_one():
         (term,) = (t for t in tc.terms.sensor(outputs=("x",)) if t.name == name)
         assert term.expected == {"a": (1.0, 0.25)}
         assert dataclasses.replace(term, description="").expected == term.expected
+
+
+def test_a_candidate_begins_at_the_trajectory_of_the_base(monkeypatch: pytest.MonkeyPatch) -> None:
+    """States that it adds begin as they do; nothing is solved from the beginning."""
+    recording = recorded(3.0)
+    problem = Problem.of(heated().bind(recording), recording)
+    base, _ = calibrate_base(problem, {}, 4, 0)
+    scale = drivers_scale(base.problem, base)
+    terms = [one for one in tc.terms.sensor("T") if one.name in ("lag of T", "gain error of T")]
+    assert len(terms) == 2
+    marched = []
+    monkeypatch.setattr(Steps, "_march", lambda steps, values: marched.append(len(values)) or values)
+    for term in terms:
+        prepare(base.problem, base, [term], {}, scale)
+    assert not marched
+    other = base.problem.with_simulator(base.problem.simulator.refined(2))
+    assert other.guess(base.warm, base.values[None]) is None

@@ -228,7 +228,7 @@ def prepare(
     free = sorted(set(held) | set(own))
 
     def linear(rows: Tensor, columns: list[int]) -> tuple[Tensor, Tensor]:
-        y, jacobian, _ = problem.evaluate(rows, columns, problem.guess(found.warm, len(rows)))
+        y, jacobian, _ = problem.evaluate(rows, columns, problem.guess(found.warm, rows))
         return y, jacobian
 
     y, jacobian = linear(begin[None], own)

@@ -151,7 +151,7 @@ def _no_instrument(search: Search, model: Model) -> str:
     bare = search.problem.with_simulator(extend(search.problem.simulator, others))
     bare = dataclasses.replace(bare, keep=problem.keep)
     values = spread_values(bare, [q.name for q in problem.parameters], model.found.values)
-    true = bare.evaluate(values[None], [], bare.guess(model.found.warm, 1))[0][0]
+    true = bare.evaluate(values[None], [], bare.guess(model.found.warm, values[None]))[0][0]
     drivers = problem.drivers_at_data(model.found.values[None], model.found.warm)
     p = {name: values.new_tensor(value) for name, value in model.found.by_name.items()}
     sd = _noise_at_data(search, model)

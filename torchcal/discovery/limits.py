@@ -224,6 +224,6 @@ def _simulated(search: Search, i: int, column: int, size: float) -> Tensor | Non
     row = candidate.begin.clone()
     row[candidate.own] = candidate.shapes[int(screening.shape[column])]
     row[candidate.amplitudes[int(screening.amplitude[column])]] += size
-    warm = candidate.problem.guess(search.base.warm, 1)
+    warm = candidate.problem.guess(search.base.warm, row[None])
     y = candidate.problem.evaluate(row[None], [], warm)[0][0]
     return y if bool(torch.isfinite(y).all()) else None

@@ -185,14 +185,23 @@ class Problem:
             )
         return found.y[:, self.index], found.jacobian[:, self.index], found.warm
 
-    def guess(self, found: Solution | None, count: int) -> Solution | None:
-        """Another problem's only solution as a warm start of this one, so many times; None where it is none."""
+    def guess(self, found: Solution | None, values: Tensor) -> Solution | None:
+        """Another problem's only solution as a warm start at ``values`` (H, P); None where it is none.
+
+        States that are added, behind the others, stay as they begin.
+        """
         bound = self.simulator
         if found is None or not isinstance(bound, Trajectories):
             return None
-        if found.states.shape[-2:] != (bound.grid.t.shape[1], len(bound.ode.states)):  # other steps, or other states
+        known, nodes = found.states.shape[-1], found.states.shape[-2]
+        added = len(bound.ode.states) - known
+        if nodes != bound.grid.nodes.shape[1] or added < 0:  # other steps, or other states
             return None
-        return found.repeated(count)
+        guess = found.repeated(len(values))
+        if not added:
+            return guess
+        begin = bound.layout.start(values)[..., known:].unsqueeze(2)
+        return Solution(torch.cat([guess.states, begin.expand(*guess.states.shape[:-1], -1)], dim=-1))
 
     def drivers(self, values: Tensor, warm: Solution | None) -> dict[str, Tensor]:
         """What a change may vary with at every datum, ``(n_total conditions,)`` each: conditions, or time, states and

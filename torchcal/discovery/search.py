@@ -273,7 +273,7 @@ class Search:
         jobs = []
         for one in wanted:
             candidate, begin = one.candidate, one.begin
-            warm = candidate.problem.guess(self.base.warm, len(begin))
+            warm = candidate.problem.guess(self.base.warm, begin)
             shape = [i for i in candidate.own if i not in candidate.amplitudes]
             whitening = self.noise.whitening(candidate.problem)
             jobs.append(Refit(candidate.problem, whitening, begin, candidate.free, shape, warm))

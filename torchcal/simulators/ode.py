@@ -23,7 +23,7 @@ class ODESimulator(Simulator):
     Write the rates elementwise: ``s[name]`` has shape ``(*batch, R)`` for R runs, ``u[name]`` ``(R,)``, ``t`` is a
     scalar or ``(R,)``, and ``p[name]`` has shape ``(*batch, 1)`` (``(*batch, R)`` for per-run parameters). A returned
     rate is expanded to its state's shape. Solved by the classical fourth-order Runge–Kutta method with steps that
-    end at every sample; `Trajectories` says how.
+    end at every sample (`Trajectories` says how), or, where the model is stiff, by Radau IIA of order 5.
 
     Args:
         rates: ``rates(t, s, p, u)`` returns the rate of every state by name.
@@ -35,6 +35,8 @@ class ODESimulator(Simulator):
             initial value it takes, or a function ``f(s, p)`` of the other states' initial values. What a run gives
             comes first; what neither gives is calibrated.
         max_step: Longest time step. By default steps are halved until the solution stops changing.
+        stiff: Whether steps are implicit, as some states follow others far faster than anything else happens. By
+            default they are where explicit ones would have to be too short.
 
     Raises:
         DomainError: If something is not as described.
@@ -63,6 +65,8 @@ class ODESimulator(Simulator):
             raise DomainError(f"Expected states of different names. Got {list(states)}.")
         if max_step is not None and not max_step > 0:
             raise DomainError(f"Expected max_step > 0 or None. Got {max_step!r}.")
+        if stiff is not None and not isinstance(stiff, bool):
+            raise DomainError(f"Expected stiff=True, False or None. Got {stiff!r}.")
         self.rates = rates
         self.states: dict[str, str | None] = dict(states) if isinstance(states, Mapping) else dict.fromkeys(states)
         self.parameters = check_parameters(parameters)

@@ -1,0 +1,274 @@
+"""Stiff models: implicit steps against SciPy, their exact derivatives, and when they are taken."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+import torchcal as tc
+from torchcal.discovery.fitting import fit
+from torchcal.discovery.problem import Problem
+from torchcal.discovery.sharpen import sharpen
+from torchcal.errors import DomainError
+from torchcal.simulators import Trajectories, settled, settled_implicitly, workable
+from torchcal.terms import extend
+
+F64 = torch.float64
+
+
+def tensor(*values):
+    return torch.tensor(values, dtype=F64)
+
+
+def run_of(t, initial, outputs=("a",), **more):
+    return tc.Run(t, {name: np.zeros(len(t)) for name in outputs}, initial=initial, **more)
+
+
+def robertson(stiff=True):
+    """H. H. Robertson's autocatalysis: rate constants of 0.04, 1e4 and 3e7."""
+
+    def rates(t, s, p, u):
+        made, back, on = p["k1"] * s["a"], p["k2"] * s["b"] * s["c"], p["k3"] * s["b"] ** 2
+        return {"a": back - made, "b": made - back - on, "c": on}
+
+    parameters = [tc.Parameter("k1"), tc.Parameter("k2"), tc.Parameter("k3")]
+    return tc.ODESimulator(rates, ["a", "b", "c"], parameters, stiff=stiff)
+
+
+K = tensor(0.04, 1e4, 3e7)
+
+
+@pytest.fixture(scope="module")
+def burnt():
+    t = np.concatenate([[0.0], np.logspace(-4, 4, 40)])
+    return tc.Recording(runs=[run_of(t, {"a": 1.0, "b": 0.0, "c": 0.0}, ("a", "b", "c"))])
+
+
+def test_robertsons_problem_agrees_with_scipy(burnt):
+    def rates(t, s):
+        made, back, on = 0.04 * s[0], 1e4 * s[1] * s[2], 3e7 * s[1] ** 2
+        return [back - made, made - back - on, on]
+
+    t = burnt.runs[0].time.numpy()
+    exact = solve_ivp(rates, (0, t[-1]), [1.0, 0.0, 0.0], "Radau", t, rtol=1e-10, atol=1e-14).y
+    bound = robertson().bind(burnt)
+    assert bound.implicit
+    errors = []
+    for factor in (1, 2, 4):
+        finer = bound.refined(factor)
+        y = finer.at(finer.x)(K).reshape(3, -1).numpy()
+        errors.append(max(np.abs(y - exact).max(1) / np.abs(exact).max(1)))
+    assert errors[0] < 1e-4
+    assert errors[2] < 1e-7
+    assert errors[2] < errors[1] / 8 < errors[0] / 64
+
+
+def test_derivatives_are_those_of_the_discrete_solution(burnt):
+    bound = robertson().bind(burnt)
+    found = bound.linearise(bound.x, K[None])
+    for k in range(3):
+        step = torch.zeros(3, dtype=F64)
+        step[k] = 1e-4 * K[k]
+        up, down = (bound.linearise(bound.x, (K + sign * step)[None]).y[0] for sign in (1, -1))
+        numeric = (up - down) / (2 * step[k])
+        torch.testing.assert_close(found.jacobian[0, :, k], numeric, rtol=1e-5, atol=1e-7 * float(numeric.abs().max()))
+    # From there other values take a pass or two, and come to what is solved anew.
+    near = bound.linearise(bound.x, 1.02 * K[None], warm=found.warm)
+    anew = bound.linearise(bound.x, 1.02 * K[None])
+    torch.testing.assert_close(near.y, anew.y, rtol=1e-8, atol=1e-12)
+    torch.testing.assert_close(near.jacobian * K, anew.jacobian * K, rtol=1e-3, atol=1e-7)
+
+
+def driven(stiff=True, **more):
+    """A fast state that follows an input, whose rate constant may differ from run to run, and a slow one behind it."""
+    return tc.ODESimulator(
+        lambda t, s, p, u: {"a": p["k"] * (u["f"] + torch.sin(t) - s["a"]), "b": p["r"] * (s["a"] - s["b"])},
+        ["a", "b"],
+        [tc.Parameter("k", per_run=True, low=0.0), tc.Parameter("r", low=0.0)],
+        stiff=stiff,
+        **more,
+    )
+
+
+@pytest.mark.parametrize("hold", ["linear", "zero", "cubic"])
+def test_inputs_and_runs_agree_with_short_explicit_steps(hold):
+    t1, t2 = np.linspace(0, 4, 30), np.array([1.0, 1.3, 2.0, 2.1, 3.5])
+    runs = [
+        run_of(t, {"a": 0.5, "b": b}, ("a", "b"), inputs={"f": np.cos(3 * t)}, hold=hold)
+        for t, b in ((t1, 0.0), (t2, 1.0))
+    ]
+    recording = tc.Recording(runs=runs)
+    values = tensor(40.0, 25.0, 0.7)
+    implicit = driven().bind(recording).refined(4)
+    explicit = driven(stiff=False).bind(recording).refined(64)
+    torch.testing.assert_close(implicit.at(implicit.x)(values), explicit.at(explicit.x)(values), rtol=1e-6, atol=1e-6)
+    mine, others = (b.linearise(b.x, values[None]).jacobian[0] for b in (implicit, explicit))
+    torch.testing.assert_close(mine, others, rtol=1e-4, atol=1e-7)
+    states = explicit.solve(values[None])[:, :, ::16]
+    torch.testing.assert_close(implicit.solve(values[None]), states, rtol=1e-5, atol=1e-5)
+
+
+def test_a_batch_is_every_one_of_it(burnt):
+    bound = robertson().bind(burnt)
+    values = K * torch.linspace(0.8, 1.2, 5, dtype=F64)[:, None]
+    together = bound.at(bound.x)(values)
+    for k in range(5):
+        torch.testing.assert_close(together[k], bound.at(bound.x)(values[k]), rtol=1e-9, atol=1e-13)
+
+
+def test_a_force_throughout_a_step_moves_its_end_by_what_is_left_of_it():
+    recording = tc.Recording(runs=[run_of(np.linspace(0, 4, 21), {"a": 0.5, "b": 0.0}, inputs={"f": np.zeros(21)})])
+    pushed = tc.Term("push", equation="a", rate=lambda t, s, p, u: p["F"], parameters=[tc.Parameter("F")])
+    bound = extend(driven().bind(recording), [pushed])
+    values = tensor(1e4, 0.7, 0.0)
+    states = bound.solve(values[None])
+    kicks = bound.steps.kicks(values[None], states)
+    forcing = bound.steps.derivatives(values[None], states, [2])[2][..., 0]
+    torch.testing.assert_close(kicks[..., 0], forcing, rtol=1e-10, atol=1e-16)
+    assert float((kicks[0, 0, :, 0, 0] - 1e-4).abs().max()) < 1e-6  # F / k and not F h
+
+
+def test_a_stage_that_is_not_found_blows_up():
+    t = np.linspace(0, 2, 20)
+    model = tc.ODESimulator(
+        lambda t, s, p, u: {"a": p["k"] * s["a"] ** 2 + 1.0}, ["a"], [tc.Parameter("k")], stiff=True
+    )
+    bound = model.bind(tc.Recording(runs=[run_of(t, {"a": 1.0})]))
+    y = bound.at(bound.x)(tensor(4.0))  # infinite at t = 0.22
+    before = torch.as_tensor(t) < 0.2
+    assert bool(torch.isfinite(y[before]).all())
+    assert not bool(torch.isfinite(y).all())
+
+
+# --- when they are taken ---------------------------------------------------------------------------------------
+
+
+def fast(**more):
+    return tc.ODESimulator(
+        lambda t, s, p, u: {"a": -p["k"] * (s["a"] - torch.cos(t))}, ["a"], [tc.Parameter("k", low=0.0)], **more
+    )
+
+
+T = np.linspace(0, 3, 31)
+FOLLOWED = tc.Recording(runs=[run_of(T, {"a": 1.0})])
+ALLOWED = torch.full((31,), 1e-4, dtype=F64)
+
+
+@pytest.mark.parametrize("k", [300.0, 3e4, 3e7])
+def test_a_stiff_solution_settles_with_few_implicit_steps(k):
+    bound = fast().bind(FOLLOWED)
+    assert not bound.implicit
+    for found in (workable(bound, tensor(k)[None], ALLOWED), settled_implicitly(bound, tensor(k)[None], ALLOWED)):
+        assert found.implicit
+        assert found.num_steps <= 2 * bound.num_steps
+        y = found.at(found.x)(tensor(k))
+        exact = (k * k * np.cos(T) + k * np.sin(T)) / (k * k + 1)  # but for what decays at once
+        assert np.abs(y.numpy() - exact)[1:].max() < 1e-4
+
+
+def test_a_solution_that_is_not_stiff_has_explicit_steps():
+    for k in (0.3, 3.0, 30.0):
+        bound = fast().bind(FOLLOWED)
+        assert not settled(bound, tensor(k)[None], ALLOWED).implicit
+        assert not workable(bound, tensor(k)[None], ALLOWED).implicit
+
+
+def test_what_the_user_says_of_stiffness_holds():
+    point = tensor(3e4)[None]
+    assert fast(stiff=True).bind(FOLLOWED).implicit
+    never = fast(stiff=False).bind(FOLLOWED)
+    assert settled_implicitly(never, point, ALLOWED) is None
+    assert not workable(never, point, ALLOWED).implicit
+    with pytest.raises(DomainError, match=r"Expected stiff=True, False or None\. Got 'yes'"):
+        fast(stiff="yes")
+
+
+def test_a_jump_is_no_stiffness():
+    model = tc.ODESimulator(
+        lambda t, s, p, u: {"a": -p["k"] * torch.tanh(s["a"] / 1e-9)}, ["a"], [tc.Parameter("k", low=0.0)]
+    )
+    t = np.linspace(0, 3, 31)
+    bound = model.bind(tc.Recording(runs=[run_of(t, {"a": 1.0})]))
+    found = workable(bound, tensor(1.0)[None], ALLOWED)
+    y = found.at(found.x)(tensor(1.0)).numpy()
+    assert np.abs(y - np.maximum(1.0 - t, 0.0)).max() < 0.1
+
+
+def test_terms_other_runs_and_shorter_steps_keep_implicit_ones():
+    bound = fast(stiff=True).bind(FOLLOWED)
+    push = tc.Term("push", equation="a", rate=lambda t, s, p, u: p["F"], parameters=[tc.Parameter("F")])
+    other = tc.Recording(runs=[run_of(np.linspace(0, 5, 11), {"a": 0.0})])
+    found = workable(fast().bind(FOLLOWED), tensor(3e4)[None], ALLOWED)
+    for one in (bound, found):
+        for again in (extend(one, [push]), one.refined(2), one.elsewhere(other)):
+            assert isinstance(again, Trajectories)
+            assert again.implicit
+    assert extend(fast(stiff=True), [push]).bind(FOLLOWED).implicit
+
+
+def test_a_fit_that_comes_to_a_stiff_place_goes_on_there():
+    """Explicit steps are unstable beyond k h = 2.8; the data want more."""
+    t = np.linspace(0, 3, 31)
+    rng = np.random.default_rng(0)
+    y = np.cos(t) + 1e-3 * rng.standard_normal(31)
+    recording = tc.Recording(runs=[tc.Run(t, {"a": y}, initial={"a": 1.0})], noise=1e-3)
+    bound = fast().bind(recording)
+    problem = Problem.of(bound, recording)
+    whitening = problem.whitening(recording.noise, torch.zeros(1, dtype=F64))
+    found = fit(problem, whitening, tensor(20.0)[None], [0])
+    again, error = sharpen(found, lambda now: ALLOWED[now.problem.index] / 10, rounds=7)
+    assert error == 0.0
+    assert again.problem.simulator.implicit
+    assert float(again.values[0]) > 80.0
+    assert again.chi2 < 31 + 4 * math.sqrt(62)
+
+
+# --- what they are for -----------------------------------------------------------------------------------------
+
+
+def chain(k2, planted=0.0, *, noise=0.02):
+    """A to C over B, which is used up as soon as it is made; and what else C does, if anything."""
+    t = np.linspace(0, 10, 60)
+    rng = np.random.default_rng(1)
+    runs = []
+    for first in (1.0, 2.0):
+        def rates(t, s):
+            made = 0.3 * s[0] + planted * s[0] * s[2]
+            return [-made, made - k2 * s[1], k2 * s[1]]
+
+        y = solve_ivp(rates, (0, 10), [first, 0.0, 0.0], "Radau", t, rtol=1e-9, atol=1e-12).y
+        outputs = {"A": y[0] + noise * rng.standard_normal(60), "C": y[2] + noise * rng.standard_normal(60)}
+        runs.append(tc.Run(t, outputs, initial={"A": first, "B": 0.0, "C": 0.0}))
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {
+            "A": -p["k1"] * s["A"], "B": p["k1"] * s["A"] - p["k2"] * s["B"], "C": p["k2"] * s["B"]
+        },
+        {"A": "mol/L", "B": "mol/L", "C": "mol/L"},
+        [tc.Parameter("k1", low=0.0, initial=0.5, unit="1/s"),
+         tc.Parameter("k2", low=0.0, initial=k2, unit="1/s")],
+        observe=("A", "C"),
+    )  # fmt: skip
+    return base, tc.Recording(runs=runs, noise=noise)
+
+
+@pytest.mark.parametrize(("planted", "verdict", "terms"), [(0.18, "named", ["autocatalysis"]), (0.0, "consistent", [])])
+def test_a_stiff_mechanism_is_diagnosed(planted, verdict, terms):
+    base, recording = chain(1e4, planted)
+    d = tc.diagnose(base, recording, tc.terms.kinetics("A", "C", rate="k1"), seed=0, progress=False)
+    assert (d.verdict, d.terms) == (verdict, terms)
+    assert "implicit" in d.settings["solver"]
+    if planted:
+        assert d.ranking[0].estimates[0].value == pytest.approx(planted, abs=4 * d.ranking[0].estimates[0].sd)
+
+
+def test_a_stiff_mechanism_is_calibrated_and_kept(tmp_path):
+    base, recording = chain(1e4)
+    found = tc.calibrate(base, recording, fixed={"k2": 1e4}, num_samples=0, seed=0)
+    assert found.settings["implicit"]
+    assert float(found.map.mean[0]) == pytest.approx(0.3, abs=0.01)
+    found.save(tmp_path / "stiff.nc")
+    again = tc.results.Calibration.load(tmp_path / "stiff.nc", simulator=base)
+    assert again.propagate.simulator.implicit
+    torch.testing.assert_close(again.predict().mean, found.predict().mean)
