@@ -37,8 +37,9 @@ UNPHYSICAL = math.log(1e-3)
 MOST = 40
 #: Refitted in any case: this many, and those with at least this share of the largest score.
 FEW, CHANCE = 6, 0.2
-#: Log evidence that a refit must gain for its time steps to be looked at, and how often they are chosen anew at most.
-WORTH, ROUNDS = 3.0, 3
+#: Log evidence that a refit must gain for its time steps to be looked at, by how much several terms may fall short of
+#: the best fit for that, and how often steps are chosen anew at most.
+WORTH, NEAR, ROUNDS = 3.0, 20.0, 3
 #: Log evidence by which something unknown must explain the base's residual better than any noise, to be there.
 CLEARLY = 5.0
 #: Share of the best log evidence below which a model is not fitted again when the noise estimate has changed.
@@ -286,20 +287,24 @@ class Search:
 
         with self.stop.refitting():
             refit_all(jobs, take, self.executor)
-        return [
-            None if fitted is None
-            else self._judge(Model(one.numbers, one.candidate, self._settled(fitted, one.window), 0.0, one.prior, True,
-                                   window=one.window))
-            for one, fitted in zip(wanted, found, strict=True)
-        ]  # fmt: skip
+        every = [*(model.found for model in self.models), *(fitted for fitted in found if fitted is not None)]
+        best = max((self.gain(fitted.chi2) for fitted in every), default=0.0)
+        models: list[Model | None] = []
+        for one, fitted in zip(wanted, found, strict=True):
+            if fitted is None:
+                models.append(None)
+                continue
+            least = WORTH if len(one.numbers) == 1 else max(WORTH, best - NEAR)
+            if one.window is None and self.gain(fitted.chi2) >= least:  # an edge within a step would only move
+                fitted = self._settled(fitted)
+            model = Model(one.numbers, one.candidate, fitted, 0.0, one.prior, True, window=one.window)
+            models.append(self._judge(model))
+        return models
 
-    def _settled(self, found: Fitted, window: Window | None) -> Fitted:
-        """A fit with time steps that are short enough for it: what a term brings may be faster than the base.
-
-        The edge of a window may lie within a step: shorter ones would only move it.
-        """
+    def _settled(self, found: Fitted) -> Fitted:
+        """A fit with time steps that are short enough for it: what a term brings may be faster than the base."""
         sd = self.noise.sd[found.problem.index]
-        if self.exact or window is not None or self.gain(found.chi2) < WORTH or accurate(found, sd):
+        if self.exact or accurate(found, sd):
             return found
         try:
             return sharpen(found, lambda now: SOLVER_SHARE * sd, rounds=ROUNDS, patient=False)[0]
