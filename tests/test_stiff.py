@@ -196,6 +196,26 @@ def test_a_jump_is_no_stiffness():
     assert np.abs(y - np.maximum(1.0 - t, 0.0)).max() < 0.1
 
 
+def test_steps_become_short_where_a_stiff_solution_jumps():
+    """Van der Pol's relaxation oscillation: two jumps, each in a thousandth of the time between them."""
+    mu = 100.0
+    t = np.linspace(0, 2 * mu, 150)
+    y = solve_ivp(
+        lambda t, s: [s[1], mu * (1 - s[0] ** 2) * s[1] - s[0]], (0, t[-1]), [2.0, 0.0], "Radau", t,
+        rtol=1e-10, atol=1e-12,
+    ).y[0]  # fmt: skip
+    model = tc.ODESimulator(
+        lambda t, s, p, u: {"x": s["v"], "v": p["mu"] * (1 - s["x"] ** 2) * s["v"] - s["x"]},
+        ["x", "v"], [tc.Parameter("mu", low=0.0)], observe=("x",),
+    )  # fmt: skip
+    bound = model.bind(tc.Recording(runs=[run_of(t, {"x": 2.0, "v": 0.0}, ("x",))]))
+    found = workable(bound, tensor(mu)[None], torch.full((150,), 1e-3, dtype=F64))
+    assert found.implicit
+    assert np.abs(found.at(found.x)(tensor(mu)).numpy() - y).max() < 1e-3
+    lengths = found.grid.h[found.grid.h > 0]
+    assert float(lengths.max() / lengths.min()) > 50
+
+
 def test_terms_other_runs_and_shorter_steps_keep_implicit_ones():
     bound = fast(stiff=True).bind(FOLLOWED)
     push = tc.Term("push", equation="a", rate=lambda t, s, p, u: p["F"], parameters=[tc.Parameter("F")])

@@ -11,12 +11,15 @@ from torchcal.simulators.trajectories import Trajectories
 
 __all__ = ["focused", "may_change", "settled", "settled_implicitly", "step_errors", "workable"]
 
-#: How often steps are halved at most; the same of implicit ones where they are tried in place of others.
-HALVINGS, FEW = 7, 3
+#: How often steps are halved at most; how often implicit ones are chosen that are tried in place of others, and how
+#: many they may become.
+HALVINGS, ROUNDS, MANY = 7, 8, 20_000
 #: Factor by which halving steps must lessen the error, lest the model be stiff (16, where they are short enough).
 CONVERGING = 4.0
 #: How much shorter steps become at once where they err, and where no solution is finite.
 MOST_DENSER, SHORTER = 16, (4, 16, 64)
+#: The same between two samples, where no implicit step gets through; up to how much; and how often at most.
+DENSER, DENSEST, JUMPS = 4, 4096, 48
 
 
 def may_change(simulator: object) -> bool:
@@ -71,13 +74,40 @@ def settled(simulator: Trajectories, values: Tensor, allowed: Tensor, *, halving
 
 def settled_implicitly(simulator: Trajectories, values: Tensor, allowed: Tensor) -> Trajectories | None:
     """The same with implicit steps, where these settle on a finite solution, else None; arguments as of `settled`."""
-    other = _implicitly(simulator)
-    if other is None or not _finite(other, values):
-        return None
-    try:
-        return settled(other, values, allowed, halvings=FEW)
-    except (SimulatorError, DomainError):  # or more steps than anyone can take
-        return None
+    implicit = _implicitly(simulator)
+    here = None if implicit is None else _through(implicit, values)
+    for _ in range(ROUNDS):
+        if here is None or here.num_steps > MANY:
+            return None
+        finer = _through(here.refined(2), values)
+        if finer is None:
+            return None
+        states = here.solve(values)
+        change = (_outputs(finer, values) - here.outputs_of(values, states)).abs() / allowed
+        if bool((change <= 1).all()):
+            return here
+        worst = int(change.amax(-1).argmax())
+        here = _through(focused(here, values[worst], states[worst : worst + 1], 2.0 * float(change.max())), values)
+    return None
+
+
+def _through(simulator: Trajectories, values: Tensor) -> Trajectories | None:
+    """The same with shorter steps where no finite solution gets through, as where a stiff one jumps; None if none."""
+    for _ in range(JUMPS):
+        bad = ~torch.isfinite(simulator.solve(values)).all(-1).all(0)  # (R, K + 1)
+        if not bool(bad.any()):
+            return simulator if _finite(simulator, values) else None
+        denser = []
+        for r, node in enumerate(bad.long().argmax(1).tolist()):
+            counts = simulator.grid.steps_between(r)
+            factor = torch.ones_like(counts)
+            if bool(bad[r].any()) and node:
+                factor[int((counts.cumsum(0) < node).sum())] = DENSER
+            denser.append(factor if simulator.denser is None else factor * simulator.denser[r])
+        if max(int(factor.max()) for factor in denser) > DENSEST:
+            return None
+        simulator = simulator.with_steps(simulator.subdivide, tuple(denser))
+    return None
 
 
 def workable(simulator: Trajectories, values: Tensor, allowed: Tensor, *, halvings: int = HALVINGS) -> Trajectories:
