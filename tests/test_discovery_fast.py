@@ -9,6 +9,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 import torchcal as tc
+from torchcal.discovery import search as search_module
 from torchcal.discovery.base import calibrate_base
 from torchcal.discovery.candidates import drivers_scale, prepare
 from torchcal.discovery.problem import Problem
@@ -173,3 +174,29 @@ def test_a_candidate_begins_at_the_trajectory_of_the_base(monkeypatch: pytest.Mo
     assert not marched
     other = base.problem.with_simulator(base.problem.simulator.refined(2))
     assert other.guess(base.warm, base.values[None]) is None
+
+
+def test_a_refit_that_goes_astray_begins_at_the_base(monkeypatch: pytest.MonkeyPatch) -> None:
+    x = torch.linspace(0, 1, 20, dtype=F64)
+    wobble = 0.02 * torch.randn(20, generator=torch.Generator().manual_seed(1), dtype=F64)
+    base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    bend = tc.Term("bend", outputs={"y": lambda x, p, y: y + p["q"] * x**2}, parameters=[tc.Parameter("q")])
+    fits = search_module.refit_all
+    seen = []
+
+    def astray(jobs, on_result, executor=None):
+        seen.append([job.begin for job in jobs])
+
+        def take(index, fitted):
+            on_result(index, dataclasses.replace(fitted, chi2=1e6) if len(seen) == 1 else fitted)
+
+        fits(jobs, take, executor)
+
+    monkeypatch.setattr(search_module, "refit_all", astray)
+    d = tc.diagnose(base, tc.Recording(x=x, y=1 + x + wobble, noise=0.02), [bend], progress=False)
+    (first,), (second,) = seen[:2]
+    assert float(second[0, -1]) == 0.0  # neutral
+    torch.testing.assert_close(second[0, :2], torch.tensor([e.value for e in d.base.estimates], dtype=F64))
+    assert len(first) >= 1
+    row = next(row for row in d.ranking if row.terms == ("bend",))
+    assert -5.0 < row.log_evidence < 5.0

@@ -40,6 +40,8 @@ FEW, CHANCE = 6, 0.2
 #: Log evidence that a refit must gain for its time steps to be looked at, by how much several terms may fall short of
 #: the best fit for that, and how often steps are chosen anew at most.
 WORTH, NEAR, ROUNDS = 3.0, 20.0, 3
+#: χ² above the base's from which on a refit, which holds the base, has gone astray.
+ASTRAY = 1.0
 #: Log evidence by which something unknown must explain the base's residual better than any noise, to be there.
 CLEARLY = 5.0
 #: Share of the best log evidence below which a model is not fitted again when the noise estimate has changed.
@@ -268,25 +270,17 @@ class Search:
         return self.base.problem.drivers(self.base.values[None], self.base.warm)
 
     def refit_together(self, wanted: Sequence[Hypothetical]) -> list[Model | None]:
-        """Refit several hypotheses, on the executor where there is one; None where no start gives a fit."""
-        if self.stop.is_set():
-            return [None] * len(wanted)
-        jobs = []
-        for one in wanted:
-            candidate, begin = one.candidate, one.begin
-            warm = candidate.problem.guess(self.base.warm, begin)
-            shape = [i for i in candidate.own if i not in candidate.amplitudes]
-            whitening = self.noise.whitening(candidate.problem)
-            jobs.append(Refit(candidate.problem, whitening, begin, candidate.free, shape, warm))
-        names = [" + ".join(term.name for term in one.candidate.terms) for one in wanted]
-        found: list[Fitted | None] = [None] * len(jobs)
+        """Refit several hypotheses, on the executor where there is one; None where no start gives a fit.
 
-        def take(index: int, fitted: Fitted | None) -> None:
-            found[index] = fitted
-            self.tick(f"refit with {names[index]}")
-
-        with self.stop.refitting():
-            refit_all(jobs, take, self.executor)
+        Each holds the base: what has ended in a worse fit begins there again.
+        """
+        found = self._fits(wanted)
+        astray = [k for k, one in enumerate(found) if one is not None and one.chi2 > self.base.chi2 + ASTRAY]
+        again = [dataclasses.replace(wanted[k], begin=wanted[k].candidate.begin[None]) for k in astray]
+        for k, fitted in zip(astray, self._fits(again), strict=True):
+            old = found[k]
+            if fitted is not None and old is not None and fitted.chi2 < old.chi2:
+                found[k] = fitted
         every = [*(model.found for model in self.models), *(fitted for fitted in found if fitted is not None)]
         best = max((self.gain(fitted.chi2) for fitted in every), default=0.0)
         models: list[Model | None] = []
@@ -300,6 +294,28 @@ class Search:
             model = Model(one.numbers, one.candidate, fitted, 0.0, one.prior, True, window=one.window)
             models.append(self._judge(model))
         return models
+
+    def _fits(self, wanted: Sequence[Hypothetical]) -> list[Fitted | None]:
+        """The fits of hypotheses; None where no start gives one, and where the search has been stopped."""
+        found: list[Fitted | None] = [None] * len(wanted)
+        if self.stop.is_set() or not wanted:
+            return found
+        jobs = []
+        for one in wanted:
+            candidate, begin = one.candidate, one.begin
+            warm = candidate.problem.guess(self.base.warm, begin)
+            shape = [i for i in candidate.own if i not in candidate.amplitudes]
+            whitening = self.noise.whitening(candidate.problem)
+            jobs.append(Refit(candidate.problem, whitening, begin, candidate.free, shape, warm))
+        names = [" + ".join(term.name for term in one.candidate.terms) for one in wanted]
+
+        def take(index: int, fitted: Fitted | None) -> None:
+            found[index] = fitted
+            self.tick(f"refit with {names[index]}")
+
+        with self.stop.refitting():
+            refit_all(jobs, take, self.executor)
+        return found
 
     def _settled(self, found: Fitted) -> Fitted:
         """A fit with time steps that are short enough for it: what a term brings may be faster than the base."""
