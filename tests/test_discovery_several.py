@@ -10,7 +10,7 @@ import torchcal as tc
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.rounds import settle
 from torchcal.discovery.search import Search
-from torchcal.discovery.several import refit_several
+from torchcal.discovery.several import _one_fewer, _refit_sets, refit_several
 from torchcal.discovery.windows import _rivals
 
 F64 = torch.float64
@@ -169,3 +169,22 @@ def test_a_pair_is_tried_beside_three_different_terms():
     known = [row.terms for row in d.ranking if row.terms != ("none of these",)]
     assert set(known[0]) == {"propellant burnt", "quadratic drag"}
     assert str(d).split("\n")[0].count(", or ") <= 6  # five of them and how many others, and none of them
+
+
+def test_a_third_term_that_does_nothing_gives_way_to_the_pair():
+    """Three terms, of which two do it all, and whose pair had got stuck."""
+    noise = 0.02 * torch.randn(60, generator=torch.Generator().manual_seed(3), dtype=F64)
+    y = 2 * X + 0.3 * X**2 + 0.4 * (2 * X).sin() + noise
+    base = tc.Simulator(lambda x, p: {"y": p["m"] * x["x"]}, [tc.Parameter("m")])
+    problem = Problem.of(base, tc.Recording(x={"x": X}, y={"y": y}, noise=0.02))
+    search = Search(problem, [term(name) for name in ("square", "wave", "root")], {}, 0, 3, 3, lambda text: None)
+    search.calibrate_base()
+    search, _ = settle(search, problem, 0.99)
+    right, three = (_refit_sets(search, [(numbers, None)], -4.0)[0] for numbers in ((0, 1), (0, 1, 2)))
+    search.models = [dataclasses.replace(right, log_evidence=right.log_evidence - 100), three]
+    _one_fewer(search, three, -4.0)
+    (again,) = [model for model in search.models if model.numbers == (0, 1)]
+    assert abs(again.weight - right.weight) < 0.01
+    assert again.weight > three.weight
+    _one_fewer(search, three, -4.0)  # once is enough
+    assert [model for model in search.models if model.numbers == (0, 1)] == [again]

@@ -440,3 +440,14 @@ def test_how_well_tied_hypotheses_do_is_their_probability(shares, told):
     names = [f"b{k}" for k in range(len(shares))]
     rows = [row((name,), share) for name, share in zip(names, shares, strict=True)]
     assert told in said(finding("ambiguous", tied=[[name] for name in names], ranking=rows))
+
+
+@pytest.mark.parametrize(("low", "told"), [(0.0, False), (None, True)])
+def test_opposites_that_have_one_sign_each_are_not_the_same(low, told):
+    x = torch.linspace(1, 3, 40, dtype=F64)
+    base = tc.Simulator(lambda x, p: p["k"] / x, [tc.Parameter("k", low=0.0)])
+    less = tc.Term("less", outputs={"y": lambda x, p, y: y + p["b"] / x**2}, parameters=[tc.Parameter("b", low=low)])
+    more = tc.Term("more", outputs={"y": lambda x, p, y: y - p["d"] / x**2}, parameters=[tc.Parameter("d", low=low)])
+    wobble = 0.01 * torch.randn(40, generator=torch.Generator().manual_seed(0), dtype=F64)
+    d = tc.diagnose(base, tc.Recording(x=x, y=1 / x + wobble, noise=0.01), [less, more], progress=False)
+    assert any("less and more are nearly the same" in row for row in d.identifiability) is told

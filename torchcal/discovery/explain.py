@@ -205,12 +205,22 @@ def identifiability(search: Search, best: Model | None) -> list[str]:
             everywhere = ", where it acts everywhere," if own else ""
             rows.append(f"{candidate.name}{everywhere} cannot be told from the parameters of the base")
         for j in range(i):
-            c = abs(screening.correlation(i, j))
+            c = _alike(search, i, j)
             if c > 0.99 and not _told_apart(search, i, j):
                 rows.append(
                     f"{search.candidates[j].name} and {candidate.name} are nearly the same here (correlation {c:.3f})"
                 )
     return [*([] if best is None else _one_law(best)), *rows][:12]
+
+
+def _alike(search: Search, i: int, j: int) -> float:
+    """Correlation of what two candidates do, of the signs that both may have."""
+    screening = search.screening
+    c = screening.correlation(i, j)
+    if min(screening.best[i], screening.best[j]) < 0:
+        return 0.0
+    sides = [search.candidates[k].one_sided(search.amplitude(screening.best[k])) for k in (i, j)]
+    return c * math.prod(sides) if all(sides) else abs(c)
 
 
 def _one_law(model: Model) -> list[str]:

@@ -1,5 +1,6 @@
 """Several terms together: effects hide each other, so pairs are searched as well as second and third terms."""
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ from torchcal.discovery.explain import removed
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.residual import Residual
 from torchcal.discovery.screen import screen
-from torchcal.discovery.search import Search
+from torchcal.discovery.search import BETTER, Search
 from torchcal.discovery.verdict import PLAINLY_WHITE
 from torchcal.errors import DomainError, SimulatorError
 
@@ -81,6 +82,28 @@ def refit_several(search: Search) -> None:
         third = math.log(0.2 * PRIOR["several"] / (count * (count - 1) * max(count - 2, 1) / 6))
         more = [tuple(sorted((*best.numbers, j))) for j in _next_terms(search, best)[:4] if j not in best.numbers]
         search.models += _refit_sets(search, [(numbers, None) for numbers in more], third)
+        leader = search.physical_leader
+        if leader is not None and len(leader.numbers) == 3:
+            _one_fewer(search, leader, prior)
+
+
+def _one_fewer(search: Search, three: Model, prior: float) -> None:
+    """The pairs of three terms, each refitted from where the three ended: from the base it may have got stuck."""
+    known = three.found.by_name
+    wanted = []
+    for numbers in itertools.combinations(three.numbers, 2):
+        pair = _hypothetical(search, numbers, prior, None)
+        if pair is not None:
+            names = [q.name for q in pair.candidate.problem.parameters]
+            row = pair.candidate.begin.clone()
+            for k in pair.candidate.free:  # what the third term frees stays neutral here
+                row[k] = known[names[k]]
+            wanted.append(dataclasses.replace(pair, begin=row[None]))
+    for model in search.refit_together(wanted):
+        if model is not None:
+            old = [m for m in search.models if m.numbers == model.numbers and m.window is None]
+            if all(model.weight > m.weight + BETTER for m in old):
+                search.models = [m for m in search.models if m not in old] + [model]
 
 
 def _alone_again(search: Search, pair: Model) -> None:
