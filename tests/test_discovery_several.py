@@ -188,3 +188,25 @@ def test_a_third_term_that_does_nothing_gives_way_to_the_pair():
     assert again.weight > three.weight
     _one_fewer(search, three, -4.0)  # once is enough
     assert [model for model in search.models if model.numbers == (0, 1)] == [again]
+
+
+def test_an_instrument_shows_the_physics_in_whatever_order_the_two_are_listed():
+    x = torch.linspace(0.1, 3, 80, dtype=F64)
+    true = 2 * x + 1.5 * (4 * x).sin()
+    y = true / (1 + 0.15 * true) + 0.01 * torch.randn(80, generator=torch.Generator().manual_seed(5), dtype=F64)
+    base = tc.Simulator(lambda x, p: {"y": p["m"] * x["x"]}, [tc.Parameter("m", low=0.0)])
+    dull = tc.Term(
+        "dead time", outputs={"y": lambda x, p, y: y / (1 + p["q"] * y)}, parameters=[tc.Parameter("q", low=0.0)]
+    )
+    wave = tc.Term(
+        "wave", outputs={"y": lambda x, p, y: y + p["a"] * (4 * x["x"]).sin()}, parameters=[tc.Parameter("a")]
+    )
+    recording = tc.Recording(x={"x": x}, y={"y": y}, noise=0.01)
+    found = [tc.diagnose(base, recording, terms, progress=False) for terms in ([dull, wave], [wave, dull])]
+    for d in found:
+        assert d.verdict == "named"
+        assert set(d.terms) == {"wave", "dead time"}
+        estimates = {e.name: e for e in d.final.estimates}
+        assert abs(estimates["dead time.q"].value - 0.15) < 4 * estimates["dead time.q"].sd
+        assert abs(estimates["wave.a"].value - 1.5) < 4 * estimates["wave.a"].sd
+    assert abs(found[0].final.chi2 - found[1].final.chi2) < 0.01

@@ -70,6 +70,9 @@ def refit_several(search: Search) -> None:
         twins = _refit_sets(search, [(pair, None) for pair in _swapped(search, best) if pair not in pairs], prior)
         fitted += twins
         search.models += twins
+        if (other := _turned(search, best)) is not None:
+            fitted, search.models = ([other if m is best else m for m in models] for models in (fitted, search.models))
+            best = other
         close = [m for m in search.models if m.physical and len(m.numbers) == 2 and m.weight > best.weight - CLOSE]
         for pair in sorted(close, key=lambda m: -m.weight)[:AGAIN]:
             _alone_again(search, pair)
@@ -85,6 +88,25 @@ def refit_several(search: Search) -> None:
         leader = search.physical_leader
         if leader is not None and len(leader.numbers) == 3:
             _one_fewer(search, leader, prior)
+
+
+def _turned(search: Search, pair: Model) -> Model | None:
+    """The same two terms the other way round, where these act on one output and do better so.
+
+    An instrument shows what the physics gives; which of the two is which nobody says.
+    """
+    first, second = pair.candidate.terms
+    if not set(first.outputs) & set(second.outputs):
+        return None
+    one = _hypothetical(search, pair.numbers, pair.log_prior, None, turned=True)
+    if one is None:
+        return None
+    known, row = pair.found.by_name, one.candidate.begin.clone()
+    for k, q in enumerate(one.candidate.problem.parameters):
+        row[k] = known[q.name]
+    (other,) = search.refit_together([dataclasses.replace(one, begin=torch.cat([one.begin, row[None]]))])
+    better = other is not None and other.physical >= pair.physical and other.weight > pair.weight + BETTER
+    return other if better else None
 
 
 def _one_fewer(search: Search, three: Model, prior: float) -> None:
@@ -219,9 +241,9 @@ def _refit_sets(
 
 
 def _hypothetical(
-    search: Search, numbers: tuple[int, ...], prior: float, columns: tuple[int, int] | None
+    search: Search, numbers: tuple[int, ...], prior: float, columns: tuple[int, int] | None, *, turned: bool = False
 ) -> Hypothetical | None:
-    terms = [term for i in numbers for term in search.candidates[i].terms]
+    terms = [term for i in (reversed(numbers) if turned else numbers) for term in search.candidates[i].terms]
     terms.sort(key=lambda term: not replaces(search.base.problem, search.base.values, term))  # else others are lost
     try:
         candidate = prepare(
