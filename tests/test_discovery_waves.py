@@ -156,3 +156,31 @@ def test_a_wave_larger_than_the_base_s_own_rate_is_none_of_that_rate():
     for share, larger in ((0.5, False), (1.5, True)):
         moved = dataclasses.replace(place, profile=torch.full_like(place.profile, share * usual))
         assert _larger_than_all(search, moved) is larger
+
+
+@pytest.mark.parametrize(
+    ("effect", "largest"),
+    [(lambda p: 1.0 * (p > 3), (3.6, 10.0)), (lambda p: 1.0 * (p < 0.3), (0.1, 0.3)), (lambda p: p / 10, (4.6, 10.0))],
+    ids=["above", "below", "growing"],
+)
+def test_what_is_missing_is_told_beside_what_the_base_makes_up_for(effect, largest):
+    """The base has a constant of its own: only how the change differs from its median can be told."""
+    x, p = (grid.ravel() for grid in np.meshgrid(np.linspace(0, 1, 12), np.geomspace(0.1, 10, 9), indexing="ij"))
+    noise = 0.05 * np.random.default_rng(0).standard_normal(len(x))
+    recording = tc.Recording(
+        x={"x": torch.tensor(x), "p": torch.tensor(p)}, y=torch.tensor(2 - 3 * x + effect(p) + noise), noise=0.05
+    )
+    base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x["x"], [tc.Parameter("a"), tc.Parameter("b")])
+    idle = tc.Term(
+        "idle", outputs={"y": lambda x, p, y: y + p["c"] * (7 * x["x"]).sin()}, parameters=[tc.Parameter("c")]
+    )
+    d = tc.diagnose(base, recording, [idle], progress=False)
+    assert d.missing is not None
+    assert d.missing.driver == "p"
+    values, rate = d.missing.values.numpy(), d.missing.rate.numpy()
+    truth = effect(values)
+    assert np.abs(rate - (truth - np.median(truth))).max() < 0.25 * np.ptp(truth)
+    assert float(d.missing.sd.max()) < 0.25 * np.ptp(truth)
+    low, high = d.where[0].spans[0][0], d.where[0].spans[-1][1]
+    assert low == pytest.approx(largest[0], rel=0.5)
+    assert high == pytest.approx(largest[1], rel=0.5)

@@ -13,6 +13,8 @@ __all__ = ["SIZES", "SMALL", "Change", "Place", "evidence_of"]
 
 #: Singular values below this share of the largest are none.
 SMALL = 1e-6
+#: Share of a change that is the same everywhere up to which the base's parameters make up for it.
+SAME = 1e-3
 #: Sizes of an unknown change that are tried, in noise sd.
 SIZES = torch.logspace(-0.3, 3.0, 14, dtype=torch.float64)
 
@@ -26,7 +28,8 @@ class Place:
         driver: Against what.
         evidence: Log evidence against no change.
         share: Share of the excess misfit that it removes.
-        profile: Estimated change at the channel's points, ``(K,)``.
+        profile: Estimated change at the channel's points, ``(K,)``; its median is 0 where the base's parameters make
+            up for one that is the same everywhere.
         sd: Its standard deviation there.
         size: Chosen prior size; of an oscillation its amplitude.
         period: Of an oscillation, in units of the driver; None of a smooth change.
@@ -92,11 +95,19 @@ class Change:
         removed = float(((1 - (1 - shrink).square()) * self.along.square()).sum())
         left = float(residual.e.square().sum()) - removed
         rest = max(left - residual.freedom + float(shrink.sum()), 0.0)
-        within = (self.features @ self.v) / (1 + gain).sqrt()
+        features, profile = self.features, self.features @ weights
+        if _is_unseen(channel, residual):
+            features, profile = features - features.mean(0), profile - profile.median()
+        within = (features @ self.v) / (1 + gain).sqrt()
         # What the data say nothing about keeps its prior sd.
-        beyond = (self.features.square().sum(1) - (self.features @ self.v).square().sum(1)).clamp_min(0.0)
+        beyond = (features.square().sum(1) - (features @ self.v).square().sum(1)).clamp_min(0.0)
         sd = (within.square().sum(1) + beyond).sqrt() * float(size[0]) / self.scale
         return Place(
-            channel, driver, float(evidence[0]), 1.0 - min(rest / excess, 1.0), self.features @ weights, sd,
-            float(size[0]),
-        )  # fmt: skip
+            channel, driver, float(evidence[0]), 1.0 - min(rest / excess, 1.0), profile, sd, float(size[0])
+        )
+
+
+def _is_unseen(channel: Channel, residual: Residual) -> bool:
+    """Whether the base's parameters make up for a change that is the same everywhere, so that it may be any."""
+    change = channel.response(channel.time.new_ones(len(channel.time), 1))
+    return float(residual.tangent(change).norm()) <= SAME * float(residual.found.whitening(change).norm())
