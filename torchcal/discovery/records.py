@@ -307,7 +307,8 @@ class MissingRate:
         target: Name of that equation (its state), output or parameter.
         driver: What it is drawn against.
         values: Driver values, ascending, ``(m,)``.
-        rate: Estimate there, ``(m,)``, in ``unit``.
+        rate: Estimate there, ``(m,)``, in ``unit``; relative to its median where the base's own parameters make up for
+            what is the same everywhere.
         sd: Its standard deviation, ``(m,)``.
         unit: Unit of the rate.
         time: Times of the grid along the calibrated trajectory, ``(T,)``; the conditions' rows in the
