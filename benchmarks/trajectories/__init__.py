@@ -1,0 +1,1 @@
+"""How long trajectories and their derivatives take, beside SciPy's solvers."""
