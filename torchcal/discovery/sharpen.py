@@ -14,6 +14,8 @@ __all__ = ["SOLVER_SHARE", "accurate", "sharpen"]
 
 #: Solver error, in noise sd, up to which it is none.
 SOLVER_SHARE = 0.05
+#: How often implicit steps are chosen at most.
+ROUNDS = 8
 #: Factor by which the error must become smaller when steps are chosen anew.
 CONVERGING = 4.0
 
@@ -59,7 +61,7 @@ def sharpen(
             return found, 0.0
         before, share = share, float((error / most).nan_to_num(nan=math.inf).max())
         slow = number > 0 and not share < before / CONVERGING
-        if slow and (again := _implicit(found, most)) is not None:
+        if slow and (again := _implicit(found, most, ROUNDS if patient else 1)) is not None:
             return sharpen(again, allowed, rounds=rounds, patient=patient)
         if number == rounds or (slow and not patient):
             break
@@ -75,14 +77,14 @@ def sharpen(
     return found, float(error.max())
 
 
-def _implicit(found: Fitted, allowed: Tensor) -> Fitted | None:
+def _implicit(found: Fitted, allowed: Tensor, rounds: int) -> Fitted | None:
     """The fit with implicit steps; None where these do not settle either."""
     problem, simulator = found.problem, found.problem.simulator
     if not isinstance(simulator, Trajectories):
         return None
     most = problem.recording.spread.clone()
     most[problem.index] = allowed
-    other = settled_implicitly(simulator, found.values[None], most)
+    other = settled_implicitly(simulator, found.values[None], most, rounds=rounds)
     if other is None:
         return None
     return fit(problem.with_simulator(other), found.whitening, found.values[None], found.free)

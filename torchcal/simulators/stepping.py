@@ -72,11 +72,14 @@ def settled(simulator: Trajectories, values: Tensor, allowed: Tensor, *, halving
     )
 
 
-def settled_implicitly(simulator: Trajectories, values: Tensor, allowed: Tensor) -> Trajectories | None:
-    """The same with implicit steps, where these settle on a finite solution, else None; arguments as of `settled`."""
+def settled_implicitly(
+    simulator: Trajectories, values: Tensor, allowed: Tensor, *, rounds: int = ROUNDS
+) -> Trajectories | None:
+    """The same with implicit steps, where these settle on a finite solution, else None; arguments as of `settled`, and
+    how often they are chosen at most."""
     implicit = _implicitly(simulator)
     here = None if implicit is None else _through(implicit, values)
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         if here is None or here.num_steps > MANY:
             return None
         finer = _through(here.refined(2), values)
