@@ -78,6 +78,12 @@ ACTS = {
     "parameter": (tc.Term("one", shifts={"kp": rate}, **Q), (), ("parameter", "kp")),
     "value of a run": (tc.Term("one", frees=("k",)), [channel("parameter", "k[1]", M=1)], ("equation", "M")),
     "no place": (tc.Term("one", frees=("ki",)), [channel("parameter", "ki", R=1)], ("equation", "R")),
+    "hidden state of an output": (
+        tc.Term("one", states={"z": None}, initial={"z": 0.0}, rates={"z": rate},
+                outputs={"y": lambda t, s, p, u, y: y + s["z"]}, **Q), (), ("output", "y")),
+    "hidden state of a parameter": (
+        tc.Term("one", states={"z": None}, initial={"z": 0.0}, rates={"z": rate}, shifts={"kp": rate}, **Q), (),
+        ("parameter", "kp")),
     "output": (tc.Term("one", outputs={"y": lambda t, s, p, u, y: y + p["q"]}, **Q), (), ("output", "y")),
 }
 

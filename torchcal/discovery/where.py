@@ -111,7 +111,7 @@ def _own_places(search: Search, model: Model) -> set[tuple[str, str]]:
     inside = [] if model.structure is None else [c for c in model.structure.channels if c.kind == "parameter"]
     own: set[tuple[str, str]] = set()
     for term in model.candidate.terms:
-        if term.rates:
+        if _is_rate(term):
             own |= {("equation", name) for name in _equations(term)}
         elif term.outputs:
             own |= {("output", name if name in outputs else outputs[0]) for name in term.outputs}  # no name is y
@@ -140,11 +140,16 @@ def _contributed(search: Search, model: Model, drivers: Sequence[str]) -> Locati
 
 def _acts_on(model: Model) -> tuple[str, str]:
     term = model.candidate.terms[0]
-    if term.rates:
+    if _is_rate(term):
         return "equation", _equations(term)[0]
     if term.outputs:
         return "output", next(iter(term.outputs))
     return "parameter", next(iter([*term.shifts, *term.frees]))
+
+
+def _is_rate(term: Term) -> bool:
+    """Whether a term acts by rates: those of its own hidden states alone are how its shifts or outputs come about."""
+    return any(name not in term.states for name in term.rates) or not (term.outputs or term.shifts or term.frees)
 
 
 def _equations(term: Term) -> list[str]:
