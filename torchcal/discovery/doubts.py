@@ -233,11 +233,11 @@ def _noise_or_physics(search: Search, model: Model) -> str:
     """What may be physics that a model leaves, though it is taken for noise.
 
     Noise of unknown size that is slow is what a wrong shape leaves, too; where most of it is small, and some of it
-    large, it is no noise of one size. Of a grid of conditions no correlated noise is estimated.
+    large, it is no noise of one size. Where rows do not follow one another no correlated noise is estimated.
     """
     noise, problem = beside(search, model), model.found.problem
     e = noise.whitening(problem).vector(model.found.residual)
-    if not problem.in_time and not problem.follows and _along_rows(problem, e) > ALONG:
+    if problem.sweeps is None and _along_rows(problem, e) > ALONG:
         return (
             "What it leaves is correlated in the order of the recording, as noise or as physics: the same conditions "
             "in another order would tell."

@@ -129,7 +129,7 @@ def alone(found: Fitted, noise: Noise, tangents: Tangents) -> tuple[Noise, float
         like = log_prior(GRID, count[k]) - tangents.logs[k]
         like = like - 0.5 * count[k] * sizes[k].log() - 0.5 * square[k] / sizes[k]
         like = like - 0.5 * torch.linalg.slogdet(others + blocks[k])[1]
-        if count[k] < LEAST or not problem.follows:
+        if count[k] < LEAST or problem.sweeps is None:
             like[1:] = -math.inf
         best[k] = int(like.argmax())
         posterior[k] = (like - like[best[k]]).exp() / (like - like[best[k]]).exp().sum()
@@ -192,7 +192,7 @@ def with_unknown(
         for _ in range(ROUNDS if noise.source != "replicates" else 0):
             before = best
             for k, n in enumerate(torch.bincount(problem.output_of, minlength=len(places)).tolist()):
-                rhos = {best[0][k], *TRIED} if n >= LEAST and problem.follows else {best[0][k]}
+                rhos = {best[0][k], *TRIED} if n >= LEAST and problem.sweeps is not None else {best[0][k]}
                 wanted = itertools.product(rhos, factors if n else (0,))
                 best = max((_with(best, k, *one) for one in wanted), key=evidence)
             if best == before:

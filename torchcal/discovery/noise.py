@@ -195,16 +195,17 @@ def estimate(
                 f"Expected enough data to tell noise from misfit. Got {n} of output {recording.outputs[output]!r}. "
                 "Give noise= its standard deviation."
             )
-        correlated = n >= LEAST and problem.follows and replicated is None
+        correlated = n >= LEAST and problem.sweeps is not None and replicated is None
         logs, sizes = [], []
         for rho in GRID if correlated else GRID[:1]:
             square, log_det, count = 0.0, 0.0, 0
             for places, r, basis in zip(parts, scaled, bases, strict=True):
-                e, b = _decorrelate(r[:, None], rho)[:, 0], _decorrelate(basis, rho)
+                joined = problem.joined(places)
+                e, b = _decorrelate(r[:, None], rho, joined)[:, 0], _decorrelate(basis, rho, joined)
                 q, upper = torch.linalg.qr(b)
                 left = e - q @ (q.T @ e)
                 square += float(left.square().sum())
-                log_det += 0.5 * (len(places) - 1) * math.log(1 - float(rho) ** 2)
+                log_det += 0.5 * int(joined.sum()) * math.log(1 - float(rho) ** 2)
                 log_det += float(upper.diagonal().abs().log().sum())
                 count += len(places) - b.shape[1]
             sizes.append(square / count)
@@ -323,11 +324,12 @@ def least(problem: Problem, step: dict[str, float]) -> Tensor:
     return sd
 
 
-def _decorrelate(values: Tensor, rho: Tensor) -> Tensor:
+def _decorrelate(values: Tensor, rho: Tensor, joined: Tensor) -> Tensor:
+    """Successive values ``(m, k)`` with what follows from the one before taken out, where they are ``joined``."""
     if float(rho) == 0.0:
         return values
     rest = (values[1:] - rho * values[:-1]) / math.sqrt(1 - float(rho) ** 2)
-    return torch.cat([values[:1], rest])
+    return torch.cat([values[:1], torch.where(joined[:, None], rest, values[1:])])
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,9 @@ from torchcal.simulators import Parameter, Simulator, Solution, Trajectories
 
 __all__ = ["Problem", "Whitening", "is_value_of"]
 
-#: Combinations of all levels of all conditions, in the number of rows, up to which these are a grid.
-GRID = 2.0
+#: Combinations of all levels of all conditions, in the number of rows, up to which these are a grid; the levels of a
+#: condition up to which it switches between sweeps of another one; and the rows of a sweep, on average, at least.
+GRID, SWITCH, SWEEP = 2.0, 2, 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,15 +117,25 @@ class Problem:
         return x
 
     @cached_property
-    def follows(self) -> bool:
-        """Whether rows follow one another, so that noise can be correlated along them, as they were recorded.
+    def sweeps(self) -> Tensor | None:
+        """Number of the sweep that every row belongs to, ``(rows,)``; None where rows do not follow one another.
 
-        A grid's do not: a smooth effect of one of its conditions is steps along them, as slow noise may be.
+        Noise may be correlated along the rows of one sweep, as they were recorded. A grid is recorded sweep by sweep,
+        or in an order of its own: a smooth effect of one of its conditions is steps along all rows, as slow noise may
+        be.
         """
+        one = torch.zeros(self.recording.n, dtype=torch.long)
         if self.order is not None:
-            return True
-        levels = math.prod(len(c.unique()) for c in self.recording.x.values())  # type: ignore[union-attr]
-        return levels > GRID * self.recording.n
+            return one
+        columns = torch.stack(list(self.recording.x.values()), dim=1)  # type: ignore[union-attr]
+        levels = [len(column.unique()) for column in columns.T]
+        if sum(count > SWITCH for count in levels) == 1 or math.prod(levels) > GRID * len(one):
+            return one
+        change = columns.diff(dim=0) != 0
+        swept = int((change & (change.sum(1, keepdim=True) == 1)).sum(0).argmax())
+        others = [k for k in range(len(levels)) if k != swept]
+        one[1:] = change[:, others].any(1).cumsum(0)
+        return one if len(one) >= SWEEP * (int(one[-1]) + 1) else None
 
     @cached_property
     def sequences(self) -> list[Tensor]:
@@ -145,6 +156,12 @@ class Problem:
         """The same in the order in which they were recorded, in which noise is correlated."""
         return [places.sort().values for places in self.sequences] if not self.in_time else self.sequences
 
+    def joined(self, places: Tensor) -> Tensor:
+        """Which of successive data of one of the `recorded` sequences, ``(m - 1,)``, belong to one sweep."""
+        if self.sweeps is None:
+            return torch.zeros(len(places) - 1, dtype=torch.bool)
+        return self.sweeps[self.condition_of[places]].diff() == 0
+
     def whitening(self, sd: Tensor, correlation: Tensor) -> Whitening:
         """Of noise with sd ``(n_total,)`` and an AR(1) coefficient for each output, ``(outputs,)``."""
         rho = torch.zeros(self.n, dtype=torch.float64)
@@ -157,7 +174,8 @@ class Problem:
                 gaps = at.diff()
                 usual = gaps.median().clamp_min(1e-300)
                 phi = float(correlation[int(self.output_of[places[0]])])
-                rho[places[1:]] = phi ** (gaps / usual).clamp(1e-3, 1e3) if phi > 0 else 0.0
+                each = phi ** (gaps / usual).clamp(1e-3, 1e3) if phi > 0 else torch.zeros_like(gaps)
+                rho[places[1:]] = torch.where(self.joined(places), each, 0.0)
                 before[places[1:]] = places[:-1]
         return Whitening(sd[self.index], rho.clamp_max(0.999), before)
 

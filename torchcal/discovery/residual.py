@@ -68,8 +68,8 @@ def _noise_draws(found: Fitted, noise: Noise, draws: int, seed: int) -> Tensor:
                 rho = GRID[chosen].repeat_interleave(each)[:draws]
                 fresh = (1 - rho.square()).sqrt()
                 walk = e[places]
-                for k in range(1, len(places)):
-                    walk[k] = rho * walk[k - 1] + fresh * walk[k]
+                for k, joined in enumerate(problem.joined(places).tolist(), start=1):
+                    walk[k] = rho * walk[k - 1] + fresh * walk[k] if joined else walk[k]
                 e[places] = walk
         unit = w.sd.clone()
         e = w(e * unit[:, None])
