@@ -356,3 +356,53 @@ def test_a_smooth_misfit_that_an_initial_state_takes_up_is_no_outlier():
     assert found[0].terms == ["quadratic loss"]
     assert found[0].noise.outliers == 0
     assert found[1].verdict != "consistent"
+
+
+def resonant(seed, noise, *, height=2.0, spike=0.0):
+    """A bent line with a resonance that is as narrow as its samples, or one wild sample there; and its library."""
+    x = torch.linspace(0, 10, 60, dtype=F64)
+    middle, width = float(x[23]), 0.134
+
+    def added(name, form):
+        term = {"y": lambda x, p, y: y + p["c"] * form(x)}
+        return tc.Term(name, outputs=term, parameters=[tc.Parameter("c")])
+
+    terms = [
+        added("quadratic", lambda x: x**2),
+        added("cubic", lambda x: x**3),
+        added("ripple", lambda x: torch.sin(3 * x)),
+        added("resonance", lambda x: torch.exp(-0.5 * ((x - middle) / width) ** 2)),
+    ]
+    y = 1 + 0.5 * x + 0.05 * x**2 + height * torch.exp(-0.5 * ((x - middle) / width) ** 2)
+    y = y + 0.1 * torch.randn(60, generator=torch.Generator().manual_seed(seed), dtype=F64)
+    y[23] += spike
+    base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    return diagnose(base, tc.Recording(x=x, y=y, noise=noise), terms)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_what_sticks_out_of_the_best_term_may_be_what_a_second_one_is_seen_by(seed):
+    d = resonant(seed, 0.1)  # of the curve alone the three samples of the resonance stick out
+    assert set(d.terms) == {"quadratic", "resonance"}
+    assert d.noise.outliers == 0
+    known = {e.name: e for e in d.final.estimates}
+    assert abs(known["resonance.c"].value - 2.0) < 4 * known["resonance.c"].sd
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_wild_sample_where_a_second_term_would_be_seen_stays_one(seed):
+    d = resonant(seed, 0.1, height=0.0, spike=2.0)
+    assert d.terms == ["quadratic"]
+    assert d.set_aside.nonzero()[:, 0].tolist() == [23]
+
+
+def test_the_sd_of_a_name_rest_on_the_noise_beside_it():
+    # That of the best single term had them five times as large, from three times the noise.
+    seen = [resonant(seed, None) for seed in range(1, 6)]
+    named = [d for d in seen if d.verdict == "named"]
+    assert len(named) >= 3
+    for d in named:
+        known = {e.name: e for e in d.final.estimates}
+        assert abs(known["quadratic.c"].value - 0.05) < 4 * known["quadratic.c"].sd
+        assert known["quadratic.c"].sd < 0.003  # 0.0018 of white noise whose sd is known
+        assert 0.07 < d.noise.sd["y"] < 0.13

@@ -205,15 +205,19 @@ def test_what_is_removed_and_what_remains_are_all():
 
 
 def test_an_estimate_that_depends_on_what_acts_beside_it_is_told():
-    other = [dataclasses.replace(TOP, value=1.5, sd=0.2), Estimate("offset.b", 3.0, 0.1)]
-    rows = [row(["drag", "offset"], 0.6, estimates=tuple(other)), row(["drag"], 0.3, estimates=(TOP,))]
-    tied = [["drag", "offset"], ["drag"]]
+    mass = Estimate("m", 2.0, 0.1, "kg")
+    other = [dataclasses.replace(TOP, value=1.5, sd=0.2), Estimate("offset.b", 3.0, 0.1), mass]
     told = "drag.c depends on what acts beside it: 1.5 ± 0.2 1/m with offset."
-    assert told in said(finding(ranking=rows, tied=tied))
-    rows[0] = row(["drag", "offset"], 0.6, estimates=(dataclasses.replace(TOP, value=1.19),))
-    assert "depends on" not in said(finding(ranking=rows, tied=tied))  # within 2 sd
-    rows[0] = row(["drag", "offset"], 0.2, estimates=tuple(other))
-    assert "depends on" not in said(finding(ranking=rows, tied=tied))  # less likely
+    assert explain.depends([mass, TOP], other, ["offset"]) == told
+    near = [dataclasses.replace(TOP, value=1.19), mass]
+    assert explain.depends([mass, TOP], near, ["offset"]) == ""  # within 2 sd
+    # One of the base's own may move most.
+    assert explain.depends([mass, TOP], [*near[:1], dataclasses.replace(mass, value=3.0)], ["offset"]).startswith("m ")
+    rows = [row(["drag", "offset"], 0.6), row(["drag"], 0.3, estimates=(TOP,))]
+    found = finding(ranking=rows, tied=[["drag", "offset"], ["drag"]])
+    assert "depends on" not in said(found)
+    found.settings["depends"] = told
+    assert told in said(found)
 
 
 # --- no name ---------------------------------------------------------------------------------------------------

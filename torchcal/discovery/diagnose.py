@@ -28,7 +28,7 @@ from torchcal.discovery.problem import Problem
 from torchcal.discovery.ranking import ranking
 from torchcal.discovery.records import Scores, Table
 from torchcal.discovery.result import Diagnosis
-from torchcal.discovery.rounds import settle, with_all
+from torchcal.discovery.rounds import settle, with_all, with_explained
 from torchcal.discovery.search import Search
 from torchcal.discovery.several import refit_several
 from torchcal.discovery.verdict import PLAINLY_WHITE, Decision, decide
@@ -43,6 +43,8 @@ __all__ = ["diagnose"]
 
 #: RMSE of a calibrated base, in the data's spread, from which on it explains nothing.
 NO_BETTER = 0.95
+#: Probability of what is tied from which on its noise is told.
+HALF = 0.5
 #: Power of the stated detection limits.
 POWER = 0.95
 
@@ -156,6 +158,7 @@ def diagnose(
                     search, detected = every, True
             if detected and terms and not search.stop.is_set():
                 refit_several(search)
+                search = with_explained(search, problem, confidence) or search
                 refit_nameless(search)
             decision = decide(search, detected, mask)
             best = decision.best or (search.physical_leader if decision.verdict == "ambiguous" else None)
@@ -283,6 +286,9 @@ def _result(
     interrupted: str,
 ) -> Diagnosis:
     best = decision.best
+    told = [best] if best is not None else decision.tied_models if decision.none + decision.base < HALF else []
+    if told and (noise := beside(search, told[0])) is not search.noise:
+        search.take(noise, told)  # what is told of them rests on the noise beside them
     shown = best or (decision.tied_models[0] if decision.tied_models else None)
     if shown is not None:
         search.examine(shown)
@@ -296,13 +302,17 @@ def _result(
         improved: Simulator = simulator
     else:
         improved = _improved(simulator, best)
-    remaining = 0.0 if decision.verdict == "consistent" else 1.0
+    remaining, depends = 0.0 if decision.verdict == "consistent" else 1.0, ""
     if best is not None:
         white = best.structure is not None and best.structure.p_value >= PLAINLY_WHITE and not search.exact
         remaining = 0.0 if white else 1.0 - explain.removed(search, best)
         larger = next((m for m in decision.tied_models if len(m.names) > len(best.names)), None)
         if larger is not None:  # something beside it is likely
             remaining = max(remaining, explain.surpassed(search, best, larger))
+            if decision.probability[id(larger)] > decision.probability[id(best)]:
+                more = [name for name in larger.names if name not in best.names]
+                other = explain.estimates(larger.found, larger.found.free)
+                depends = explain.depends(final.estimates, other, more)
     return Diagnosis(
         verdict=decision.verdict,
         terms=_in_order(search, best) if best else [],
@@ -348,6 +358,7 @@ def _result(
             "seed": seed,
             "withdrawn": decision.withdrawn,
             "doubt": decision.doubt,
+            "depends": depends,
             "nearly": decision.nearly,
             "lost": lost,
             "set_aside": suspect,
@@ -362,8 +373,6 @@ def _result(
 
 def _told_noise(search: Search, decision: Decision, alpha: float) -> Noise:
     """The noise that the verdict rests on."""
-    if decision.best is not None:
-        return beside(search, decision.best)
     if decision.verdict == "consistent" and search.noise.open and search.p_detect < alpha:
         return settled(search.base, search.noise, search.tangents)[0]
     return search.noise

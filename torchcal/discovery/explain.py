@@ -18,6 +18,7 @@ from torchcal.discovery.structure import Structure
 from torchcal.display import with_unit
 
 __all__ = [
+    "depends",
     "estimates",
     "fit_record",
     "identifiability",
@@ -45,6 +46,8 @@ STARTS, AGAIN, RIVAL, ELSEWHERE = 4, 60, 4.0, 4.0
 ONE_LAW = 0.9
 #: A base parameter that moves by this many sd when a term is added was bent by it.
 BENT = 3.0
+#: A parameter depends on what acts beside it when that moves it by more than this many of its sd.
+MOVED = 2.0
 #: Share of the noise sd that was given below which a white residual is told; its data, and the correlation of
 #: neighbours up to which it is white.
 SMALLER, ENOUGH, WHITE = 0.5, 20, 0.4
@@ -134,6 +137,17 @@ def surpassed(search: Search, model: Model, larger: Model) -> float:
     """Share of the squared misfit that a larger model removes and this one leaves."""
     whole = search.base.chi2 - larger.found.chi2
     return min(max((model.found.chi2 - larger.found.chi2) / whole, 0.0), 1.0) if whole > 0 else 0.0
+
+
+def depends(known: Sequence[Estimate], other: Sequence[Estimate], beside: Sequence[str]) -> str:
+    """Which of the estimates moves most with terms beside those that are named, in a sentence; empty where none does.
+    """
+    there = {e.name: e for e in other}
+    away = {e.name: abs(there[e.name].value - e.value) / max(e.sd, 1e-300) for e in known if e.name in there}
+    name = max(away, key=lambda one: away[one], default=None)
+    if name is None or away[name] <= MOVED:
+        return ""
+    return f"{name} depends on what acts beside it: {there[name].amount} with {' and '.join(beside)}."
 
 
 def symptoms(search: Search, best: Model | None) -> list[str]:

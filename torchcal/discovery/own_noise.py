@@ -25,6 +25,7 @@ __all__ = [
     "explains",
     "fits_by_chance",
     "isolated",
+    "known_density",
     "likeliest_alone",
     "odds_alone",
     "other_growth",
@@ -255,6 +256,12 @@ def _density(search: "Search", found: Fitted) -> float:
     that they are told by, is not the same for other data.
     """
     w = alone(found, search.noise, search.tangents)[0].whitening(found.problem)
+    return _of_outliers(search) + log_normal(w, w.vector(found.residual))
+
+
+def known_density(search: "Search", found: Fitted) -> float:
+    """The same of a model with the noise of the search."""
+    w = search.noise.whitening(found.problem)
     return _of_outliers(search) + log_normal(w, w.vector(found.residual))
 
 

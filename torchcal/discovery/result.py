@@ -66,9 +66,10 @@ class Diagnosis:
         confidence: Asked for.
         library: Names of all candidates.
         settings: What else is behind the verdict: ``withdrawn`` and ``doubt`` (why there is no name, in words, or
-            empty), ``nearly`` (whether the name rests on the share of the misfit removed), ``set_aside`` (terms that
-            may explain the outliers), ``interrupted`` (what had not been refitted then, in words, or empty), ``region``
-            of a named local term; and ``seed`` and ``solver``.
+            empty), ``depends`` (which estimate rests on what acts beside it, in words, or empty), ``nearly`` (whether
+            the name rests on the share of the misfit removed), ``set_aside`` (terms that may explain the outliers),
+            ``interrupted`` (what had not been refitted then, in words, or empty), ``region`` of a named local term;
+            and ``seed`` and ``solver``.
         seconds: How long it took.
         drivers: Conditions, or time, states and inputs of the calibrated base, at every condition of the recording.
     """

@@ -6,10 +6,14 @@ import math
 import torch
 
 from torchcal.discovery.base import MOST
+from torchcal.discovery.fitting import refit
+from torchcal.discovery.likeliest import log_normal
+from torchcal.discovery.model import Model
 from torchcal.discovery.own_noise import (
     EXPLAINED,
     fits_by_chance,
     isolated,
+    known_density,
     odds_alone,
     other_growth,
     outdone,
@@ -17,11 +21,13 @@ from torchcal.discovery.own_noise import (
     outliers_alone,
 )
 from torchcal.discovery.problem import Problem
+from torchcal.discovery.residual import Residual
 from torchcal.discovery.search import Search
+from torchcal.discovery.several import refit_several, scores_beside
 from torchcal.discovery.verdict import WHITE, base_alone
 from torchcal.discovery.windows import refit_local
 
-__all__ = ["settle", "with_all"]
+__all__ = ["settle", "with_all", "with_explained"]
 
 #: How often everything is fitted again because other data turned out to be outliers.
 ROUNDS = 3
@@ -104,6 +110,49 @@ def with_all(
         return None, ()
     odds, spare = outdone(search, every, detected)
     return (every if odds > EXPLAINED and spare > 0 else None), ()
+
+
+def with_explained(search: Search, observed: Problem, confidence: float) -> Search | None:
+    """The search of what was set aside too, where several terms together explain it better than outliers do.
+
+    What sticks out of the best single term may be what a second one is seen by. None where nothing does.
+    """
+    best = search.physical_leader
+    if search.exact or search.stop.is_set() or best is None or search.problem.n == observed.n:
+        return None
+    if not _may_explain(search, best, observed):
+        return None
+    kept = observed
+    for _ in range(2):
+        every = dataclasses.replace(search, problem=kept, clean=True)
+        every.calibrate_base()
+        if not _refit(every, confidence) or search.stop.is_set():
+            return None
+        refit_several(every)
+        sticking = outliers(every, observed.keep)
+        left = observed.keep if sticking is None else observed.keep & ~sticking
+        if torch.equal(left, every.problem.keep):
+            break
+        kept = observed.keeping(left)
+    other = every.physical_leader
+    if search.stop.is_set() or other is None:
+        return None
+    odds, _ = outdone(search, every, True)
+    spare = every.problem.n - search.problem.n - max(len(other.candidate.own) - len(best.candidate.own), 0)
+    return every if odds > EXPLAINED and spare > 0 else None
+
+
+def _may_explain(search: Search, best: Model, observed: Problem) -> bool:
+    """Whether a model explains what is set aside, or with one more term would to first order, as well as outliers."""
+    problem = dataclasses.replace(best.found.problem, keep=observed.keep)
+    found = refit(best.found, search.noise.whitening(problem), problem)
+    short = known_density(search, best.found) - log_normal(found.whitening, found.whitening.vector(found.residual))
+    if short < 0:
+        return True
+    if len(best.numbers) >= search.max_terms:
+        return False
+    scores = scores_beside(search, found, Residual(found, search.noise, draws=10), best.numbers)
+    return max((0.5 * score**2 for score, _ in scores), default=0.0) > short
 
 
 def _refit(search: Search, confidence: float) -> bool:

@@ -380,17 +380,20 @@ class Search:
         change = float((fresh.sd / old.sd).log().abs().max()) + float((fresh.correlation - old.correlation).abs().max())
         if change < 0.05:
             return
-        self.noise = fresh
-        self.base = refit(self.base, fresh.whitening(self.base.problem))
+        self.take(fresh, hopeful)
         for model in (*self.models, *self.merged.values()):
-            if any(model is one for one in hopeful):
-                model.found = refit(model.found, fresh.whitening(model.found.problem))
-            else:
-                model.found = weighed(model.found, fresh.whitening(model.found.problem))
             self._judge(model)
+        self.local, _ = windows(self.residual, self.candidates, self.screening)
+
+    def take(self, noise: Noise, again: Sequence[Model]) -> None:
+        """Go on with another noise: the base and some models are fitted again, the others weighed."""
+        self.noise = noise
+        self.base = refit(self.base, noise.whitening(self.base.problem))
+        for model in (*self.models, *self.merged.values()):
+            whitening = noise.whitening(model.found.problem)
+            model.found = (refit if any(model is one for one in again) else weighed)(model.found, whitening)
         self.residual = Residual(self.base, self.noise, seed=self.seed)
         self.screening = screen(self.residual, self.candidates, self.screening)
-        self.local, _ = windows(self.residual, self.candidates, self.screening)
         self.structure = analyse(self.residual, every=True)
 
     def with_unknown(self, found: Fitted) -> tuple[Noise, float]:

@@ -11,6 +11,7 @@ from torch import Tensor
 from torchcal.discovery.beginnings import is_far, make_up
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare, replaces
 from torchcal.discovery.explain import removed
+from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.residual import Residual
 from torchcal.discovery.screen import screen
@@ -18,7 +19,7 @@ from torchcal.discovery.search import BETTER, Search
 from torchcal.discovery.verdict import PLAINLY_WHITE
 from torchcal.errors import DomainError, SimulatorError
 
-__all__ = ["refit_several"]
+__all__ = ["refit_several", "scores_beside"]
 
 #: Pairs that are refitted at most; where one term leaves noise alone.
 MOST, FEWER = 20, 10
@@ -215,20 +216,28 @@ def _linear_row(search: Search, candidate: Candidate, columns: tuple[int, int]) 
 def _next_terms(search: Search, model: Model) -> list[int]:
     """Other candidates by their score at a model's fit."""
     residual = model.residual or Residual(model.found, search.noise, seed=search.seed, draws=10)
-    scale = drivers_scale(model.found.problem, model.found)
+    scores = scores_beside(search, model.found, residual, model.numbers)
+    return [j for _, j in sorted(scores, key=lambda one: (-one[0], one[1]))]
+
+
+def scores_beside(
+    search: Search, found: Fitted, residual: Residual, numbers: Sequence[int]
+) -> list[tuple[float, int]]:
+    """Scores and numbers of the candidates that are not in a model, at a fit of it."""
+    scale = drivers_scale(found.problem, found)
     scores = []
     for j, other in enumerate(search.candidates):
-        if j in model.numbers or j in search.gone:
+        if j in numbers or j in search.gone:
             continue
-        search.tick(f"screen {other.name} after {', '.join(model.names)}")
+        search.tick(f"screen {other.name} after {', '.join(search.candidates[i].name for i in numbers)}")
         try:
-            prepared = prepare(model.found.problem, model.found, other.terms, search.fixed, scale)
+            prepared = prepare(found.problem, found, other.terms, search.fixed, scale)
         except (SimulatorError, DomainError):
             continue
-        found = screen(residual, [prepared])
-        if found.best[0] >= 0:
-            scores.append((-found.score(0), j))
-    return [j for _, j in sorted(scores)]
+        seen = screen(residual, [prepared])
+        if seen.best[0] >= 0:
+            scores.append((seen.score(0), j))
+    return scores
 
 
 def _refit_sets(

@@ -31,8 +31,6 @@ BESIDE = 0.005
 NEARLY_ALL = 0.999
 #: Probability by noise alone below which what is taken for noise is told to be no common one.
 SELDOM = 0.05
-#: A parameter depends on what acts beside it when that moves it by more than this many of its sd.
-MOVED = 2.0
 
 
 def _probability(p: float) -> str:
@@ -275,22 +273,7 @@ def _larger(d: Any) -> list[str]:
         listed.append("others")
     together = sum(row.probability for row in more)
     parts = [f"Something else acts beside it with a probability of {together:.2f}: {', or '.join(listed)}."]
-    return parts + _depends(d, more) + _experiment(d)
-
-
-def _depends(d: Any, more: Sequence[Any]) -> list[str]:
-    """Which estimate is another one with what is likelier to act beside the named terms."""
-    top = _accepted(d)
-    for row in sorted(more, key=lambda row: -row.probability):
-        if row.probability <= top.probability:
-            break
-        other = {e.name: e for e in row.estimates}
-        moved = [e for e in top.estimates if e.name in other and abs(other[e.name].value - e.value) > MOVED * e.sd]
-        if moved:
-            name = max(moved, key=lambda e: abs(other[e.name].value - e.value) / max(e.sd, 1e-300)).name
-            beside = _and([term for term in row.terms if term not in d.terms])
-            return [f"{name} depends on what acts beside it: {other[name].amount} with {beside}."]
-    return []
+    return parts + [text for text in [d.settings.get("depends")] if text] + _experiment(d)
 
 
 def _experiment(d: Any) -> list[str]:
