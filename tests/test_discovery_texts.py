@@ -4,6 +4,7 @@ import dataclasses
 import math
 import sys
 from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -65,7 +66,8 @@ def located(term, *, inside=(), named=True):
     model = SimpleNamespace(
         window=None, candidate=SimpleNamespace(terms=[term]), structure=SimpleNamespace(channels=list(inside))
     )
-    return [(place.kind, place.target) for place in where.locate(search, model, named=named)]
+    with mock.patch.object(where, "_reads", return_value=set()):
+        return [(place.kind, place.target) for place in where.locate(search, model, named=named)]
 
 
 def rate(t, s, p, u):
@@ -127,6 +129,69 @@ def test_a_parameter_that_was_dormant_is_where_its_contribution_is_large(monkeyp
     # What no constant and slope can do: z⁴ without its mean is large at the end, and small near 0.67.
     assert first.spans[0] == (-1.0, pytest.approx(-0.85, abs=0.08))
     assert not any(low < -0.67 < high for low, high in first.spans)
+
+
+def test_a_name_acts_by_what_it_is_a_function_of(monkeypatch):
+    g = torch.Generator().manual_seed(3)
+    first, second = (torch.rand(60, generator=g, dtype=F64) for _ in range(2))
+    x = {"Re": 500 + 9500 * first, "Pr": 1 + 9 * second}
+    base = tc.Simulator(
+        lambda x, p: p["C"] * x["Re"] ** p["m"] * x["Pr"] ** 0.33,
+        [tc.Parameter("C", low=0.01, high=3.0, initial=0.3), tc.Parameter("m", low=0.2, high=1.2, initial=0.6)],
+    )
+    onset = tc.Term(
+        "onset", shifts={"m": lambda x, p: p["a"] * torch.sigmoid((x["Re"] - p["Rc"]) / 500)},
+        parameters=[tc.Parameter("a"), tc.Parameter("Rc", low=1e3, high=9e3)],
+    )  # fmt: skip
+    y = 0.25 * x["Re"] ** (0.6 + 0.02 * torch.sigmoid((x["Re"] - 4000) / 500)) * x["Pr"] ** 0.33
+    y = y + 0.01 * y.std() * torch.randn(60, generator=g, dtype=F64)
+    search, best = captured(monkeypatch, base, tc.Recording(x=x, y=y), [onset])
+    assert where._reads(best) == {"Re"}
+    mine = [place for place in search.structure.places if place.channel.target == "m"]
+    along = {place.driver: place for place in mine}
+    # However likely the other condition is: the term is no function of it.
+    search.structure.places[:] = [dataclasses.replace(along["Pr"], evidence=900.0), *search.structure.places]
+    assert where.locate(search, best, named=True)[0].driver == "Re"
+    assert where.locate(search, best)[0].driver == "Pr"
+
+
+def test_what_a_term_in_time_is_a_function_of():
+    drivers = {name: torch.ones(3, dtype=F64) for name in ("t", "z", "v", "F")}
+    problem = SimpleNamespace(
+        in_time=True, drivers_at_data=lambda values, warm: dict(drivers), recording=SimpleNamespace(x={"time": T})
+    )
+    found = SimpleNamespace(problem=problem, values=T, warm=None, by_name={"k": 1.0, "one.q": 2.0}, y=T)
+    for term, read in (
+        (tc.Term("one", rates={"v": lambda t, s, p, u: p["q"] * s["v"] * u["F"]}, **Q), {"v", "F"}),
+        (tc.Term("one", shifts={"k": lambda t, s, p, u: p["q"] * t}, **Q), set()),
+        (tc.Term("one", outputs={"y": lambda t, s, p, u, y: y + p["q"] * s["z"]}, **Q), {"z"}),
+        (tc.Term("one", rates={"v": lambda t, s, p, u: p["of each run"] * s["v"]}, **Q), set()),
+    ):
+        model = SimpleNamespace(found=found, candidate=SimpleNamespace(terms=[term]))
+        assert where._reads(model) == read
+
+
+def test_slivers_are_no_spans():
+    x = torch.linspace(0, 1, 200, dtype=F64)
+    change = ((x > 0.2) & (x < 0.6)).double()
+    change[60] = change[61] = 0.0  # a gap of two points in a hundred each
+    change[150] = 1.0
+    assert where._ranges(x, change) == ((float(x[40]), float(x[119])),)
+    alone = torch.zeros(200, dtype=F64)
+    alone[150] = 1.0
+    assert where._ranges(x, alone) == ((float(x[150]), float(x[150])),)
+
+
+def test_the_missing_rate_is_told_where_the_change_without_a_name_acts():
+    places = [Place(channel(*key), driver, 9.0, 0.5, T, T, 1.0)
+              for key in (("equation", "R"), ("equation", "M")) for driver in ("t", "R")]  # fmt: skip
+    nameless = tc.Term("a constant", rates={"M": rate}, **Q)
+    unnamed = SimpleNamespace(
+        window=SimpleNamespace(driver="R"), candidate=SimpleNamespace(terms=[nameless]), structure=None
+    )
+    found = where._first_unnamed(SimpleNamespace(unnamed=unnamed), places)
+    assert [(p.channel.target, p.driver) for p in found] == [("M", "R"), ("R", "t"), ("R", "R"), ("M", "t")]
+    assert where._first_unnamed(SimpleNamespace(unnamed=None), places) == places
 
 
 @pytest.mark.parametrize(
@@ -307,6 +372,21 @@ def test_a_bound_of_the_base_may_be_why_a_size_is_open(monkeypatch, stuck):
     told = doubts.left_open(search, model)
     assert told.startswith("The data leave the size of what it adds open")
     assert ("k ran to a bound in the base" in told) is bool(stuck)
+
+
+@pytest.mark.parametrize(
+    ("count", "away", "is_open"), [(1, 1.0, False), (1, 0.05, True), (2, 1.0, True), (2, 3.0, False)]
+)
+def test_what_one_of_several_adds_must_be_clearly_there(monkeypatch, count, away, is_open):
+    problem = SimpleNamespace(parameters=[tc.Parameter("drag.a"), tc.Parameter("bias.b")][:count])
+    terms = [SimpleNamespace(brings=[q.name]) for q in problem.parameters]
+    candidate = SimpleNamespace(terms=terms, own=[*range(count)], amplitudes=[*range(count)])
+    found = SimpleNamespace(problem=problem, free=[*range(count)])
+    model = SimpleNamespace(candidate=candidate, window=None, found=found)
+    search = SimpleNamespace(exact=False, base=SimpleNamespace(stuck=[]), problem=None)
+    monkeypatch.setattr(doubts, "_distance", lambda *given: away)
+    monkeypatch.setattr(doubts, "distinct", lambda problem: 100)
+    assert doubts.left_open(search, model).startswith("The data leave the size") is is_open
 
 
 def test_an_estimate_on_its_bound_says_so():

@@ -27,9 +27,9 @@ EVEN, MANY = 0.55, 30
 ALONG = 3.3
 #: Distance of a term's amplitudes from neutral, in their joint sd, up to which the data leave them open.
 OPEN = 0.1
-#: The same of a term that acts in a window, where most terms can do what a few data want, or of data without noise,
-#: where nothing else weighs it.
-OPEN_IN_WINDOW = 2.0
+#: The same of a term that acts in a window, where most terms can do what a few data want, of one of several, which may
+#: make up for each other, or of data without noise, where nothing else weighs it.
+CLEARLY_OPEN = 2.0
 #: Distinct values of its driver at which a window must be open, and at which closed: its height, end and slope can be
 #: drawn through fewer, whatever they are. And the share of a term that may be missing, or left.
 LEVELS, NEARLY = 3, 0.2
@@ -58,7 +58,8 @@ def left_open(search: Search, model: Model) -> str:
     for term in model.candidate.terms:
         shapes = [i for i in model.candidate.own if names[i] in term.brings and not is_window(names[i])]
         places = [i for i in model.candidate.amplitudes if names[i] in term.brings]
-        least = OPEN if model.window is None and not search.exact else OPEN_IN_WINDOW
+        sure = model.window is None and len(model.candidate.terms) == 1 and not search.exact
+        least = OPEN if sure else CLEARLY_OPEN
         # Without noise the misfit is what an amplitude is uncertain by.
         if places and _distance(model, places, shapes, misfit_size(model.found) if search.exact else 1.0) <= least:
             bound = search.base.stuck

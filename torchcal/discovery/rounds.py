@@ -135,11 +135,11 @@ def with_explained(search: Search, observed: Problem, confidence: float) -> Sear
             break
         kept = observed.keeping(left)
     other = every.physical_leader
-    if search.stop.is_set() or other is None:
+    if search.stop.is_set() or other is None or len(other.numbers) < 2:  # single terms were judged before
         return None
-    odds, _ = outdone(search, every, True)
-    spare = every.problem.n - search.problem.n - max(len(other.candidate.own) - len(best.candidate.own), 0)
-    return every if odds > EXPLAINED and spare > 0 else None
+    odds, spare = outdone(search, every, True)
+    seen = set(other.names) == set(best.names)  # by the other data too
+    return every if odds > EXPLAINED and (spare > 0 or seen) else None
 
 
 def _may_explain(search: Search, best: Model, observed: Problem) -> bool:

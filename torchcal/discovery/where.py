@@ -12,6 +12,8 @@ from torchcal.discovery.places import Place
 from torchcal.discovery.problem import is_value_of
 from torchcal.discovery.records import Location, MissingRate, NeededShift, Table
 from torchcal.discovery.search import Search
+from torchcal.errors import SimulatorError
+from torchcal.simulators.layout import Values
 from torchcal.terms import Term
 
 __all__ = ["locate", "missing_rate", "needed_shifts"]
@@ -22,6 +24,8 @@ OUTPUT_SHARE, SEVERAL_SHARE = 0.8, 0.9
 SURELY = 2.0
 #: A span begins where the estimated change exceeds this share of its largest magnitude.
 SPAN_LEVEL = 0.3
+#: Share of the points up to which a gap between spans is none, nor a span beside wider ones.
+SLIVER = 0.02
 #: Log evidence from which on a place is listed, and how many are.
 LEAST_EVIDENCE, LISTED = 2.0, 8
 
@@ -44,19 +48,15 @@ def _ranges(values: Tensor, change: Tensor) -> tuple[tuple[float, float], ...]:
     order = values.argsort(stable=True)
     along, size = values[order], change[order].abs()
     high = size >= SPAN_LEVEL * float(size.max())
-    found: list[tuple[float, float]] = []
-    start: float | None = None
-    last = 0.0
-    for value, inside in zip(along.tolist(), high.tolist(), strict=True):
-        if inside and start is None:
-            start = value
-        if not inside and start is not None:
-            found.append((start, last))
-            start = None
-        last = value
-    if start is not None:
-        found.append((start, last))
-    return tuple(found[:6])
+    least = SLIVER * len(along)
+    found: list[list[int]] = []
+    for k in high.nonzero()[:, 0].tolist():
+        if found and k - found[-1][1] - 1 <= least:
+            found[-1][1] = k
+        else:
+            found.append([k, k])
+    wide = [span for span in found if span[1] - span[0] + 1 > least]
+    return tuple((float(along[low]), float(along[high])) for low, high in (wide or found)[:6])
 
 
 def locate(search: Search, best: Model | None, *, named: bool = False) -> Table[Location]:
@@ -86,8 +86,8 @@ def locate(search: Search, best: Model | None, *, named: bool = False) -> Table[
         if place.evidence >= LEAST_EVIDENCE
     ]
     if named and best is not None and best.window is None:
-        own = _own_places(search, best)
-        places.sort(key=lambda place: (place.channel.kind, place.channel.target) not in own)
+        own, reads = _own_places(search, best), _reads(best)
+        places.sort(key=lambda place: _rank(place, own, reads))
         if not places or (places[0].channel.kind, places[0].channel.target) not in own:
             rows.append(_contributed(search, best, [place.driver for place in places]))
     seen: set[tuple[str, str]] = set()
@@ -121,6 +121,44 @@ def _own_places(search: Search, model: Model) -> set[tuple[str, str]]:
                 acted = {("equation", state) for c in inside if is_value_of(c.target, name) for state in c.rates}
                 own |= mine or acted
     return own
+
+
+def _rank(place: Place, own: set[tuple[str, str]], reads: set[str]) -> int:
+    """Where a name acts and by what it does so comes first, then where it acts."""
+    return 2 if (place.channel.kind, place.channel.target) not in own else int(place.driver not in reads)
+
+
+class _Noting(dict[str, Tensor]):
+    """Drivers by name; those that were looked up are noted."""
+
+    def __init__(self, drivers: dict[str, Tensor]) -> None:
+        super().__init__(drivers)
+        self.noted: set[str] = set()
+
+    def __getitem__(self, name: str) -> Tensor:
+        self.noted.add(name)
+        return super().__getitem__(name)
+
+
+def _reads(model: Model) -> set[str]:
+    """The drivers that what a model adds is a function of, as far as its functions can be asked."""
+    found = model.found
+    problem = found.problem
+    if not isinstance(problem.recording.x, dict):
+        return set()
+    drivers = _Noting(problem.drivers_at_data(found.values[None], found.warm))
+    p = {name: found.values.new_tensor(value) for name, value in found.by_name.items()}
+    for term in model.candidate.terms:
+        try:
+            own = term.own(Values(p, 0.0, 0.0))
+            given = (dict(drivers)["t"], drivers, own, drivers) if problem.in_time else (drivers, own)
+            for function in (*term.rates.values(), *term.shifts.values()):
+                term.call(function, *given)
+            for function in term.outputs.values():
+                term.call(function, *given, found.y)
+        except (KeyError, SimulatorError):  # it asks for what differs from run to run
+            continue
+    return drivers.noted
 
 
 def _contributed(search: Search, model: Model, drivers: Sequence[str]) -> Location:
@@ -216,16 +254,25 @@ def _possible(search: Search, place: Place) -> bool:
     return not bool(((moved + open_by < low) | (moved - open_by > high)).any())
 
 
+def _first_unnamed(search: Search, places: list[Place]) -> list[Place]:
+    """Places with that of the likeliest change that has no name first, where there is one."""
+    unnamed = search.unnamed
+    if unnamed is None or unnamed.window is None:
+        return places
+    there = (*_acts_on(unnamed), unnamed.window.driver)
+    return sorted(places, key=lambda place: (place.channel.kind, place.channel.target, place.driver) != there)
+
+
 def missing_rate(search: Search) -> MissingRate | None:
     """The best unknown change, smooth or a wave, of one equation, output or parameter.
 
     A parameter that changes in time and acts in one equation is a missing rate of that equation, in one run: what it
     does to the rate depends on the states too, which differ between runs at the same time.
     """
-    for place in _by_plausibility(search):
+    for place in _first_unnamed(search, _by_plausibility(search)):
         channel = place.channel
         if place.evidence <= 0:
-            return None
+            continue
         kind, target, unit, size = channel.kind, channel.target, channel.unit, torch.ones_like(place.profile)
         if kind == "parameter" and search.problem.in_time:
             if not channel.rates or not _possible(search, place):
