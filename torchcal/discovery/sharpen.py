@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchcal.discovery.fitting import Fitted, fit
 from torchcal.errors import DomainError
-from torchcal.simulators import Trajectories, focused, may_change, settled_implicitly, step_errors
+from torchcal.simulators import Trajectories, focused, may_change, outgrown, settled_implicitly, step_errors
 
 __all__ = ["SOLVER_SHARE", "accurate", "sharpen"]
 
@@ -29,6 +29,8 @@ def accurate(found: Fitted, sd: Tensor) -> bool:
     if not isinstance(simulator, Trajectories) or not may_change(simulator):
         return True
     errors = step_errors(simulator, found.values, simulator.solve(found.values[None], found.warm))
+    if outgrown(simulator, found.values[None]):
+        return False
     least = float((sd / found.problem.recording.spread[found.problem.index]).min())
     return float(errors.sum()) <= SOLVER_SHARE * least
 
@@ -57,10 +59,11 @@ def sharpen(
         finer = simulator.refined(2)
         y = finer.outputs_of(found.values[None], finer.solve(found.values[None]))[0, found.problem.index]
         error, most = (y - found.y).abs(), allowed(found)
-        if bool((error <= most).all()):
+        branch = outgrown(simulator, found.values[None])  # of the solution may be another one
+        if bool((error <= most).all()) and not branch:
             return found, 0.0
         before, share = share, float((error / most).nan_to_num(nan=math.inf).max())
-        slow = number > 0 and not share < before / CONVERGING
+        slow = branch or (number > 0 and not share < before / CONVERGING)
         if slow and (again := _implicit(found, most, ROUNDS if patient else 1)) is not None:
             return sharpen(again, allowed, rounds=rounds, patient=patient)
         if number == rounds or (slow and not patient):

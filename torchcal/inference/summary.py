@@ -233,9 +233,10 @@ def settings_of(problem: Problem, fit: LeastSquares, embedding: str, seed: int, 
     propagate = problem.propagate
     choice = propagate.rule_choice
     simulator = propagate.simulator
-    in_time = {}
+    in_time: dict[str, Any] = {}
     if isinstance(simulator, Trajectories):
-        in_time = {"subdivide": simulator.subdivide, "implicit": simulator.implicit}
+        denser = None if simulator.denser is None else [factor.tolist() for factor in simulator.denser]
+        in_time = {"subdivide": simulator.subdivide, "denser": denser, "implicit": simulator.implicit}
     return {
         **in_time,
         "embedding": embedding,

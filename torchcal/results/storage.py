@@ -405,9 +405,7 @@ def _propagation(
         raise RecordingError("Expected a static simulator for a static recording. Got one in time (give the other).")
     simulator = simulator.bind(recording)
     if isinstance(simulator, Trajectories):
-        subdivide = max(settings.get("subdivide", 1), simulator.subdivide)
-        implicit = settings.get("implicit", simulator.implicit)
-        simulator = Trajectories(simulator.ode, recording, subdivide=subdivide, implicit=implicit)
+        simulator = _with_steps(simulator, settings)
     propagate = NISP(
         simulator,
         embedding,
@@ -425,6 +423,17 @@ def _propagation(
             f"{list(propagate.pattern.names)}."
         )
     return propagate
+
+
+def _with_steps(simulator: Trajectories, settings: Mapping[str, Any]) -> Trajectories:
+    """With the time steps that were stored; where the simulator says now how stiff it is, with its own."""
+    implicit = settings.get("implicit", simulator.implicit)
+    if simulator.ode.stiff not in (None, implicit):
+        return simulator
+    subdivide = max(settings.get("subdivide", 1), simulator.subdivide)
+    denser = settings.get("denser")
+    known = None if denser is None else tuple(torch.tensor(factor) for factor in denser)
+    return Trajectories(simulator.ode, simulator.recording, subdivide=subdivide, denser=known, implicit=implicit)
 
 
 def scaling_of(settings: Mapping[str, Any]) -> Scaling:

@@ -12,6 +12,7 @@ from torchcal.simulators.static import Conditions, Linearisation, Simulator, che
 from torchcal.simulators.stepping import (
     focused,
     may_change,
+    outgrown,
     settled,
     settled_implicitly,
     step_errors,
@@ -39,6 +40,7 @@ __all__ = [
     "focused",
     "free_parameters",
     "may_change",
+    "outgrown",
     "settled",
     "settled_implicitly",
     "step_errors",

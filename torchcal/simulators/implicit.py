@@ -2,12 +2,13 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from torchcal.simulators.layout import Values
-from torchcal.simulators.steps import COPIED, Steps
+from torchcal.simulators.steps import COPIED, SPAN, Steps
 
 __all__ = ["ImplicitSteps"]
 
@@ -24,8 +25,9 @@ STAGES = len(NODES)
 #: Newton passes for the stages; corrections, relative to the state, after which the next would be rounding, and up to
 #: which a state is one where rounding keeps them from becoming smaller.
 PASSES, SMALL, ROUNDED = 12, 1e-7, 1e-5
-#: Share of a state's largest value below which it counts as that large.
-SMALLEST = 1e-9
+#: Share of a state's largest value below which it counts as that large; and of the terms that a gap is the difference
+#: of up to which it is rounding, whatever the states at rest are that it would correct.
+SMALLEST, ROUNDING = 1e-9, 1e-13
 
 
 class ImplicitSteps(Steps):
@@ -41,6 +43,22 @@ class ImplicitSteps(Steps):
     def step(self, s: Tensor, t: Tensor, h: Tensor, p: Values, u: dict[str, Tensor]) -> Tensor:
         """As `Steps.step`."""
         return self._stages(s, t, h, p, u)[:, -1]
+
+    def difference(self, values: Tensor) -> float:
+        """As `Steps.difference`, of the rates: equations of stages may have several solutions."""
+        part = replace(self, grid=self.grid.part(0, SPAN))
+        states = part._one_by_one(values, self.layout.start(values))[:, :, :-1]
+        grid, p = part.grid, self.layout.by_name(values)
+        once = []
+        for k in range(grid.num_steps):
+            u = {name: table[0, :, k] for name, table in grid.u.items()}
+            once.append(self.rates(grid.t[:, k], states[:, :, k], p, u))
+        t, _, u = grid.flat
+        spread = self.layout.by_name(values, grid.step_run)
+        rates = self.rates(t, _points(states), spread, {name: table[0] for name, table in u.items()})
+        gap = (torch.stack(once, dim=2) - rates.reshape(states.shape)).abs()
+        size = rates.abs().amax(dim=(0, 1)).clamp_min(1e-300)
+        return float((gap / size).max())
 
     def ends(self, values: Tensor, states: Tensor) -> Tensor:
         """As `Steps.ends`."""
@@ -97,40 +115,37 @@ class ImplicitSteps(Steps):
         """States ``(H, 3, M, S)`` at the stages of steps from ``s`` (H, M, S), begun towards guessed ends."""
         c = torch.tensor(NODES, dtype=s.dtype)[:, None, None]
         a = torch.tensor(WEIGHTS, dtype=s.dtype)
-        base = s.unsqueeze(1)
-        moved = torch.zeros_like(base).expand(-1, STAGES, -1, -1) if guess is None else c * (guess - s).unsqueeze(1)
-        times, inputs = _times(t, h), _inputs(u)
         size = s.shape[-1]
-        copies = size if moved.numel() <= COPIED else 1
-        tiled = _tiled(p, copies)
-        change, before = moved, math.inf
+        stages = s.unsqueeze(1).repeat(1, STAGES, 1, 1)
+        if guess is not None:
+            stages += c * (guess - s).unsqueeze(1)
+        floor = SMALLEST * s.abs().nan_to_num(nan=0.0, posinf=0.0).amax(1, keepdim=True)
+        share = s.new_full(s.shape[:2], math.inf)
+        at = torch.arange(s.shape[1])  # the points that are not settled, in one row at least
         for _ in range(PASSES):
-            flat = (base + moved).flatten(1, 2)
+            now, step = stages[:, :, at], h[at]
+            copies = size if now.numel() <= COPIED else 1
+            times = _times(t[at], step)
             with torch.enable_grad():
-                leaf = flat.detach().repeat(copies, 1, 1).requires_grad_(True)
-                rates = self.rates(times, leaf, tiled, inputs)
+                leaf = now.flatten(1, 2).repeat(copies, 1, 1).requires_grad_(True)
+                rates = self.rates(times, leaf, _tiled(p, at, copies), _inputs({n: v[:, at] for n, v in u.items()}))
                 slopes, _ = self.layout.derivatives(rates, leaf, {}, times, (), copied=copies > 1)
-            f = rates[: len(s)].detach().unflatten(1, (STAGES, -1))
-            gap = h[:, None] * torch.einsum("ij,hjms->hims", a, f) - moved
-            matrix = _matrix(slopes.unflatten(1, (STAGES, -1)), h)
+            f, slopes = rates[: len(s)].detach().unflatten(1, (STAGES, -1)), slopes.unflatten(1, (STAGES, -1))
+            gap = step[:, None] * torch.einsum("ij,hjms->hims", a, f) - (now - s[:, None, at])
             right = gap.transpose(1, 2).flatten(2, 3).unsqueeze(-1)
-            change = torch.linalg.solve_ex(matrix, right)[0].squeeze(-1).unflatten(2, (STAGES, size)).transpose(1, 2)
-            moved = moved + change
-            share = _share(change, base + moved)
-            worst = float(share.nan_to_num(nan=0.0).max())
-            if worst < SMALL or (worst < ROUNDED and worst > 0.5 * before):
+            change = torch.linalg.solve_ex(_matrix(slopes, step), right)[0]
+            change = change.squeeze(-1).unflatten(2, (STAGES, size)).transpose(1, 2)
+            stages[:, :, at] = now + change
+            near = stages[:, :, at].abs()
+            found = (change.abs().amax(1) / torch.maximum(near.amax(1), floor).clamp_min(1e-300)).amax(-1)
+            terms = near + step[:, None] * torch.einsum("himab,himb->hima", slopes.abs(), near)
+            found[(gap.abs() <= ROUNDING * terms).all(-1).all(1)] = 0.0
+            settled = (found < SMALL) | ((found < ROUNDED) & (found > 0.5 * share[:, at]))
+            share[:, at] = found
+            at = at[(~settled & found.isfinite()).any(0)]
+            if not len(at):
                 break
-            before = worst
-        bad = ~(_share(change, base + moved) < ROUNDED)
-        return (base + moved).masked_fill(bad[:, None, :, None], math.nan)
-
-
-def _share(change: Tensor, states: Tensor) -> Tensor:
-    """Largest correction of the stages ``(H, 3, M, S)`` of each step, relative to its states, ``(H, M)``."""
-    near = states.abs().amax(1)
-    largest = near.nan_to_num(nan=0.0, posinf=0.0).amax(1, keepdim=True)
-    floor = (SMALLEST * largest).clamp_min(1e-300)
-    return (change.abs().amax(1) / torch.maximum(near, floor)).amax(-1)
+        return stages.masked_fill(~(share < ROUNDED)[:, None, :, None], math.nan)
 
 
 def _matrix(slopes: Tensor, h: Tensor) -> Tensor:
@@ -161,8 +176,9 @@ def _inputs(u: dict[str, Tensor]) -> dict[str, Tensor]:
     }
 
 
-def _tiled(p: Values, copies: int) -> Values:
-    """Parameters of points as those of their stages, so many times."""
-    start = p.start.repeat(STAGES) if isinstance(p.start, Tensor) else p.start
-    tiled = {name: v.repeat(copies, STAGES if v.shape[-1] > 1 else 1) for name, v in p.items()}
+def _tiled(p: Values, at: Tensor, copies: int) -> Values:
+    """Parameters of points as those of the stages of some of them, so many times."""
+    start = p.start[at].repeat(STAGES) if isinstance(p.start, Tensor) else p.start
+    tiled = {name: (v[..., at].repeat(copies, STAGES) if v.shape[-1] > 1 else v.repeat(copies, 1))
+             for name, v in p.items()}  # fmt: skip
     return Values(tiled, p.first, start)

@@ -36,7 +36,7 @@ class ODESimulator(Simulator):
             comes first; what neither gives is calibrated.
         max_step: Longest time step. By default steps are halved until the solution stops changing.
         stiff: Whether steps are implicit, as some states follow others far faster than anything else happens. By
-            default they are where explicit ones would have to be too short.
+            default they are where explicit ones would have to be too short; with ``max_step`` only where this is True.
 
     Raises:
         DomainError: If something is not as described.

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -9,7 +10,7 @@ from torch import Tensor
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators.trajectories import Trajectories
 
-__all__ = ["focused", "may_change", "settled", "settled_implicitly", "step_errors", "workable"]
+__all__ = ["focused", "may_change", "outgrown", "settled", "settled_implicitly", "step_errors", "workable"]
 
 #: How often steps are halved at most; how often implicit ones are chosen that are tried in place of others, and how
 #: many they may become.
@@ -20,6 +21,13 @@ CONVERGING = 4.0
 MOST_DENSER, SHORTER = 16, (4, 16, 64)
 #: The same between two samples, where no implicit step gets through; up to how much; and how often at most.
 DENSER, DENSEST, JUMPS = 4, 4096, 48
+#: Factor in log by which something may grow within an implicit step: these damp what grows faster, and stay on a branch
+#: of the solution that is none.
+GROWTH = 2.0
+#: Implicit steps that are solved at most while their lengths are chosen: a model that jumps needs ever more of them.
+WORK = 200_000
+#: Choices of their lengths in which the error must fall by `CONVERGING`.
+STALLED = 3
 
 
 def may_change(simulator: object) -> bool:
@@ -28,17 +36,18 @@ def may_change(simulator: object) -> bool:
 
 
 def _implicitly(simulator: Trajectories) -> Trajectories | None:
-    """The same with implicit steps, the coarsest; None where they are implicit already, or must not be."""
-    if simulator.implicit or simulator.ode.stiff is not None or not may_change(simulator):
+    """The same with implicit steps, the coarsest if they were explicit; None where they must not be."""
+    if not may_change(simulator) or simulator.ode.stiff is False:
         return None
-    return Trajectories(simulator.ode, simulator.recording, implicit=True)
+    return simulator if simulator.implicit else Trajectories(simulator.ode, simulator.recording, implicit=True)
 
 
 def settled(simulator: Trajectories, values: Tensor, allowed: Tensor, *, halvings: int = HALVINGS) -> Trajectories:
     """The same with steps so short that halving them changes no output by more than is allowed.
 
-    Where halving them hardly lessens that, as of a stiff model, implicit steps are tried. A solution that is infinite
-    with both steps counts as settled. Where the simulator has a ``max_step``, the steps stay as they are.
+    Where halving them hardly lessens that, as of a stiff model, implicit steps are tried; where they are implicit,
+    these are shortened in places first. A solution that is infinite with both steps counts as settled. Where the
+    simulator has a ``max_step``, the steps stay as they are.
 
     Args:
         simulator: In time.
@@ -51,16 +60,18 @@ def settled(simulator: Trajectories, values: Tensor, allowed: Tensor, *, halving
     """
     if not may_change(simulator):
         return simulator
+    if simulator.implicit and (other := settled_implicitly(simulator, values, allowed)) is not None:
+        return other
     here, share = simulator, math.inf
     y = _outputs(here, values)
     for number in range(halvings):
         finer = here.refined(2)
         z = _outputs(finer, values)
         change = torch.where(torch.isfinite(y) | torch.isfinite(z), (z - y).abs(), torch.zeros_like(y))
-        if bool((change <= allowed).all()):
+        if bool((change <= allowed).all()) and not outgrown(here, values):
             return here
         before, share = share, float((change / allowed).nan_to_num(nan=math.inf).max())
-        if number == 1 and not share < before / CONVERGING:
+        if number == 1 and not share < before / CONVERGING and not here.implicit:
             other = settled_implicitly(simulator, values, allowed)
             if other is not None:
                 return other
@@ -77,40 +88,93 @@ def settled_implicitly(
 ) -> Trajectories | None:
     """The same with implicit steps, where these settle on a finite solution, else None; arguments as of `settled`, and
     how often they are chosen at most."""
-    implicit = _implicitly(simulator)
-    here = None if implicit is None else _through(implicit, values)
+    implicit, work = _implicitly(simulator), _Work()
+    here = None if implicit is None else _through(implicit, values, work)
+    excess: list[float] = []
     for _ in range(rounds):
-        if here is None or here.num_steps > MANY:
+        if here is None or here.simulator.num_steps > MANY:
             return None
-        finer = _through(here.refined(2), values)
+        halved = here.simulator.refined(2)
+        finer = _through(halved, values, work)
         if finer is None:
             return None
-        states = here.solve(values)
-        change = (_outputs(finer, values) - here.outputs_of(values, states)).abs() / allowed
+        change = (finer.outputs(values) - here.outputs(values)).abs() / allowed
         if bool((change <= 1).all()):
-            return here
+            return here.simulator
+        excess.append(float(change.max()))
+        if len(excess) > STALLED and not excess[-1] < excess[-1 - STALLED] / CONVERGING:
+            return None
         worst = int(change.amax(-1).argmax())
-        here = _through(focused(here, values[worst], states[worst : worst + 1], 2.0 * float(change.max())), values)
+        other = focused(here.simulator, values[worst], here.states[worst : worst + 1], 2.0 * excess[-1])
+        same = other.subdivide == halved.subdivide and other.denser is halved.denser
+        here = finer if same else _through(other, values, work)
     return None
 
 
-def _through(simulator: Trajectories, values: Tensor) -> Trajectories | None:
-    """The same with shorter steps where no finite solution gets through, as where a stiff one jumps; None if none."""
+class _Solved(NamedTuple):
+    """A simulator and its states at some values."""
+
+    simulator: Trajectories
+    states: Tensor
+
+    def outputs(self, values: Tensor) -> Tensor:
+        return self.simulator.outputs_of(values, self.states)
+
+
+class _Work:
+    """How many steps have been solved."""
+
+    def __init__(self) -> None:
+        self.steps = 0
+
+    def solve(self, simulator: Trajectories, values: Tensor) -> Tensor | None:
+        """States; None where that would be too much."""
+        self.steps += simulator.grid.h.numel() * len(values)
+        return simulator.solve(values) if self.steps <= WORK else None
+
+
+def _through(simulator: Trajectories, values: Tensor, work: _Work) -> _Solved | None:
+    """The same with shorter steps where no finite solution gets through, as where a stiff one jumps, and where what
+    grows would be damped; None if none."""
     for _ in range(JUMPS):
-        bad = ~torch.isfinite(simulator.solve(values)).all(-1).all(0)  # (R, K + 1)
+        states = work.solve(simulator, values)
+        if states is None:
+            return None
+        bad = ~torch.isfinite(states).all(-1).all(0)  # (R, K + 1)
+        if bool(bad[:, 0].any()):
+            return None
+        bad[:, 1:] |= _outgrown(simulator, values, states).any(0)
         if not bool(bad.any()):
-            return simulator if _finite(simulator, values) else None
+            found = _Solved(simulator, states)
+            return found if bool(torch.isfinite(found.outputs(values)).all()) else None
         denser = []
         for r, node in enumerate(bad.long().argmax(1).tolist()):
             counts = simulator.grid.steps_between(r)
             factor = torch.ones_like(counts)
-            if bool(bad[r].any()) and node:
+            if node:
                 factor[int((counts.cumsum(0) < node).sum())] = DENSER
             denser.append(factor if simulator.denser is None else factor * simulator.denser[r])
         if max(int(factor.max()) for factor in denser) > DENSEST:
             return None
         simulator = simulator.with_steps(simulator.subdivide, tuple(denser))
     return None
+
+
+def outgrown(simulator: Trajectories, values: Tensor) -> bool:
+    """Whether implicit steps, at some values, damp what grows."""
+    return simulator.implicit and bool(_outgrown(simulator, values, simulator.solve(values)).any())
+
+
+def _outgrown(simulator: Trajectories, values: Tensor, states: Tensor) -> Tensor:
+    """Which steps something grows in by more than `GROWTH`, ``(H, R, K)``: h Re λ of the rates' slopes at their ends.
+    """
+    t, h, u = simulator.grid.flat
+    slopes = simulator.steps.slopes_at(values, states[:, :, 1:], t + h, {name: table[2] for name, table in u.items()})
+    fastest = torch.zeros(slopes.shape[:2], dtype=slopes.dtype)
+    possible = (slopes.abs().sum(-1).amax(-1) * h > GROWTH) & slopes.isfinite().flatten(2).all(-1)
+    if bool(possible.any()):
+        fastest[possible] = torch.linalg.eigvals(slopes[possible]).real.amax(-1)
+    return (fastest * h > GROWTH).reshape(*states.shape[:2], -1)
 
 
 def workable(simulator: Trajectories, values: Tensor, allowed: Tensor, *, halvings: int = HALVINGS) -> Trajectories:
@@ -121,7 +185,7 @@ def workable(simulator: Trajectories, values: Tensor, allowed: Tensor, *, halvin
     """
     if not may_change(simulator):
         return simulator
-    if not _finite(simulator, values):
+    if simulator.implicit or not _finite(simulator, values):
         other = settled_implicitly(simulator, values, allowed)
         if other is not None:
             return other

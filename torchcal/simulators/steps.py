@@ -22,7 +22,7 @@ from torchcal.simulators.shooting import begun, close_gaps
 if TYPE_CHECKING:
     from torchcal.simulators.ode import ODESimulator
 
-__all__ = ["COPIED", "POINTS", "Steps"]
+__all__ = ["COPIED", "POINTS", "SPAN", "Steps"]
 
 #: Points whose derivatives are computed at once: about what a processor's cache holds.
 POINTS = 2**15
@@ -124,6 +124,14 @@ class Steps:
         """What a force of 1 in each equation, throughout a step, does to the end of the step, ``(H, R, K, S, S)``."""
         size = states.shape[-1]
         return torch.diag_embed(self.grid.h[..., None].expand(len(states), *self.grid.h.shape, size))
+
+    def slopes_at(self, values: Tensor, states: Tensor, t: Tensor, u: dict[str, Tensor]) -> Tensor:
+        """∂ rates / ∂ states ``(H, M, S, S)`` at one state for each step, ``(H, R, K, S)``; t, u ``(M,)``."""
+        run_of = self.grid.step_run
+        with torch.enable_grad():
+            leaf = states.flatten(1, 2).detach().requires_grad_(True)
+            rates = self.rates(t, leaf, self.layout.by_name(values, run_of), u)
+            return self.layout.derivatives(rates, leaf, {}, run_of, ())[0]
 
     def difference(self, values: Tensor) -> float:
         """Largest difference between the first steps taken one after another and all at once, relative to the states'.
