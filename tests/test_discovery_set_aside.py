@@ -406,3 +406,26 @@ def test_the_sd_of_a_name_rest_on_the_noise_beside_it():
         assert abs(known["quadratic.c"].value - 0.05) < 4 * known["quadratic.c"].sd
         assert known["quadratic.c"].sd < 0.003  # 0.0018 of white noise whose sd is known
         assert 0.07 < d.noise.sd["y"] < 0.13
+
+
+@pytest.mark.parametrize("noise", [0.1, None])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_what_sticks_out_of_two_terms_is_an_outlier_of_both(seed, noise):
+    x = torch.linspace(0, 10, 80, dtype=F64)
+    terms = [
+        tc.Term(
+            f"wave {k}", outputs={"y": lambda x, p, y, k=k: y + p["c"] * torch.sin(k * x)},
+            parameters=[tc.Parameter("c")],
+        )
+        for k in (3, 12, 17)
+    ]  # fmt: skip
+    y = 1 + 0.5 * x + 0.7 * torch.sin(12 * x) + 0.7 * torch.sin(17 * x)
+    y = y + 0.1 * torch.randn(80, generator=torch.Generator().manual_seed(seed), dtype=F64)
+    y[31] -= 1.0  # no more than either wave, whose samples it does not stick out of
+    base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    d = diagnose(base, tc.Recording(x=x, y=y, noise=noise), terms)
+    assert set(d.terms) == {"wave 12", "wave 17"}
+    assert d.set_aside.nonzero()[:, 0].tolist() == [31]
+    known = {e.name: e for e in d.final.estimates}
+    for name in ("wave 12.c", "wave 17.c"):
+        assert abs(known[name].value - 0.7) < 4 * known[name].sd

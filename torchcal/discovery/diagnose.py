@@ -28,7 +28,7 @@ from torchcal.discovery.problem import Problem
 from torchcal.discovery.ranking import ranking
 from torchcal.discovery.records import Scores, Table
 from torchcal.discovery.result import Diagnosis
-from torchcal.discovery.rounds import settle, with_all, with_explained
+from torchcal.discovery.rounds import settle, with_all, with_explained, without_others
 from torchcal.discovery.search import Search
 from torchcal.discovery.several import refit_several
 from torchcal.discovery.verdict import PLAINLY_WHITE, Decision, decide
@@ -158,7 +158,7 @@ def diagnose(
                     search, detected = every, True
             if detected and terms and not search.stop.is_set():
                 refit_several(search)
-                search = with_explained(search, problem, confidence) or search
+                search = with_explained(search, problem, confidence) or without_others(search, problem)
                 refit_nameless(search)
             decision = decide(search, detected, mask)
             best = decision.best or (search.physical_leader if decision.verdict == "ambiguous" else None)

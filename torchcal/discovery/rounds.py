@@ -27,7 +27,7 @@ from torchcal.discovery.several import refit_several, scores_beside
 from torchcal.discovery.verdict import WHITE, base_alone
 from torchcal.discovery.windows import refit_local
 
-__all__ = ["settle", "with_all", "with_explained"]
+__all__ = ["settle", "with_all", "with_explained", "without_others"]
 
 #: How often everything is fitted again because other data turned out to be outliers.
 ROUNDS = 3
@@ -113,7 +113,7 @@ def with_all(
 
 
 def with_explained(search: Search, observed: Problem, confidence: float) -> Search | None:
-    """The search of what was set aside too, where several terms together explain it better than outliers do.
+    """The search of what was set aside too, where a term beside the best one explains it better than outliers do.
 
     What sticks out of the best single term may be what a second one is seen by. None where nothing does.
     """
@@ -122,24 +122,36 @@ def with_explained(search: Search, observed: Problem, confidence: float) -> Sear
         return None
     if not _may_explain(search, best, observed):
         return None
-    kept = observed
-    for _ in range(2):
-        every = dataclasses.replace(search, problem=kept, clean=True)
-        every.calibrate_base()
-        if not _refit(every, confidence) or search.stop.is_set():
-            return None
-        refit_several(every)
-        sticking = outliers(every, observed.keep)
-        left = observed.keep if sticking is None else observed.keep & ~sticking
-        if torch.equal(left, every.problem.keep):
-            break
-        kept = observed.keeping(left)
+    every = dataclasses.replace(search, problem=observed, clean=True)
+    every.calibrate_base()
+    if not _refit(every, confidence) or search.stop.is_set():
+        return None
+    refit_several(every)
+    every = without_others(every, observed)
     other = every.physical_leader
     if search.stop.is_set() or other is None or len(other.numbers) < 2:  # single terms were judged before
         return None
     odds, spare = outdone(search, every, True)
-    seen = set(other.names) == set(best.names)  # by the other data too
-    return every if odds > EXPLAINED and (spare > 0 or seen) else None
+    same = set(other.names) == set(best.names)  # they are seen by the other data too
+    return every if odds > EXPLAINED and (same or spare > 0) else None
+
+
+def without_others(search: Search, observed: Problem) -> Search:
+    """The search with the outliers of several terms, where these are others than those of the best single one.
+
+    Its models are fitted again, and no others.
+    """
+    best = search.physical_leader
+    if best is None or len(best.numbers) < 2 or search.stop.is_set():
+        return search
+    sticking = outliers(search, observed.keep)
+    if sticking is None or torch.equal(observed.keep & ~sticking, search.problem.keep):
+        return search
+    other = dataclasses.replace(search, problem=observed.keeping(~sticking), clean=True)
+    other.calibrate_base()
+    other.screen_all()
+    other.take_over(search.models)
+    return other if not search.stop.is_set() and other.physical_leader is not None else search
 
 
 def _may_explain(search: Search, best: Model, observed: Problem) -> bool:

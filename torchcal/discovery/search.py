@@ -396,6 +396,22 @@ class Search:
         self.screening = screen(self.residual, self.candidates, self.screening)
         self.structure = analyse(self.residual, every=True)
 
+    def take_over(self, models: Sequence[Model]) -> None:
+        """Models of another search of the same candidates, fitted to the data of this one from where they stood."""
+        best = max((model.log_evidence for model in models), default=0.0)
+        for old in models:
+            problem = dataclasses.replace(old.found.problem, keep=self.problem.keep)
+            whitening = self.noise.whitening(problem)
+            found = refit(old.found, whitening, problem) if old.log_evidence > HOPELESS * best else None
+            if found is None:
+                y, jacobian, _ = problem.evaluate(old.found.values[None], old.found.free, old.found.warm)
+                found = dataclasses.replace(old.found, problem=problem, y=y[0], jacobian=jacobian[0])
+                found = weighed(found, whitening)
+            model = dataclasses.replace(old, found=found, structure=None, residual=None)
+            self.models.append(self._judge(model))
+        self.reweigh()
+        self.merge()
+
     def with_unknown(self, found: Fitted) -> tuple[Noise, float]:
         """Noise and log evidence of something unknown beside a fit; computed once."""
         if id(found) not in self._unknown:  # the fit is kept beside it, so that its id stays its own
