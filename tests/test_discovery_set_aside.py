@@ -429,3 +429,24 @@ def test_what_sticks_out_of_two_terms_is_an_outlier_of_both(seed, noise):
     known = {e.name: e for e in d.final.estimates}
     for name in ("wave 12.c", "wave 17.c"):
         assert abs(known[name].value - 0.7) < 4 * known[name].sd
+
+
+def test_a_dip_in_both_of_two_sweeps_is_no_pair_of_outliers():
+    x = torch.linspace(0, 1, 28, dtype=F64)
+    base = tc.Simulator(
+        lambda x, p: {"y": p["a"] + p["b"] * x["x"] + p["c"] * x["s"]}, [tc.Parameter(name) for name in "abc"]
+    )
+    term = tc.Term(
+        "quadratic", outputs={"y": lambda x, p, y: y + p["q"] * x["x"] ** 2}, parameters=[tc.Parameter("q")]
+    )
+    dip = torch.zeros(28, dtype=F64)
+    dip[14], dip[15] = 12.0, 6.0  # noise sd
+    lost = 0
+    for seed in range(4):
+        noise = torch.randn(56, generator=torch.Generator().manual_seed(seed), dtype=F64)
+        y = 1 + 2 * x.repeat(2) + 0.5 * (torch.arange(56) // 28) + 0.02 * (noise - dip.repeat(2))
+        recording = tc.Recording(x={"x": x.repeat(2), "s": torch.arange(56).double() // 28}, y={"y": y}, noise=0.02)
+        d = diagnose(base, recording, [term])
+        lost += d.verdict == "consistent"
+        assert d.verdict != "named"
+    assert lost <= 1  # and not all

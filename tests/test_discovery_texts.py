@@ -250,6 +250,21 @@ def test_the_likeliest_rival_is_told(rows, told):
     assert told in said(finding(ranking=[row(["drag"], 0.97, estimates=(TOP,)), *rows]))
 
 
+@pytest.mark.parametrize(
+    ("beside", "told"),
+    [
+        ((), "The next best without it, something that is not in this library, has a probability of 0.03"),
+        (("drag",), "That something which is not in this library acts beside it has a probability of 0.03."),
+        (("drag", "bias"), "That something which is not in this library acts beside it has a probability of 0.03."),
+        (("bias",), "The next best without it, something that is not in this library, has a probability of 0.03"),
+    ],
+)
+def test_something_unknown_beside_a_name_is_told_as_that(beside, told):
+    found = finding(ranking=[row(["drag"], 0.97, estimates=(TOP,)), row(["none of these"], 0.03)])
+    found.settings["unknown_beside"] = beside
+    assert told in said(found)
+
+
 def test_what_has_a_part_of_a_name_is_a_rival():
     rows = [row(["drag", "bias"], 0.9), row(["drag"], 0.06)]
     assert "The next best without all of them, drag, has" in said(finding(terms=["bias", "drag"], ranking=rows))

@@ -359,6 +359,7 @@ def _result(
             "withdrawn": decision.withdrawn,
             "doubt": decision.doubt,
             "depends": depends,
+            "unknown_beside": decision.beside,
             "nearly": decision.nearly,
             "lost": lost,
             "set_aside": suspect,

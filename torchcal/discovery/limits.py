@@ -150,6 +150,8 @@ def _corrected(
             now[i, sign] = min(sizes[i], room[i, sign])
     unseen, seen = dict.fromkeys(now, 0.0), dict.fromkeys(now, math.inf)
     trials = list(now)
+    ended: dict[tuple[int, int], tuple[float, Tensor]] = {}  # at the last size, by how much the base moved
+    low, high = base.problem.limits()
     for _ in range(ROUNDS):
         if search.stop.is_set():
             seen |= {trial: min(seen[trial], sizes[trial[0]]) for trial in trials}
@@ -165,20 +167,26 @@ def _corrected(
                 known.append(trial)
         if known:
             warm = None if base.warm is None else base.warm.repeated(len(known))
+            begin = base.values.repeat(len(known), 1)
+            for row, trial in zip(begin, known, strict=True):
+                if trial in ended:
+                    size, moved = ended[trial]
+                    row += now[trial] / size * moved
             found = fit(
                 base.problem,
                 base.whitening,
-                base.values.expand(len(known), -1),
+                begin.clamp(low, high),
                 base.free,
                 warm=warm,
                 data=torch.stack(data),
                 max_steps=30,
                 finish=0,
             )
-            if found is None or found.ends_chi2 is None or len(found.ends_chi2) != len(known):
+            if found is None or found.ends is None or found.ends_chi2 is None or len(found.ends) != len(known):
                 for trial in trials:  # as far as tangents tell
                     seen[trial] = min(seen[trial], sizes[trial[0]])
                 break
+            ended = {trial: (now[trial], end - base.values) for trial, end in zip(known, found.ends, strict=True)}
             for trial, chi2 in zip(known, found.ends_chi2.tolist(), strict=True):
                 short = effects[trial[0]].distance / max(math.sqrt(chi2), 1e-300)
                 if abs(math.log(short)) <= CLOSE:

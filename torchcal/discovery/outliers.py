@@ -204,17 +204,20 @@ def _off_curve(at: Tensor, r: Tensor, high: Sequence[bool], k: int, end: int, le
 def _clustered(problem: Problem, places: Tensor, high: Tensor) -> bool:
     """Whether data that stick out lie together among the conditions, as outliers do not."""
     count = int(high.sum())
-    if count < 3:
+    if count < 2:
         return False
     x = problem.recording.x
     columns = [c[problem.condition_of[places]] for c in (x.values() if isinstance(x, dict) else [x])]
     if any(_one_level(column, high, CHANCE / len(columns)) for column in columns):
         return True
+    if count < 3:
+        return False
     ranks = torch.stack([c.unique(return_inverse=True)[1].double() for c in columns], dim=-1)
     ranks = ranks * (len(places) / (ranks.amax(0) + 1))
     distance = torch.cdist(ranks[high], ranks)
     distance[torch.arange(count), high.nonzero()[:, 0]] = math.inf
-    together = float(high[distance.argmin(1)].double().mean())
+    nearest = (distance <= distance.amin(1, keepdim=True) * (1 + 1e-9)).double()
+    together = float((nearest @ high.double() / nearest.sum(1)).mean())
     return together > TOGETHER
 
 

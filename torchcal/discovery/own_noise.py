@@ -78,11 +78,12 @@ def beside(search: "Search", model: Model) -> Noise:
     return own if float((own.sd / search.noise.sd).median()) < OUTDATED else search.noise
 
 
-def weigh_alone(search: "Search") -> tuple[float, float]:
+def weigh_alone(search: "Search") -> tuple[float, Model | None, float]:
     """Weigh every model against the base, each of them with its own noise.
 
     Returns:
-        Log evidence of something unknown, and that of the base as it stands here, against the base with its own.
+        Log evidence of something unknown, the model beside which that is (None for the base), and that of the base as
+        it stands here, against the base with its own.
     """
     base = settled(search.base, search.noise, search.tangents)[1]
     here = log_likelihood(search.base, search.noise, search.tangents) - base
@@ -101,7 +102,7 @@ def weigh_alone(search: "Search") -> tuple[float, float]:
     unknown = [search.with_unknown(search.base)[1]]
     if best is not None:
         unknown.append(search.with_unknown(best.found)[1] + best.prior)
-    return max(unknown) - base, min(here, 0.0)
+    return max(unknown) - base, best if max(unknown) > unknown[0] else None, min(here, 0.0)
 
 
 def likeliest_alone(search: "Search") -> Model | None:

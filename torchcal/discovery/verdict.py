@@ -68,6 +68,7 @@ class Decision:
         base: Probability of the base alone.
         none_evidence: Log weight of something that is not in the library.
         none_note: What that is, in words.
+        beside: Terms beside which that is likeliest to act; none where it would act alone.
         withdrawn: Why a name was withdrawn, in words.
         doubt: Why the best explanation is no name, though probable, in words.
         nearly: Whether what is left is not white, and the name rests on the share of the misfit that it removes.
@@ -83,6 +84,7 @@ class Decision:
         self.base = 1.0
         self.none_evidence = 0.0
         self.none_note = "something unknown and smooth"
+        self.beside: tuple[str, ...] = ()
         self.withdrawn = ""
         self.doubt = ""
         self.nearly = False
@@ -105,8 +107,8 @@ def _unknown(search: Search, structure: Structure, *, calibrated: bool) -> float
     return bound + max(seen - float(structure.null_best.max()), 0.0)
 
 
-def _none_evidence(search: Search, ranked: list[Model], here: float) -> float:
-    """Log weight of "none of these": something unknown in the base, or beside the best models.
+def _none_evidence(search: Search, ranked: list[Model], here: float) -> tuple[float, Model | None]:
+    """Log weight of "none of these": something unknown in the base, or beside one of the best models; and that model.
 
     ``here`` is the log evidence of the base with the noise in use.
     """
@@ -114,10 +116,13 @@ def _none_evidence(search: Search, ranked: list[Model], here: float) -> float:
     found = _unknown(search, search.structure, calibrated=False) + here + prior
     if any(search.examine(model).p_value >= PLAINLY_WHITE for model in ranked[:2]):
         found -= LINEAR * max(found, 0.0)  # refitted and white: its rival is linear, and as wrong as that
+    beside = None
     for model in ranked[:4]:
         left = _unknown(search, search.examine(model), calibrated=True)  # of the search's noise, as this evidence
-        found = max(found, model.in_use + model.log_prior + left + prior + _by_chance(model))
-    return found
+        value = model.in_use + model.log_prior + left + prior + _by_chance(model)
+        if value > found:
+            found, beside = value, model
+    return found, beside
 
 
 def _by_chance(model: Model) -> float:
@@ -142,9 +147,12 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         return _decide_exact(search, ranked, mask, decision)
     decision.none_evidence = math.log(PRIOR["none"])
     if detected:
-        unknown, here = weigh_alone(search)
+        unknown, beside, here = weigh_alone(search)
         ranked.sort(key=lambda m: -m.weight)
-        decision.none_evidence = max(_none_evidence(search, ranked, here), unknown + decision.none_evidence)
+        found = _none_evidence(search, ranked, here)
+        decision.none_evidence, beside = max(
+            (unknown + decision.none_evidence, beside), found, key=lambda one: one[0]
+        )
         nameless = max(search.nameless, key=lambda m: m.weight, default=None)
         leading = next((p for p in search.structure.places if p.channel.kind in search.problem.kinds), None)
         search.unnamed = None
@@ -152,6 +160,9 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
             search.unnamed = nameless
             decision.none_evidence = nameless.weight
             decision.none_note = f"{nameless.candidate.name} where {nameless.where}"
+        elif beside is not None:
+            decision.beside = beside.names
+            decision.none_note = f"something unknown beside {' and '.join(beside.names)}"
         elif leading is not None and leading.period is not None:
             decision.none_note = "an unknown oscillation"
     _weigh(search, decision)

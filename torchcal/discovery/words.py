@@ -247,6 +247,12 @@ def _rival(d: Any, probability: float) -> list[str]:
         return []
     rival, share = max(shares.items(), key=lambda item: item[1])
     behind = _behind(share, probability)
+    if rival == NONE and set(d.settings.get("unknown_beside", ())) >= set(d.terms):
+        where = "it" if len(d.terms) == 1 else "them"
+        return [
+            f"That something which is not in this library acts beside {where} has a probability of "
+            f"{_probability(share)}."
+        ]
     without = "without it" if len(d.terms) == 1 else "without all of them"
     return [
         f"The next best {without}, {_hypothesis(d, rival)}, has a probability of {_probability(share)} "
