@@ -233,11 +233,11 @@ def test_what_grows_fast_is_not_damped(k, stiff):
     bound = model.bind(tc.Recording(runs=[run_of(T, {"a": 1e-3})]))
     exact = 1 / (1 + (1 / 1e-3 - 1) * np.exp(-k * T))
     wrong = Trajectories(model, bound.recording, implicit=True)
-    assert outgrown(wrong, tensor(k)[None])
+    assert outgrown(wrong, tensor(k)[None], wrong.solve(tensor(k)[None]))
     assert float(wrong.at(wrong.x)(tensor(1e6))[-1]) < 0.5  # and not 1
     for found in (workable(bound, tensor(k)[None], ALLOWED), settled_implicitly(bound, tensor(k)[None], ALLOWED)):
         assert found.implicit
-        assert not outgrown(found, tensor(k)[None])
+        assert not outgrown(found, tensor(k)[None], found.solve(tensor(k)[None]))
         assert np.abs(found.at(found.x)(tensor(k)).numpy() - exact).max() < 1e-4
 
 

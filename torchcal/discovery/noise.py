@@ -196,11 +196,11 @@ def estimate(
                 "Give noise= its standard deviation."
             )
         correlated = n >= LEAST and problem.sweeps is not None and replicated is None
+        joints = [problem.joined(places) for places in parts]
         logs, sizes = [], []
         for rho in GRID if correlated else GRID[:1]:
             square, log_det, count = 0.0, 0.0, 0
-            for places, r, basis in zip(parts, scaled, bases, strict=True):
-                joined = problem.joined(places)
+            for places, r, basis, joined in zip(parts, scaled, bases, joints, strict=True):
                 e, b = _decorrelate(r[:, None], rho, joined)[:, 0], _decorrelate(basis, rho, joined)
                 q, upper = torch.linalg.qr(b)
                 left = e - q @ (q.T @ e)

@@ -28,8 +28,9 @@ def accurate(found: Fitted, sd: Tensor) -> bool:
     simulator = found.problem.simulator
     if not isinstance(simulator, Trajectories) or not may_change(simulator):
         return True
-    errors = step_errors(simulator, found.values, simulator.solve(found.values[None], found.warm))
-    if outgrown(simulator, found.values[None]):
+    states = simulator.solve(found.values[None], found.warm)
+    errors = step_errors(simulator, found.values, states)
+    if outgrown(simulator, found.values[None], states):
         return False
     least = float((sd / found.problem.recording.spread[found.problem.index]).min())
     return float(errors.sum()) <= SOLVER_SHARE * least
@@ -59,7 +60,8 @@ def sharpen(
         finer = simulator.refined(2)
         y = finer.outputs_of(found.values[None], finer.solve(found.values[None]))[0, found.problem.index]
         error, most = (y - found.y).abs(), allowed(found)
-        branch = outgrown(simulator, found.values[None])  # of the solution may be another one
+        states = simulator.solve(found.values[None], found.warm)
+        branch = outgrown(simulator, found.values[None], states)  # of the solution may be another one
         if bool((error <= most).all()) and not branch:
             return found, 0.0
         before, share = share, float((error / most).nan_to_num(nan=math.inf).max())
@@ -70,7 +72,6 @@ def sharpen(
             break
         try:
             if math.isfinite(share):
-                states = simulator.solve(found.values[None], found.warm)
                 finer = focused(simulator, found.values, states, 2.0 * share)
         except DomainError:  # more steps than anyone can take
             break

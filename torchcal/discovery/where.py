@@ -13,7 +13,7 @@ from torchcal.discovery.problem import is_value_of
 from torchcal.discovery.records import Location, MissingRate, NeededShift, Table
 from torchcal.discovery.search import Search
 from torchcal.errors import SimulatorError
-from torchcal.simulators.layout import Values
+from torchcal.simulators import Values
 from torchcal.terms import Term
 
 __all__ = ["locate", "missing_rate", "needed_shifts"]

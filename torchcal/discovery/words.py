@@ -279,7 +279,8 @@ def _larger(d: Any) -> list[str]:
         listed.append("others")
     together = sum(row.probability for row in more)
     parts = [f"Something else acts beside it with a probability of {together:.2f}: {', or '.join(listed)}."]
-    return parts + [text for text in [d.settings.get("depends")] if text] + _experiment(d)
+    depends = d.settings.get("depends")
+    return parts + ([depends] if depends else []) + _experiment(d)
 
 
 def _experiment(d: Any) -> list[str]:

@@ -62,16 +62,17 @@ def settled(simulator: Trajectories, values: Tensor, allowed: Tensor, *, halving
         return simulator
     if simulator.implicit and (other := settled_implicitly(simulator, values, allowed)) is not None:
         return other
-    here, share = simulator, math.inf
-    y = _outputs(here, values)
+    here, share = _Solved(simulator, simulator.solve(values)), math.inf
+    y = here.outputs(values)
     for number in range(halvings):
-        finer = here.refined(2)
-        z = _outputs(finer, values)
+        halved = here.simulator.refined(2)
+        finer = _Solved(halved, halved.solve(values))
+        z = finer.outputs(values)
         change = torch.where(torch.isfinite(y) | torch.isfinite(z), (z - y).abs(), torch.zeros_like(y))
-        if bool((change <= allowed).all()) and not outgrown(here, values):
-            return here
+        if bool((change <= allowed).all()) and not outgrown(here.simulator, values, here.states):
+            return here.simulator
         before, share = share, float((change / allowed).nan_to_num(nan=math.inf).max())
-        if number == 1 and not share < before / CONVERGING and not here.implicit:
+        if number == 1 and not share < before / CONVERGING and not simulator.implicit:
             other = settled_implicitly(simulator, values, allowed)
             if other is not None:
                 return other
@@ -160,9 +161,9 @@ def _through(simulator: Trajectories, values: Tensor, work: _Work) -> _Solved | 
     return None
 
 
-def outgrown(simulator: Trajectories, values: Tensor) -> bool:
-    """Whether implicit steps, at some values, damp what grows."""
-    return simulator.implicit and bool(_outgrown(simulator, values, simulator.solve(values)).any())
+def outgrown(simulator: Trajectories, values: Tensor, states: Tensor) -> bool:
+    """Whether implicit steps, at some values and their solved states, damp what grows."""
+    return simulator.implicit and bool(_outgrown(simulator, values, states).any())
 
 
 def _outgrown(simulator: Trajectories, values: Tensor, states: Tensor) -> Tensor:
@@ -208,12 +209,8 @@ def _shorter(simulator: Trajectories) -> Iterator[Trajectories]:
             return
 
 
-def _outputs(simulator: Trajectories, values: Tensor) -> Tensor:
-    return simulator.outputs_of(values, simulator.solve(values))
-
-
 def _finite(simulator: Trajectories, values: Tensor) -> bool:
-    return bool(torch.isfinite(_outputs(simulator, values)).all())
+    return bool(torch.isfinite(_Solved(simulator, simulator.solve(values)).outputs(values)).all())
 
 
 def step_errors(simulator: Trajectories, values: Tensor, states: Tensor) -> Tensor:
