@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import pytest
 import torch
 from scipy.integrate import solve_ivp
 
@@ -210,3 +211,24 @@ def test_an_instrument_shows_the_physics_in_whatever_order_the_two_are_listed():
         assert abs(estimates["dead time.q"].value - 0.15) < 4 * estimates["dead time.q"].sd
         assert abs(estimates["wave.a"].value - 1.5) < 4 * estimates["wave.a"].sd
     assert abs(found[0].final.chi2 - found[1].final.chi2) < 0.01
+
+
+@pytest.mark.parametrize("noise", [0.02, None])
+def test_two_terms_of_which_no_tangent_shows_anything_are_tried_together(noise):
+    x = torch.linspace(0, 4, 60, dtype=F64)
+    terms = [
+        tc.Term(
+            f"wave {k}", outputs={"y": lambda x, p, y, k=k: y + p["a"] ** 2 * torch.sin(k * x)},
+            parameters=[tc.Parameter("a", low=0.0)],
+        )
+        for k in (3, 5, 8)
+    ]  # fmt: skip
+    y = 1 + 0.5 * x + 0.05 * torch.sin(3 * x) + 0.05 * torch.sin(8 * x)
+    y = y + 0.02 * torch.randn(60, generator=torch.Generator().manual_seed(0), dtype=F64)
+    base = tc.Simulator(lambda x, p: p["c"] + p["b"] * x, [tc.Parameter("c"), tc.Parameter("b")])
+    d = tc.diagnose(base, tc.Recording(x=x, y=y, noise=noise), terms, seed=0, progress=False)
+    assert d.verdict == "named"
+    assert set(d.terms) == {"wave 3", "wave 8"}
+    known = {e.name: e for e in d.final.estimates}
+    for name in ("wave 3.a", "wave 8.a"):
+        assert abs(known[name].value - 0.05**0.5) < 4 * known[name].sd

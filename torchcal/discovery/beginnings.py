@@ -12,7 +12,7 @@ from torchcal.discovery.fitting import Fitted, fit, follow_slopes, starts
 from torchcal.discovery.residual import Residual
 from torchcal.discovery.screen import Screening
 
-__all__ = ["BENT", "beginnings", "first_guess", "is_far", "larger_effects", "learned", "make_up"]
+__all__ = ["BENT", "beginnings", "blind_rows", "first_guess", "is_far", "larger_effects", "learned", "make_up"]
 
 #: Shapes that a refit begins at, by their tangents; the same where the base is far off.
 SHAPES, SHAPES_FAR = 3, 8
@@ -148,7 +148,7 @@ def _linear(residual: Residual, screening: Screening, number: int, candidate: Ca
     mine = (screening.owner == number).nonzero()[:, 0]
     usable = mine[screening.norm[mine] > 0]
     if len(usable) == 0:
-        return _blind(candidate)
+        return blind_rows(candidate)
     rows, used = [], set()
     # The tangents of an effect that is far from small say little of which shape it has.
     far = is_far(residual.found)
@@ -166,8 +166,8 @@ def _linear(residual: Residual, screening: Screening, number: int, candidate: Ca
     return torch.stack(rows)
 
 
-def _blind(candidate: Candidate) -> Tensor:
-    """Amplitudes of all magnitudes, where the tangent says nothing."""
+def blind_rows(candidate: Candidate) -> Tensor:
+    """Starting values ``(B, P)`` with amplitudes of all magnitudes, where the tangent says nothing."""
     if candidate.bent is not None:
         return candidate.bent
     rows = []

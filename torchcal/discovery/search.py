@@ -161,6 +161,11 @@ class Search:
         return {m.numbers[0]: m for m in self.models if len(m.numbers) == 1 and m.window is None}
 
     @property
+    def blind(self) -> list[int]:
+        """Candidates whose effect no tangent at the base shows, but a larger one may."""
+        return [i for i, c in enumerate(self.candidates) if self.screening.best[i] < 0 and c.blind]
+
+    @property
     def unfinished(self) -> list[str]:
         """Candidates that an interruption has left without a fit of their own."""
         return [self.candidates[i].name for i in sorted(self.left)]
@@ -205,13 +210,12 @@ class Search:
         """Every candidate that the screening leaves a chance; where nothing was detected only the leading few."""
         count = len(self.candidates)
         prior = self.prior
-        blind = [i for i in range(count) if self.screening.best[i] < 0 and self.candidates[i].blind]
         order = sorted((i for i in range(count) if self.screening.best[i] >= 0), key=lambda i: -self.screening.score(i))
         top = self.screening.score(order[0]) if order else 0.0
         promising = [i for k, i in enumerate(order) if k < FEW or self.screening.score(i) >= CHANCE * top]
         chosen = promising[:MOST] if detected else order[:FEW]
         guess = first_guess(self.base, self.fixed, self.seed) if is_far(self.base) else None
-        chances = [*chosen, *blind]
+        chances = [*chosen, *self.blind]
         begin = (beginnings(self.residual, self.screening, i, self.candidates[i], guess) for i in chances)
         wanted = [Hypothetical((i,), self.candidates[i], rows, prior) for i, rows in zip(chances, begin, strict=True)]
         found = self.refit_together(wanted)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchcal.discovery.beginnings import is_far, make_up
+from torchcal.discovery.beginnings import blind_rows, is_far, make_up
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare, replaces
 from torchcal.discovery.explain import removed
 from torchcal.discovery.fitting import Fitted
@@ -23,8 +23,8 @@ __all__ = ["refit_several", "scores_beside"]
 
 #: Pairs that are refitted at most; where one term leaves noise alone.
 MOST, FEWER = 20, 10
-#: Second terms that are tried beside one of the best.
-NEXT = 7
+#: Second terms that are tried beside one of the best, and how many of them at most whose tangents vanish.
+NEXT, UNSEEN = 7, 3
 #: Share of the misfit that one term removes of a recording without noise, and nothing need be sought beside it.
 ALL = 0.99999
 #: Of them from the linear search, and from that of a base that is far off, which linear estimates do not reach; and the
@@ -56,7 +56,7 @@ def refit_several(search: Search) -> None:
         lead = model.numbers[0]  # in a window merged ones may differ, beside others not
         leads.setdefault(search.twins[lead] if lead in search.gone else lead, model)
     beside = [
-        [tuple(sorted((lead, j))) for j in _next_terms(search, model) if j != lead][:NEXT]
+        [tuple(sorted((lead, j))) for j in _next_terms(search, model) if j != lead]
         for lead, model in itertools.islice(leads.items(), 1 if enough else 3)
     ]
     for pair in itertools.chain(*itertools.zip_longest(*beside)):  # the best of each lead first
@@ -214,10 +214,13 @@ def _linear_row(search: Search, candidate: Candidate, columns: tuple[int, int]) 
 
 
 def _next_terms(search: Search, model: Model) -> list[int]:
-    """Other candidates by their score at a model's fit."""
+    """Other candidates by their score at a model's fit, and some that only large effects show."""
     residual = model.residual or Residual(model.found, search.noise, seed=search.seed, draws=10)
     scores = scores_beside(search, model.found, residual, model.numbers)
-    return [j for _, j in sorted(scores, key=lambda one: (-one[0], one[1]))]
+    scored = [j for _, j in sorted(scores, key=lambda one: (-one[0], one[1]))]
+    # What no tangent shows may be seen beside another that none shows, or that has taken its part.
+    unseen = [j for j in search.blind if j not in {*scored, *model.numbers, *search.gone}][:UNSEEN]
+    return [*scored[: NEXT - len(unseen)], *unseen]
 
 
 def scores_beside(
@@ -282,6 +285,25 @@ def _hypothetical(
                 value = float(fitted.found.values[place]) if fitted is not None else neutral
                 row[k] = neutral + 0.02 * (value - neutral) if place in source.amplitudes else value
         rows.append(row)
+        if single is not None:
+            for other in numbers:
+                if other != lead and other in search.blind:
+                    rows += _unseen(search.candidates[other], row, names)
     if columns is not None:
         rows.append(_linear_row(search, candidate, columns))
     return Hypothetical(numbers, candidate, torch.stack(rows), prior)
+
+
+def _unseen(candidate: Candidate, row: Tensor, names: Sequence[str]) -> list[Tensor]:
+    """Starting values of several terms with larger effects of one of them that none of its tangents shows.
+
+    Where the base's parameters make up for an effect, they are moved from where they are in ``row`` as from the base.
+    """
+    places = [names.index(q.name) for q in candidate.problem.parameters]
+    rows = []
+    for start in blind_rows(candidate):
+        moved = row.clone()
+        moved[places] += start - candidate.begin
+        moved[[places[i] for i in candidate.own]] = start[candidate.own]
+        rows.append(moved)
+    return rows
