@@ -450,3 +450,29 @@ def test_a_dip_in_both_of_two_sweeps_is_no_pair_of_outliers():
         lost += d.verdict == "consistent"
         assert d.verdict != "named"
     assert lost <= 1  # and not all
+
+
+@pytest.mark.parametrize("place", [0, -1])
+def test_an_outlier_at_the_end_of_an_uneven_run_is_one_beside_the_term_that_explains_the_rest(place):
+    # Its neighbours were too unevenly spaced to tell, and beside the term something unknown took its place.
+    rng, runs = np.random.default_rng(0), []
+    for j, start in enumerate((0.5, 1.0, 2.0)):
+        t = np.concatenate([[0.0], np.sort(rng.uniform(0, 10, 39))])
+        n = solve_ivp(lambda _, n: -0.3 * n - 0.15 * n**2, (0, 10), [start], t_eval=t, rtol=1e-9, atol=1e-12).y[0]
+        n += 0.01 * rng.standard_normal(40)
+        n[place] += 0.12 * (j == 1)
+        runs.append(tc.Run(time=t, outputs={"n": n}))
+    model = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"n": -p["k"] * s["n"]},
+        states={"n": "1"},
+        parameters=[tc.Parameter("k", low=0.0, initial=0.4)],
+    )
+    terms = [
+        tc.Term("second order", equation="n", rate=lambda t, s, p, u: -p["a"] * s["n"] ** 2,
+                parameters=[tc.Parameter("a", low=0.0)]),
+        tc.Term("source", equation="n", rate=lambda t, s, p, u: p["q"], parameters=[tc.Parameter("q")]),
+    ]  # fmt: skip
+    d = diagnose(model, tc.Recording(runs=runs, noise=0.01), terms)
+    assert d.verdict == "named"
+    assert d.terms == ["second order"]
+    assert torch.where(d.set_aside)[0].tolist() == [40 if place == 0 else 79]

@@ -184,28 +184,30 @@ def outliers(search: "Search", observed: Tensor) -> Tensor | None:
         before, keep = keep, observed  # what was set aside may be the effect itself
         for _ in range(2):  # beside what sticks out most an end of a recording is not judged
             problem = dataclasses.replace(best.found.problem, keep=keep)
-            y = problem.evaluate(found.values[None], [], found.warm)[0][0]
-            keep = keep & ~_sticking(search, problem, problem.y - y)
+            left = problem.y - problem.evaluate(found.values[None], [], found.warm)[0][0]
+            off = _sticking(search, problem, left)
+            if bool((observed & ~search.problem.keep).any()):  # an end that has been weighed before stays aside
+                off |= _sticking(search, problem, left, ends=True) & ~search.problem.keep
+            keep = keep & ~off
         if torch.equal(keep, before):
             break
     sticking = observed & ~keep
     return sticking if float(sticking.sum()) <= MOST_OUTLIERS * float(observed.sum()) else None
 
 
-def isolated(search: "Search") -> Tensor | None:
-    """Samples in time that the base misses by far and alone, bool ``(n_total,)``; None for none, or too many.
+def isolated(search: "Search", fit: Fitted) -> Tensor | None:
+    """Samples in time that a fit misses by far and alone, bool ``(n_total,)``; None for none, or too many.
 
     With the ends of recordings: whether such data are outliers or all that is seen of some physics is to be weighed.
     Residuals are scaled to one variance by their leverage: an unknown initial state follows the first sample. Among
-    conditions, what a base lacks may well be seen in one datum first, the one at the edge.
+    conditions, what a model lacks may well be seen in one datum first, the one at the edge.
     """
     if search.exact or not search.problem.in_time:
         return None
-    base = search.base
-    slope = base.jacobian[:, ~base.at_bound]
-    curve = (slope @ torch.linalg.pinv(base.whitening(slope), rtol=1e-7)).square().sum(1)  # the variance of the fit
-    free = (1 - curve / base.whitening.sd.square()).clamp_min(LEAST_FREE).sqrt()
-    found = _sticking(search, base.problem, base.residual / free, ends=True)
+    slope = fit.jacobian[:, ~fit.at_bound]
+    curve = (slope @ torch.linalg.pinv(fit.whitening(slope), rtol=1e-7)).square().sum(1)  # the variance of the fit
+    free = (1 - curve / fit.whitening.sd.square()).clamp_min(LEAST_FREE).sqrt()
+    found = _sticking(search, fit.problem, fit.residual / free, ends=True)
     return found if 0 < float(found.sum()) <= MOST_OUTLIERS * float(search.problem.n) else None
 
 
@@ -226,14 +228,18 @@ def outdone(search: "Search", every: "Search", detected: bool) -> tuple[float, i
         Log odds, and how many more data the model of ``every`` explains than it has parameters: one datum that shows
         one parameter alone is always explained by it. An outlier is drawn evenly from the range of its output's data.
     """
-    best, other = every.physical_leader, search.physical_leader if detected else None
+    best = every.physical_leader
     if best is None:
         return -math.inf, 0
-    known = _density(search, search.base) + math.log(PRIOR["base"])
-    if other is not None:
-        known = max(known, _density(search, other.found) + other.prior)
-    odds = _density(every, best.found) + best.prior - known
+    odds = _density(every, best.found) + best.prior - _likeliest(search, detected)
     return odds, every.problem.n - search.problem.n - len(best.candidate.own)
+
+
+def _likeliest(search: "Search", detected: bool) -> float:
+    """Log weight of the base, or of the best physical model where more than noise is ``detected``, if that is more."""
+    best = search.physical_leader if detected else None
+    value = _density(search, search.base) + math.log(PRIOR["base"])
+    return value if best is None else max(value, _density(search, best.found) + best.prior)
 
 
 def outliers_alone(fewer: "Search", search: "Search", detected: bool) -> bool:
@@ -244,10 +250,16 @@ def outliers_alone(fewer: "Search", search: "Search", detected: bool) -> bool:
         search: That with them.
         detected: Whether ``fewer`` has more than noise.
     """
-    unknown = search.with_unknown(search.base)[1] - settled(search.base, search.noise, search.tangents)[1]
-    known = _density(fewer, fewer.base) + math.log(PRIOR["base"])
-    odds = _density(search, search.base) + unknown + math.log(PRIOR["none"]) - known
-    return max(odds, outdone(fewer, search, detected)[0]) < 0
+    known, best = _likeliest(fewer, detected), search.physical_leader
+    unknown = [_density(search, search.base) + _unknown(search, search.base)]
+    if best is not None:
+        unknown.append(_density(search, best.found) + best.prior + _unknown(search, best.found))
+    return max(max(unknown) + math.log(PRIOR["none"]) - known, outdone(fewer, search, detected)[0]) < 0
+
+
+def _unknown(search: "Search", found: Fitted) -> float:
+    """Log odds of something unknown beside a fit."""
+    return search.with_unknown(found)[1] - settled(found, search.noise, search.tangents)[1]
 
 
 def _density(search: "Search", found: Fitted) -> float:

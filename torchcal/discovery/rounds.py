@@ -11,6 +11,7 @@ from torchcal.discovery.likeliest import log_normal
 from torchcal.discovery.model import Model
 from torchcal.discovery.own_noise import (
     EXPLAINED,
+    explains,
     fits_by_chance,
     isolated,
     known_density,
@@ -47,17 +48,28 @@ def settle(search: Search, observed: Problem, confidence: float) -> tuple[Search
     Returns:
         The search, and whether there is more than noise.
     """
-    detected = _refit(search, confidence)
-    apart = isolated(search) if detected and not search.stop.is_set() else None
-    if apart is not None:
-        kept = search.problem.keep & ~apart
-        if float(kept.sum()) >= (1 - MOST) * observed.n:
-            fewer = dataclasses.replace(search, problem=observed.keeping(kept), clean=True)
-            fewer.calibrate_base()
-            still = _refit(fewer, confidence)
-            if not search.stop.is_set() and outliers_alone(fewer, search, still):
-                search, detected = fewer, still
-    return _again(search, observed, detected, confidence)
+    search, detected = _without_isolated(search, observed, _refit(search, confidence), confidence)
+    search, detected = _again(search, observed, detected, confidence)
+    return _without_isolated(search, observed, detected, confidence, of_best=True)
+
+
+def _without_isolated(
+    search: Search, observed: Problem, detected: bool, confidence: float, *, of_best: bool = False
+) -> tuple[Search, bool]:
+    """The search without data that its base or best model misses alone, where outliers are the likelier reason."""
+    if not detected or search.stop.is_set() or (of_best and not explains(search)):
+        return search, detected
+    best = search.leader if of_best else None
+    apart = isolated(search, search.base if best is None else best.found)
+    kept = search.problem.keep if apart is None else search.problem.keep & ~apart
+    if apart is None or float(kept.sum()) < (1 - MOST) * observed.n:
+        return search, detected
+    fewer = dataclasses.replace(search, problem=observed.keeping(kept), clean=True)
+    fewer.calibrate_base()
+    still = _refit(fewer, confidence)
+    if not search.stop.is_set() and outliers_alone(fewer, search, still):
+        return fewer, still
+    return search, detected
 
 
 def _again(search: Search, observed: Problem, detected: bool, confidence: float) -> tuple[Search, bool]:
