@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import torchcal as tc
+from torchcal.discovery.base import calibrate_base
 from torchcal.discovery.fitting import fit
 from torchcal.discovery.noise import Noise, estimate
 from torchcal.discovery.outliers import lone, spikes
@@ -407,3 +408,47 @@ def test_an_instrument_that_adds_more_than_it_measures_is_no_name(size, verdict)
     d = tc.diagnose(base, tc.Recording(x=x, y=y), terms, seed=0, progress=False)
     assert d.verdict == verdict
     assert ("varies more by the instrument's error than by the true value" in str(d)) == (verdict != "named")
+
+
+DECAY = tc.ODESimulator(
+    rates=lambda t, s, p, u: {"n": -p["k"] * s["n"]},
+    states={"n": "1"},
+    parameters=[tc.Parameter("k", low=0.0, initial=0.4)],
+)
+
+
+def uneven(seed, by_sample, phi=0.75, sd=0.02):
+    """Two unevenly sampled runs of `DECAY` with noise that forgets with every sample, or with time."""
+    rng, runs = np.random.default_rng(seed), []
+    for start in (1.0, 2.0):
+        t = np.concatenate([[0.0], np.sort(rng.uniform(0, 8, 59))])
+        gaps = np.diff(t) / np.median(np.diff(t))
+        noise = rng.standard_normal(60)
+        for k in range(1, 60):
+            rho = phi if by_sample else phi ** gaps[k - 1]
+            noise[k] = rho * noise[k - 1] + math.sqrt(1 - rho**2) * noise[k]
+        runs.append(tc.Run(time=t, outputs={"n": start * np.exp(-0.3 * t) + sd * noise}))
+    return tc.Recording(runs=runs)
+
+
+@pytest.mark.parametrize("by_sample", [True, False])
+def test_noise_of_uneven_runs_forgets_with_time_or_with_every_sample(by_sample):
+    # What forgets with every sample was something missing: close samples do not agree as they would have to.
+    seeds, seen = 12, []
+    for seed in range(seeds):
+        problem = Problem.of(DECAY, uneven(seed, by_sample))
+        base, noise = calibrate_base(problem, {}, 4, seed)
+        seen.append((base.problem.by_sample, float(noise.correlation[0]), float(noise.sd[0])))
+    assert sum(one[0] == by_sample for one in seen) >= seeds - 1
+    assert 0.55 < sum(one[1] for one in seen) / seeds < 0.85
+    assert 0.013 < sum(one[2] for one in seen) / seeds < 0.022
+
+
+@pytest.mark.parametrize("by_sample", [True, False])
+def test_correlated_noise_of_uneven_runs_is_nothing_missing(by_sample):
+    term = tc.Term(
+        "second order", equation="n", rate=lambda t, s, p, u: -p["a"] * s["n"] ** 2,
+        parameters=[tc.Parameter("a", low=0.0)],
+    )  # fmt: skip
+    found = [tc.diagnose(DECAY, uneven(seed, by_sample), [term], seed=0, progress=False) for seed in range(4, 10)]
+    assert sum(d.verdict != "consistent" for d in found) <= 1

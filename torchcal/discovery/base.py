@@ -29,6 +29,8 @@ SAME_FIT = 0.01
 MOST = 0.2
 #: How often noise that grows is estimated from what it leaves when it is weighed.
 GROWTHS = 4
+#: Log odds from which on noise forgets with every sample and not with time.
+BY_SAMPLE = 1.0
 
 
 def calibrate_base(
@@ -89,7 +91,7 @@ def calibrate_base(
     base = refit(found, noise.whitening(found.problem))
     if not exact:
         base, units = _grown(base, unit, units)
-        noise = estimate(base.problem, base.residual, base.jacobian, recording.noise, units)
+        base, noise = _with_memory(base, units)
         base = _sharpen(refit(base, noise.whitening(base.problem)))
     return base, noise
 
@@ -117,6 +119,19 @@ def _grown(found: Fitted, known: Tensor | None, before: Tensor | None = None) ->
         noise = estimate(found.problem, found.residual, found.jacobian, None, unit)
         found = refit(found, noise.whitening(found.problem))
     return found, unit
+
+
+def _with_memory(found: Fitted, units: Tensor) -> tuple[Fitted, Noise]:
+    """A fit and its noise, which forgets with time, or with every sample where that is clearly likelier."""
+    known = found.problem.recording.noise
+    with_time = dataclasses.replace(found.problem, by_sample=False)
+    noise = estimate(with_time, found.residual, found.jacobian, known, units)
+    if with_time.uneven:
+        by_sample = dataclasses.replace(with_time, by_sample=True)
+        other = estimate(by_sample, found.residual, found.jacobian, known, units)
+        if other.log_density > noise.log_density + BY_SAMPLE:
+            return dataclasses.replace(found, problem=by_sample), other
+    return dataclasses.replace(found, problem=with_time), noise
 
 
 def growing(found: Fitted, before: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """Which new condition would tell tied hypotheses apart: where their predictions differ most after refitting."""
 
+import dataclasses
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -225,10 +226,11 @@ def _explodes(model: Model, y: Tensor, noise: Noise) -> bool:
 def _whitening(problem: Problem, recording: Recording, noise: Noise) -> Whitening:
     """Of noise at new conditions, which has the memory of that of the recording, however close samples are."""
     correlation = noise.correlation
-    if problem.recording.runs and recording.runs:
+    if problem.recording.runs and recording.runs and not problem.by_sample:
         usual = [float(runs[0].time.diff().median()) for runs in (recording.runs, problem.recording.runs)]
         correlation = correlation ** (usual[0] / usual[1])
-    return Problem.of(problem.simulator, recording).whitening(_sd(recording, noise), correlation)
+    new = dataclasses.replace(Problem.of(problem.simulator, recording), by_sample=problem.by_sample)
+    return new.whitening(_sd(recording, noise), correlation)
 
 
 def _sd(recording: Recording, noise: Noise) -> Tensor:

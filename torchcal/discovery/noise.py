@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchcal.discovery.problem import Problem, Whitening
+from torchcal.discovery.problem import Problem, Whitening, remembered
 from torchcal.discovery.records import NoiseModel
 from torchcal.errors import DomainError
 
@@ -60,6 +60,7 @@ class Noise:
         doubted: By how much the residual's fastest part exceeds the noise given, where that is a contradiction; else 1.
         step: As in `NoiseModel`.
         unit: Of unknown noise, its sd in units of its median, ``(n_total,)``; see `growth`.
+        log_density: Of what it was estimated from, with the prior of the correlation, up to a constant.
     """
 
     sd: Tensor
@@ -71,6 +72,7 @@ class Noise:
     doubted: float = 1.0
     step: dict[str, float] = dataclasses.field(default_factory=dict)
     unit: Tensor = dataclasses.field(default_factory=lambda: torch.ones(()))
+    log_density: float = 0.0
 
     @property
     def open(self) -> bool:
@@ -179,7 +181,7 @@ def estimate(
     known = given if isinstance(given, Tensor) else unit
     replicated = _replicates(problem) if given is None else None
     sd = known.clone()
-    freedom, doubted = math.inf, 1.0
+    freedom, doubted, log_density = math.inf, 1.0, 0.0
     for output in range(outputs):
         parts = [places for places in problem.recorded if int(problem.output_of[places[0]]) == output]
         n = sum(len(places) for places in parts)
@@ -196,22 +198,24 @@ def estimate(
                 "Give noise= its standard deviation."
             )
         correlated = n >= LEAST and problem.sweeps is not None and replicated is None
-        joints = [problem.joined(places) for places in parts]
+        gaps = [problem.gaps(places) for places in parts]
         logs, sizes = [], []
         for rho in GRID if correlated else GRID[:1]:
             square, log_det, count = 0.0, 0.0, 0
-            for places, r, basis, joined in zip(parts, scaled, bases, joints, strict=True):
-                e, b = _decorrelate(r[:, None], rho, joined)[:, 0], _decorrelate(basis, rho, joined)
+            for places, r, basis, apart in zip(parts, scaled, bases, gaps, strict=True):
+                each = remembered(rho, apart)
+                e, b = _decorrelate(r[:, None], each)[:, 0], _decorrelate(basis, each)
                 q, upper = torch.linalg.qr(b)
                 left = e - q @ (q.T @ e)
                 square += float(left.square().sum())
-                log_det += 0.5 * int(joined.sum()) * math.log(1 - float(rho) ** 2)
+                log_det += 0.5 * float(torch.log1p(-each.square()).sum())
                 log_det += float(upper.diagonal().abs().log().sum())
                 count += len(places) - b.shape[1]
             sizes.append(square / count)
             size = 0.5 * count * math.log(max(square, 1e-300)) if given is None else 0.5 * square
             logs.append(-size - log_det + float(log_prior(rho, n)))
         likelihood = torch.tensor(logs, dtype=torch.float64)
+        log_density += float(likelihood.max())
         weight = (likelihood - likelihood.max()).exp()
         posterior[output, : len(weight)] = weight / weight.sum()
         best = int(likelihood.argmax())
@@ -234,7 +238,7 @@ def estimate(
     if given is None:
         sd = torch.maximum(sd, least(problem, step))
     source = "given" if isinstance(given, Tensor) else "replicates" if replicated is not None else "estimated"
-    return Noise(sd, correlation, freedom, posterior, source, table, doubted, step, unit)
+    return Noise(sd, correlation, freedom, posterior, source, table, doubted, step, unit, log_density)
 
 
 def _beyond(problem: Problem, places: Tensor, design: Tensor, unit: Tensor, *, ends: bool = False) -> Tensor:
@@ -324,12 +328,12 @@ def least(problem: Problem, step: dict[str, float]) -> Tensor:
     return sd
 
 
-def _decorrelate(values: Tensor, rho: Tensor, joined: Tensor) -> Tensor:
-    """Successive values ``(m, k)`` with what follows from the one before taken out, where they are ``joined``."""
-    if float(rho) == 0.0:
+def _decorrelate(values: Tensor, rho: Tensor) -> Tensor:
+    """Successive values ``(m, k)`` with what follows from the one before, by correlations ``(m - 1,)``, taken out."""
+    if not bool((rho != 0).any()):
         return values
-    rest = (values[1:] - rho * values[:-1]) / math.sqrt(1 - float(rho) ** 2)
-    return torch.cat([values[:1], torch.where(joined[:, None], rest, values[1:])])
+    rho = rho[:, None]
+    return torch.cat([values[:1], (values[1:] - rho * values[:-1]) / (1 - rho.square()).sqrt()])
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,16 @@ from torchcal.data import Recording
 from torchcal.errors import SimulatorError
 from torchcal.simulators import Parameter, Simulator, Solution, Trajectories
 
-__all__ = ["Problem", "Whitening", "is_value_of"]
+__all__ = ["Problem", "Whitening", "is_value_of", "remembered"]
 
 #: Combinations of all levels of all conditions, in the number of rows, up to which these are a grid; the levels of a
 #: condition up to which it switches between sweeps of another one; and the rows of a sweep, on average, at least.
 GRID, SWITCH, SWEEP = 2.0, 2, 6
+#: Distances of samples, in sampling intervals, over which noise forgets: at least and at most; and how far from 1 they
+#: are where sampling is uneven.
+SHORTEST, LONGEST, UNEVEN = 1e-3, 1e3, 0.05
+#: Correlation of noise in neighbouring samples at most, however close they are.
+CLOSEST = 0.999
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +62,14 @@ class Problem:
         simulator: Bound to the recording.
         recording: All data.
         keep: Which of the n_total outputs are used, bool ``(n_total,)``.
+        by_sample: Whether noise forgets with every sample, as that of an instrument that filters its readings does,
+            and not with time.
     """
 
     simulator: Simulator
     recording: Recording
     keep: Tensor
+    by_sample: bool = False
 
     @classmethod
     def of(cls, simulator: Simulator, recording: Recording) -> "Problem":
@@ -156,11 +164,28 @@ class Problem:
         """The same in the order in which they were recorded, in which noise is correlated."""
         return [places.sort().values for places in self.sequences] if not self.in_time else self.sequences
 
-    def joined(self, places: Tensor) -> Tensor:
-        """Which of successive data of one of the `recorded` sequences, ``(m - 1,)``, belong to one sweep."""
+    def gaps(self, places: Tensor) -> Tensor:
+        """Distances of successive data of one of the `recorded` sequences in sampling intervals, ``(m - 1,)``.
+
+        Noise forgets over them: they are infinite between sweeps.
+        """
+        at = self.order[self.condition_of[places]] if self.in_time else places.double()  # type: ignore[index]
+        found = at.diff()
+        if not len(found):
+            return found
+        found = (found / found.median().clamp_min(1e-300)).clamp(SHORTEST, LONGEST)
+        if self.by_sample:
+            found = torch.ones_like(found)
         if self.sweeps is None:
-            return torch.zeros(len(places) - 1, dtype=torch.bool)
-        return self.sweeps[self.condition_of[places]].diff() == 0
+            return torch.full_like(found, math.inf)
+        return torch.where(self.sweeps[self.condition_of[places]].diff() == 0, found, math.inf)
+
+    @cached_property
+    def uneven(self) -> bool:
+        """Whether it matters if noise forgets with time or with every sample."""
+        if not self.in_time:
+            return False
+        return any(bool((self.gaps(places) - 1).abs().amax() > UNEVEN) for places in self.recorded if len(places) > 2)
 
     def whitening(self, sd: Tensor, correlation: Tensor) -> Whitening:
         """Of noise with sd ``(n_total,)`` and an AR(1) coefficient for each output, ``(outputs,)``."""
@@ -170,14 +195,9 @@ class Problem:
             for places in self.recorded:
                 if len(places) < 2:
                     continue
-                at = self.order[self.condition_of[places]] if self.in_time else places.double()  # type: ignore[index]
-                gaps = at.diff()
-                usual = gaps.median().clamp_min(1e-300)
-                phi = float(correlation[int(self.output_of[places[0]])])
-                each = phi ** (gaps / usual).clamp(1e-3, 1e3) if phi > 0 else torch.zeros_like(gaps)
-                rho[places[1:]] = torch.where(self.joined(places), each, 0.0)
+                rho[places[1:]] = remembered(correlation[int(self.output_of[places[0]])], self.gaps(places))
                 before[places[1:]] = places[:-1]
-        return Whitening(sd[self.index], rho.clamp_max(0.999), before)
+        return Whitening(sd[self.index], rho, before)
 
     # --- parameters ---------------------------------------------------------------------------------------
 
@@ -241,6 +261,11 @@ class Problem:
     def kinds(self) -> tuple[str, str]:
         """Kinds of channels that something unknown is sought in."""
         return ("equation", "output") if self.in_time else ("parameter", "output")
+
+
+def remembered(phi: Tensor, gaps: Tensor) -> Tensor:
+    """Correlation of noise over distances ``(m,)``, for each AR(1) coefficient, ``(m, *phi.shape)``."""
+    return (phi ** gaps.reshape(-1, *[1] * phi.ndim)).clamp_max(CLOSEST)
 
 
 def is_value_of(name: str, parameter: str) -> bool:

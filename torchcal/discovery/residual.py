@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.noise import GRID, Noise, orthonormal
+from torchcal.discovery.problem import remembered
 
 __all__ = ["Residual"]
 
@@ -65,11 +66,10 @@ def _noise_draws(found: Fitted, noise: Noise, draws: int, seed: int) -> Tensor:
             for places in problem.recorded:
                 if int(problem.output_of[places[0]]) != output:
                     continue
-                rho = GRID[chosen].repeat_interleave(each)[:draws]
-                fresh = (1 - rho.square()).sqrt()
+                phi = GRID[chosen].repeat_interleave(each)[:draws]
                 walk = e[places]
-                for k, joined in enumerate(problem.joined(places).tolist(), start=1):
-                    walk[k] = rho * walk[k - 1] + fresh * walk[k] if joined else walk[k]
+                for k, rho in enumerate(remembered(phi, problem.gaps(places)), start=1):
+                    walk[k] = rho * walk[k - 1] + (1 - rho.square()).sqrt() * walk[k]
                 e[places] = walk
         unit = w.sd.clone()
         e = w(e * unit[:, None])
