@@ -452,3 +452,34 @@ def test_correlated_noise_of_uneven_runs_is_nothing_missing(by_sample):
     )  # fmt: skip
     found = [tc.diagnose(DECAY, uneven(seed, by_sample), [term], seed=0, progress=False) for seed in range(4, 10)]
     assert sum(d.verdict != "consistent" for d in found) <= 1
+
+
+def swept(seed, depth, sweeps=3, phi=0.0):
+    """Sweeps of 28 data with noise of unknown size, and a bump in the last of them."""
+    x, s = torch.linspace(0, 1, 28, dtype=F64).repeat(sweeps), torch.arange(28 * sweeps) // 28
+    noise = torch.cat([draw(28, 0.02, 100 * seed + k, phi) for k in range(sweeps)])
+    y = 1 + 2 * x + 0.5 * s - 0.02 * depth * torch.exp(-(((x - 0.52) / 0.15) ** 2)) * (s == sweeps - 1) + noise
+    base = tc.Simulator(
+        lambda x, p: {"y": p["a"] + p["b"] * x["x"] + p["c"] * x["s"]}, [tc.Parameter(name) for name in "abc"]
+    )
+    term = tc.Term(
+        "quadratic", outputs={"y": lambda x, p, y: y + p["q"] * x["x"] ** 2}, parameters=[tc.Parameter("q")]
+    )
+    recording = tc.Recording(x={"x": x, "s": s.double()}, y={"y": y})
+    return tc.diagnose(base, recording, [term], seed=0, progress=False)
+
+
+def test_what_acts_in_one_of_several_sweeps_is_told_where_it_was_taken_for_slow_noise():
+    for seed in range(4):
+        d = swept(seed, 12.0)
+        told = [row for row in d.symptoms if "not alike in all sweeps" in row]
+        assert d.verdict in ("consistent", "unexplained", "ambiguous")
+        if d.verdict == "consistent":
+            assert "number 3 of 3" in told[0]
+            assert "if the symptoms below are noise" in str(d)
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.7])
+def test_noise_that_is_alike_in_all_sweeps_is_not_told_to_differ(phi):
+    found = [swept(seed, 0.0, phi=phi) for seed in range(10)]
+    assert sum(any("not alike" in row for row in d.symptoms) for d in found) <= most(10, 0.01)

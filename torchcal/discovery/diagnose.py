@@ -31,6 +31,7 @@ from torchcal.discovery.result import Diagnosis
 from torchcal.discovery.rounds import settle, with_all, with_explained, without_others
 from torchcal.discovery.search import Search
 from torchcal.discovery.several import refit_several
+from torchcal.discovery.symptoms import symptoms, unlike
 from torchcal.discovery.verdict import PLAINLY_WHITE, Decision, decide
 from torchcal.discovery.where import locate, missing_rate, needed_shifts
 from torchcal.display import NONE
@@ -302,6 +303,8 @@ def _result(
         improved: Simulator = simulator
     else:
         improved = _improved(simulator, best)
+    left = search.base if best is None else best.found
+    apart = unlike(search, left) if decision.verdict in ("consistent", "named") else []
     remaining, depends = 0.0 if decision.verdict == "consistent" else 1.0, ""
     if best is not None:
         white = best.structure is not None and best.structure.p_value >= PLAINLY_WHITE and not search.exact
@@ -328,7 +331,7 @@ def _result(
         before=before,
         after=after,
         improved=improved,
-        symptoms=explain.symptoms(search, best),
+        symptoms=[*symptoms(search, best), *apart],
         noise=_told_noise(search, decision, 1.0 - confidence).record(search.problem),
         base=base,
         final=final,
@@ -362,6 +365,7 @@ def _result(
             "unknown_beside": decision.beside,
             "nearly": decision.nearly,
             "lost": lost,
+            "unlike": bool(apart),
             "set_aside": suspect,
             "interrupted": interrupted,
             "region": None if best is None else best.where,

@@ -1,4 +1,4 @@
-"""From the search to the records of a result: how much, what was bent, and what cannot be told."""
+"""From the search to the records of a result: how much, and what cannot be told."""
 
 import itertools
 import math
@@ -10,12 +10,10 @@ from torch import Tensor
 from torchcal.discovery.fitting import Fitted, fit, starts
 from torchcal.discovery.local import ENDS, WIDTH_OF_EDGE, is_window
 from torchcal.discovery.model import Model
-from torchcal.discovery.noise import estimate
 from torchcal.discovery.records import Estimate, Fit
 from torchcal.discovery.screen import Window
 from torchcal.discovery.search import Search
 from torchcal.discovery.structure import Structure
-from torchcal.display import with_unit
 
 __all__ = [
     "depends",
@@ -25,8 +23,8 @@ __all__ = [
     "misfit_size",
     "other_minima",
     "removed",
+    "stated_sd",
     "surpassed",
-    "symptoms",
 ]
 
 #: Gaps between data that an end of a window may lie in, where its edge is a step.
@@ -44,13 +42,8 @@ APART = 5.0
 STARTS, AGAIN, RIVAL, ELSEWHERE = 4, 60, 4.0, 4.0
 #: Correlation of what two accepted terms do to the data from which on one law between them may look like their sum.
 ONE_LAW = 0.9
-#: A base parameter that moves by this many sd when a term is added was bent by it.
-BENT = 3.0
 #: A parameter depends on what acts beside it when that moves it by more than this many of its sd.
 MOVED = 2.0
-#: Share of the noise sd that was given below which a white residual is told; its data, and the correlation of
-#: neighbours up to which it is white.
-SMALLER, ENOUGH, WHITE = 0.5, 20, 0.4
 
 
 def estimates(found: Fitted, places: Sequence[int], window: Window | None = None) -> tuple[Estimate, ...]:
@@ -59,7 +52,7 @@ def estimates(found: Fitted, places: Sequence[int], window: Window | None = None
     An sd beyond what the bounds allow, or far beyond the estimate, says that the data do not determine it. Where the
     edge of a static window is a step, its end is known by the gaps between data that it may lie in.
     """
-    sd = _sd(found)
+    sd = stated_sd(found)
     bound = {i for i, at in zip(found.free, found.at_bound.tolist(), strict=True) if at}
     result = []
     for i in places:
@@ -76,7 +69,7 @@ def estimates(found: Fitted, places: Sequence[int], window: Window | None = None
     return tuple(result)
 
 
-def _sd(found: Fitted) -> Tensor:
+def stated_sd(found: Fitted) -> Tensor:
     """Standard deviations of all parameters ``(P,)``. Without noise the misfit takes its place."""
     return found.sd() * (misfit_size(found) if isinstance(found.problem.recording.noise, str) else 1.0)
 
@@ -150,57 +143,6 @@ def depends(known: Sequence[Estimate], other: Sequence[Estimate], beside: Sequen
     return f"{name} depends on what acts beside it: {there[name].amount} with {' and '.join(beside)}."
 
 
-def symptoms(search: Search, best: Model | None) -> list[str]:
-    """Calibrated values that give the mismatch away."""
-    base, then = search.base, {}
-    if best is not None:
-        then = {e.name: e for e in estimates(best.found, range(len(best.found.values)))}
-    runs, bent = [], []
-    for e, at, sd in zip(estimates(base, base.free), base.at_bound.tolist(), _sd(base)[base.free], strict=True):
-        moved = 0.0 if best is None else abs(then[e.name].value - e.value)
-        is_bent = moved > max(BENT * max(float(sd), 1e-300), 0.001 * abs(e.value))
-        with_terms = f"{then[e.name].amount} with {' and '.join(best.names)}" if best is not None else ""
-        if at:
-            bound = with_unit(f"{e.value:.4g}", e.unit)
-            text = f"{e.name} runs to its bound, {bound}, in the calibrated base"
-            runs.append(f"{text}; it is {with_terms}" if is_bent else text)
-        elif is_bent:
-            bent.append(f"{e.name} was bent: {e.amount} in the calibrated base, {with_terms}")
-    rows = runs + bent
-    if search.noise.doubted > 1:
-        # A misfit that is smooth on coarse spacing passes for fast: what leaves less tells more of the noise.
-        leader = best or search.physical_leader
-        left = base if leader is None or leader.found.chi2 > base.chi2 else leader.found
-        doubted = estimate(left.problem, left.residual, left.jacobian, search.problem.recording.noise).doubted
-        if doubted > 1:
-            rows.append(f"the residual's fastest part is {doubted:.1f} times the noise sd that was given")
-    if search.noise.source == "given":
-        rows += _too_large(search, base if best is None else best.found)
-    return rows
-
-
-def _too_large(search: Search, found: Fitted) -> list[str]:
-    """Outputs whose noise was given much larger than what is left, where that is white: slow noise a fit takes up."""
-    rows = []
-    problem, outputs = found.problem, search.problem.recording.outputs
-    standard = found.residual / search.noise.sd[problem.index]
-    spare = problem.n - len(found.free)
-    for number, name in enumerate(outputs):
-        mine = standard[problem.output_of == number]
-        size = math.sqrt(float(mine.square().mean()) * problem.n / max(spare, 1)) if len(mine) >= ENOUGH else 1.0
-        slow = max(  # along the rows, and along the condition or time: rows may be in random order
-            sum(float(standard[at[1:]] @ standard[at[:-1]]) for at in along if int(problem.output_of[at[0]]) == number)
-            for along in (problem.sequences, problem.recorded)
-        )
-        if size < SMALLER and slow < WHITE * float(mine @ mine):
-            of = f" of {name}" if len(outputs) > 1 else ""
-            rows.append(
-                f"the residual{of} is white and {size:.2g} times the noise sd that was given: with a smaller one, "
-                "these data would show smaller effects"
-            )
-    return rows
-
-
 def identifiability(search: Search, best: Model | None) -> list[str]:
     """Parameters and candidates that these data cannot tell."""
     unseen, mixed = _untold(search.base)
@@ -270,7 +212,7 @@ def _untold(found: Fitted) -> tuple[list[str], list[list[str]]]:
     kept = [k for k in mine if float(size[k]) > 0]
     if len(kept) < 2:
         return unseen, []
-    loose = (~(_sd(found) <= LOOSE * found.values.abs()))[found.free]  # an sd of infinity, or none, is loose too
+    loose = (~(stated_sd(found) <= LOOSE * found.values.abs()))[found.free]  # an sd of infinity, or none, is loose too
     unit = jacobian[:, kept] / size[kept]
     values, vectors = torch.linalg.eigh(unit.T @ unit)
     groups = []

@@ -152,7 +152,9 @@ def _consistent(d: Any) -> list[str]:
     # Of what is seen with one sign alone the table tells.
     limits = [one for one in d.detection_limit if math.isfinite(one.smallest) and not one.sign]
     nothing = "There is no sign of missing physics." + _yet(d)
-    if d.p_detect < SELDOM:
+    if d.settings.get("unlike"):
+        nothing = "There is no sign of missing physics, if the symptoms below are noise." + _yet(d)
+    elif d.p_detect < SELDOM:
         nothing = "There is no sure sign of missing physics: by chance noise does as much now and then." + _yet(d)
     if d.p_detect < 1 - d.confidence:
         nothing = "Yet the base alone remains likelier than all that was tried beside it."

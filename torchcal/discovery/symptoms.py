@@ -1,0 +1,132 @@
+"""What gives a mismatch away beside the residual's structure: bent values, and noise that is not as it should be."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.explain import estimates, stated_sd
+from torchcal.discovery.fitting import Fitted
+from torchcal.discovery.model import Model
+from torchcal.discovery.noise import GRID, estimate
+from torchcal.discovery.problem import Problem, remembered
+from torchcal.discovery.search import Search
+from torchcal.display import with_unit
+
+__all__ = ["symptoms", "unlike"]
+
+#: A base parameter that moves by this many sd when a term is added was bent by it.
+BENT = 3.0
+#: Share of the noise sd that was given below which a white residual is told; its data, and the correlation of
+#: neighbours up to which it is white.
+SMALLER, ENOUGH, WHITE = 0.5, 20, 0.4
+#: Data of a run or sweep from which on its noise is compared with that of others; the probability by chance below which
+#: and the ratio of sd from which on they are told to be unlike.
+COMPARED, UNLIKE, RATIO = 12, 0.01, 2.0
+
+
+def symptoms(search: Search, best: Model | None) -> list[str]:
+    """Calibrated values, and sizes of the residual, that give the mismatch away, in words."""
+    base, then = search.base, {}
+    if best is not None:
+        then = {e.name: e for e in estimates(best.found, range(len(best.found.values)))}
+    runs, bent = [], []
+    for e, at, sd in zip(estimates(base, base.free), base.at_bound.tolist(), stated_sd(base)[base.free], strict=True):
+        moved = 0.0 if best is None else abs(then[e.name].value - e.value)
+        is_bent = moved > max(BENT * max(float(sd), 1e-300), 0.001 * abs(e.value))
+        with_terms = f"{then[e.name].amount} with {' and '.join(best.names)}" if best is not None else ""
+        if at:
+            bound = with_unit(f"{e.value:.4g}", e.unit)
+            text = f"{e.name} runs to its bound, {bound}, in the calibrated base"
+            runs.append(f"{text}; it is {with_terms}" if is_bent else text)
+        elif is_bent:
+            bent.append(f"{e.name} was bent: {e.amount} in the calibrated base, {with_terms}")
+    rows = runs + bent
+    if search.noise.doubted > 1:
+        # A misfit that is smooth on coarse spacing passes for fast: what leaves less tells more of the noise.
+        leader = best or search.physical_leader
+        left = base if leader is None or leader.found.chi2 > base.chi2 else leader.found
+        doubted = estimate(left.problem, left.residual, left.jacobian, search.problem.recording.noise).doubted
+        if doubted > 1:
+            rows.append(f"the residual's fastest part is {doubted:.1f} times the noise sd that was given")
+    if search.noise.source == "given":
+        rows += _too_large(search, base if best is None else best.found)
+    return rows
+
+
+def _too_large(search: Search, found: Fitted) -> list[str]:
+    """Outputs whose noise was given much larger than what is left, where that is white: slow noise a fit takes up."""
+    rows = []
+    problem, outputs = found.problem, search.problem.recording.outputs
+    standard = found.residual / search.noise.sd[problem.index]
+    spare = problem.n - len(found.free)
+    for number, name in enumerate(outputs):
+        mine = standard[problem.output_of == number]
+        size = math.sqrt(float(mine.square().mean()) * problem.n / max(spare, 1)) if len(mine) >= ENOUGH else 1.0
+        slow = max(  # along the rows, and along the condition or time: rows may be in random order
+            sum(float(standard[at[1:]] @ standard[at[:-1]]) for at in along if int(problem.output_of[at[0]]) == number)
+            for along in (problem.sequences, problem.recorded)
+        )
+        if size < SMALLER and slow < WHITE * float(mine @ mine):
+            of = f" of {name}" if len(outputs) > 1 else ""
+            rows.append(
+                f"the residual{of} is white and {size:.2g} times the noise sd that was given: with a smaller one, "
+                "these data would show smaller effects"
+            )
+    return rows
+
+
+def unlike(search: Search, found: Fitted) -> list[str]:
+    """Outputs whose unknown noise would have to be another one in some runs or sweeps than in others, in words.
+
+    What acts in one of several sweeps alone looks like noise that is slow in all of them.
+    """
+    rows: list[str] = []
+    problem = found.problem
+    if not search.noise.open:
+        return rows
+    for number, name in enumerate(problem.recording.outputs):
+        recorded = [places for places in problem.recorded if int(problem.output_of[places[0]]) == number]
+        parts = [part for places in recorded for part in _sweeps(problem, places)]
+        told = [part for part in parts if len(part) >= COMPARED]
+        if len(told) < 2:
+            continue
+        residual = found.residual / search.noise.unit[problem.index]
+        logs, squares = zip(*(_by_memory(problem, part, residual[part]) for part in told), strict=True)
+        counts = torch.tensor([len(part) for part in told], dtype=torch.float64)
+        square, log_det = torch.stack(squares), torch.stack(logs)
+        own = -log_det - 0.5 * counts[:, None] * (square / counts[:, None]).clamp_min(1e-300).log()
+        common = -log_det.sum(0) - 0.5 * counts.sum() * (square.sum(0) / counts.sum()).clamp_min(1e-300).log()
+        ratio = float(own.amax(1).sum() - common.max())
+        chance = float(torch.special.gammaincc(torch.tensor(len(told) - 1.0), torch.tensor(max(ratio, 0.0))))
+        size = (square[:, 0] / counts).sqrt()
+        if chance < UNLIKE and float(size.max()) > RATIO * float(size.min()):
+            kind = "runs" if problem.in_time else "sweeps"
+            of = f" of {name}" if len(problem.recording.outputs) > 1 else ""
+            which = next(k for k, part in enumerate(parts) if part is told[int(size.argmax())])
+            rows.append(
+                f"the residual{of} is not alike in all {kind}: its sd is {float(size.min()):.3g} to "
+                f"{float(size.max()):.3g}, largest in the {kind[:-1]} that is number {which + 1} of {len(parts)}. "
+                "Either the noise differs, or something acts in some of them alone and was taken for slow noise"
+            )
+    return rows
+
+
+def _sweeps(problem: Problem, places: Tensor) -> list[Tensor]:
+    """One of the `recorded` sequences, split where other conditions change than the one that is swept."""
+    x = problem.recording.x
+    if problem.in_time or not isinstance(x, dict) or len(x) < 2:
+        return [places]
+    columns = torch.stack([column[problem.condition_of[places]] for column in x.values()], dim=1)
+    change = columns.diff(dim=0) != 0
+    swept = int(change.sum(0).argmax())
+    others = [k for k in range(columns.shape[1]) if k != swept]
+    return list(places.tensor_split(change[:, others].any(1).nonzero()[:, 0] + 1))
+
+
+def _by_memory(problem: Problem, places: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
+    """Half the log determinant of the correlation of a sweep's noise, and the sum of squares of what is new in each
+    datum, for each coefficient in `GRID`, ``(grid,)`` each."""
+    rho = remembered(GRID, problem.gaps(places))
+    new = (residual[1:, None] - rho * residual[:-1, None]) / (1 - rho.square()).sqrt()
+    return 0.5 * torch.log1p(-rho.square()).sum(0), residual[0].square() + new.square().sum(0)
