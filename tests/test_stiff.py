@@ -15,7 +15,7 @@ from torchcal.discovery.problem import Problem
 from torchcal.discovery.sharpen import sharpen
 from torchcal.errors import DomainError
 from torchcal.inference.summary import settings_of
-from torchcal.results.storage import _with_steps
+from torchcal.results.reading import _with_steps
 from torchcal.simulators import Trajectories, outgrown, settled, settled_implicitly, workable
 from torchcal.terms import extend
 

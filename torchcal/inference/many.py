@@ -25,7 +25,7 @@ from torchcal.data import Recording
 from torchcal.display import PATIENCE
 from torchcal.errors import DomainError, RecordingError, TorchcalError, TorchcalWarning, warn
 from torchcal.inference.calibrate import calibrate
-from torchcal.results import Calibration, storage
+from torchcal.results import Calibration, reading, storage
 from torchcal.simulators import Simulator
 from torchcal.simulators.executor import TaskError, check_executor, portable, run_tasks, worker_died
 
@@ -296,7 +296,7 @@ class _Folder:
             try:  # the simulator's code may have changed since
                 found[name] = Calibration.load(path, simulator=self.simulator)
                 if len(found) == 1:
-                    storage.check_simulator(found[name])
+                    reading.check_simulator(found[name])
             except DomainError as error:
                 raise DomainError(f"{error} The result is in {path}: remove it, or give another folder.") from None
         return found

@@ -14,7 +14,7 @@ from torchcal.prediction import (
     additive_prediction,
 )
 from torchcal.propagation import NISP
-from torchcal.results import storage
+from torchcal.results import reading, storage
 from torchcal.results.base import Result, conditions, indent, thin
 from torchcal.results.diagnostics import Diagnostics, table
 from torchcal.results.estimate import MapEstimate
@@ -51,7 +51,7 @@ class AdditiveCalibration(Result):
     @property
     def parameters(self) -> Tensor:
         """Draws of λ in physical units, ``(S, d)``."""
-        return storage.scaling_of(self.settings).physical(self._needed_draws()[:, :-1])
+        return reading.scaling_of(self.settings).physical(self._needed_draws()[:, :-1])
 
     @property
     def sigma(self) -> Tensor:
@@ -122,7 +122,7 @@ class AdditiveCalibration(Result):
         cls, path: str | os.PathLike[str], *, simulator: Simulator | None = None
     ) -> "AdditiveCalibration":
         """Read a result that `save` wrote."""
-        return storage.read_additive(cls, path, simulator)
+        return reading.read_additive(cls, path, simulator)
 
     def __str__(self) -> str:
         lines = ["Calibration with an additive Gaussian discrepancy"]

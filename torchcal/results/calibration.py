@@ -19,7 +19,7 @@ from torchcal.prediction import (
     parameter_density,
 )
 from torchcal.propagation import NISP
-from torchcal.results import storage
+from torchcal.results import reading, storage
 from torchcal.results.base import Result, conditions, indent, thin
 from torchcal.results.diagnostics import Diagnostics, table
 from torchcal.results.estimate import MapEstimate
@@ -186,7 +186,7 @@ class Calibration(Result):
             path: The file.
             simulator: The simulator it was calibrated with, for predictions elsewhere than at the data.
         """
-        return storage.read_calibration(cls, path, simulator)
+        return reading.read_calibration(cls, path, simulator)
 
     def __str__(self) -> str:
         lines = [f"Calibration with embedded model error ({self.likelihood.name}, {self.settings['embedding']})"]
