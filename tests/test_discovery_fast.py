@@ -12,10 +12,11 @@ import torchcal as tc
 from torchcal.discovery import search as search_module
 from torchcal.discovery.base import calibrate_base
 from torchcal.discovery.candidates import drivers_scale, prepare
+from torchcal.discovery.decision import Decision
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.search import Search
 from torchcal.discovery.sharpen import accurate, sharpen
-from torchcal.discovery.verdict import Decision, _second
+from torchcal.discovery.verdict import _second
 from torchcal.simulators.steps import Steps
 
 F64 = torch.float64

@@ -15,6 +15,7 @@ from torchcal.checks import whole
 from torchcal.data import Recording
 from torchcal.discovery import explain, verify
 from torchcal.discovery.candidates import base_columns, check_repeats
+from torchcal.discovery.decision import Decision
 from torchcal.discovery.embedded import embed_each, model_error_sd
 from torchcal.discovery.experiment import propose
 from torchcal.discovery.fitting import Fitted, starts
@@ -32,7 +33,7 @@ from torchcal.discovery.rounds import settle, with_all, with_explained, without_
 from torchcal.discovery.search import Search
 from torchcal.discovery.several import refit_several
 from torchcal.discovery.symptoms import symptoms, unlike
-from torchcal.discovery.verdict import PLAINLY_WHITE, Decision, decide
+from torchcal.discovery.verdict import PLAINLY_WHITE, decide
 from torchcal.discovery.where import locate, missing_rate, needed_shifts
 from torchcal.display import NONE
 from torchcal.errors import ConvergenceWarning, DomainError, EmbeddingError, RecordingError, warn

@@ -5,10 +5,10 @@ import math
 from torch import Tensor
 
 from torchcal.discovery import explain, verify
+from torchcal.discovery.decision import Decision
 from torchcal.discovery.model import PRIOR, Model
 from torchcal.discovery.records import Hypothesis, Table
 from torchcal.discovery.search import Search
-from torchcal.discovery.verdict import Decision
 from torchcal.display import NONE
 
 __all__ = ["ranking"]

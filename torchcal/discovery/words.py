@@ -6,8 +6,9 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any
 
+from torchcal.discovery.by_share import REMOVED
 from torchcal.discovery.channels import RUN
-from torchcal.discovery.verdict import PLAINLY_WHITE, REMOVED, WHITE
+from torchcal.discovery.verdict import PLAINLY_WHITE, WHITE
 from torchcal.discovery.where_in_words import share_in_words, where_in_words
 from torchcal.display import NONE, up_to, with_unit
 

@@ -1,0 +1,97 @@
+"""Names by the share of the misfit that they remove, where what is left is not white."""
+
+import math
+from collections.abc import Sequence
+
+from torch import Tensor
+
+from torchcal.discovery import explain
+from torchcal.discovery.decision import Decision, other_names, tie_other_names, weigh
+from torchcal.discovery.doubts import distinct, doubt, left_open
+from torchcal.discovery.model import Model
+from torchcal.discovery.proof import gain, prove
+from torchcal.discovery.search import Search
+from torchcal.display import NONE
+
+__all__ = ["decide_exact", "nearly"]
+
+#: Of a recording without noise, the share of the held-out misfit that a named term must remove.
+REMOVED = 0.9
+#: The same of a recording whose noise is unknown, how much more of the misfit every rival must leave, how many times
+#: its noise may be left, and data a free parameter that tell what is noise.
+NEARLY, BEATEN, LEFT, PLENTY = 0.97, 3.0, 3.0, 20
+
+
+def decide_exact(search: Search, ranked: list[Model], mask: Tensor | None, decision: Decision) -> Decision:
+    """Without noise nothing is white: a term must remove nearly all of the held-out misfit that is left, far more than
+    any rival; then another may remove nearly all of what that leaves."""
+    decision.none_evidence = -math.inf
+    recording = search.problem.recording
+    if bool((search.base.residual.abs() <= 1e-6 * recording.spread[search.base.problem.index]).all()):
+        decision.verdict = "consistent"
+        return decision
+    clean = [m for m in ranked if not m.note]
+    accepted: Model | None = None
+    decision.verdict = "unexplained"
+    for size in range(1, search.max_terms + 1):
+        have = set() if accepted is None else set(accepted.numbers)
+        left = search.base.chi2 if accepted is None else accepted.found.chi2
+        group = sorted(
+            (m for m in clean if len(m.numbers) == size and have <= set(m.numbers)), key=lambda m: m.found.chi2
+        )
+        good = [m for m in group if m.found.chi2 <= (1 - REMOVED) * min(left, _least_part(clean, m))
+                and gain(search, m, mask, accepted) >= REMOVED]  # fmt: skip
+        if not good:
+            continue
+        rivals = [
+            m
+            for m in group
+            if frozenset(m.names) != frozenset(good[0].names) and m.found.chi2 < BEATEN * good[0].found.chi2
+        ]
+        if rivals or other_names(search, good[0]):
+            if accepted is None:
+                decision.verdict = "ambiguous"
+                decision.tied_models = [good[0], *rivals]
+                decision.tied = [list(m.names) for m in decision.tied_models]
+                tie_other_names(search, good[0], decision)
+            break
+        if accepted is not None and doubt(search, good[0]):
+            break  # what is there already may be a name all the same
+        accepted = good[0]
+    if accepted is not None and (why := doubt(search, accepted)):
+        decision.verdict, decision.doubt = "ambiguous", why
+        decision.tied, decision.tied_models = [list(accepted.names), list(NONE)], [accepted]
+    elif accepted is not None:
+        decision.verdict, decision.best = "named", accepted
+    most = len(accepted.numbers) if accepted else len(decision.tied_models[0].numbers) if decision.tied_models else 1
+    weigh(search, decision, [m for m in search.models if len(m.numbers) <= most])
+    return decision
+
+
+def _least_part(models: Sequence[Model], model: Model) -> float:
+    """Smallest χ² of a model with fewer of the same terms."""
+    return min((m.found.chi2 for m in models if set(m.numbers) < set(model.numbers)), default=math.inf)
+
+
+def nearly(search: Search, ranked: list[Model], mask: Tensor | None, decision: Decision) -> None:
+    """Real recordings are never quite white: name what removes nearly all, on held-out data too, far before rivals."""
+    clean = [m for m in ranked if not m.note and m.window is None]  # a window bends to whatever is left
+    if search.problem.recording.noise is not None or not clean:
+        return
+    for size in (1, 2):  # three bend to almost anything
+        mine = sorted((m for m in clean if len(m.numbers) == size), key=lambda m: m.found.chi2)
+        if not mine:
+            continue
+        best = mine[0]
+        if explain.removed(search, best) < NEARLY or gain(search, best, mask) < REMOVED:
+            continue
+        most = min((1 - REMOVED) * search.base.chi2, LEFT**2 * search.problem.n)
+        few = distinct(search.problem) < PLENTY * len(best.found.free)
+        if best.found.chi2 > most or few or left_open(search, best):
+            continue  # most of the misfit was noise, or most of what is left is not; or the data leave it open
+        left = 1.0 - explain.removed(search, best)
+        rivals = [m for m in mine[1:] if frozenset(m.names) != frozenset(best.names)]
+        if not other_names(search, best) and all(1.0 - explain.removed(search, m) > BEATEN * left for m in rivals):
+            decision.verdict, decision.best, decision.nearly = "named", best, True
+            prove(search, decision, mask)
+        return
