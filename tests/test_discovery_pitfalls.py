@@ -669,11 +669,12 @@ def test_a_hopeless_base_is_a_misfit_whatever_is_left_looks_like(monkeypatch):
     """Noise that grows with the value took up a lag of 300 log units, and the verdict was that nothing is missing."""
     search = types.SimpleNamespace(
         models=[], exact=False, p_detect=0.6, terms=["lag"], few=False, screen_all=lambda: None,
-        refit_singles=lambda detected=True: None, stop=threading.Event(), left=set(),
+        stop=threading.Event(), left=set(),
     )  # fmt: skip
     for alone, odds, detected in ((1e-9, 0.0, True), (0.04, 2.0, False), (0.04, 8.0, True)):
         monkeypatch.setattr(rounds, "base_alone", lambda search, alone=alone: alone)
         monkeypatch.setattr(rounds, "odds_alone", lambda search, odds=odds: odds)
+        monkeypatch.setattr(rounds, "refit_singles", lambda search, detected=True: None)
         monkeypatch.setattr(rounds, "refit_local", lambda search: None)
         assert rounds._refit(search, 0.95) is detected
 

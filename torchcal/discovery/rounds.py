@@ -25,6 +25,7 @@ from torchcal.discovery.problem import Problem
 from torchcal.discovery.residual import Residual
 from torchcal.discovery.search import Search
 from torchcal.discovery.several import refit_several, scores_beside
+from torchcal.discovery.singles import refit_singles
 from torchcal.discovery.verdict import WHITE, base_alone
 from torchcal.discovery.windows import refit_local
 
@@ -108,7 +109,7 @@ def with_all(
     every = dataclasses.replace(search, problem=observed, clean=True, unit=None)
     every.calibrate_base()
     every.screen_all()
-    every.refit_singles()
+    refit_singles(every)
     if search.stop.is_set():
         return None, ()
     odds, spare = outdone(search, every, detected)
@@ -185,7 +186,7 @@ def _refit(search: Search, confidence: float) -> bool:
     search.screen_all()
     detected = at_once = search.exact or search.p_detect < 1.0 - confidence
     if search.terms:
-        search.refit_singles(detected=detected)
+        refit_singles(search, detected=detected)
         level = 1.0 - confidence
         if not detected and search.few and (p := fits_by_chance(search)) < FEW_DATA * level:
             detected, search.p_detect = True, min(p, search.p_detect)
@@ -195,7 +196,7 @@ def _refit(search: Search, confidence: float) -> bool:
             detected = detected or (not search.few and odds_alone(search) > -math.log(level))
         if detected and not at_once and not search.stop.is_set():
             before, search.models = search.models, []
-            search.refit_singles()
+            refit_singles(search)
             again = {model.numbers for model in search.models}
             search.models += [model for model in before if search.stop.is_set() and model.numbers not in again]
             search.left -= {i for model in before for i in model.numbers}

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.base import calibrate_base
-from torchcal.discovery.beginnings import BENT, beginnings, first_guess, is_far, larger_effects, learned
+from torchcal.discovery.beginnings import larger_effects
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
 from torchcal.discovery.fitting import Fitted, refit, weighed
+from torchcal.discovery.judge import judge
 from torchcal.discovery.likeliest import Tangents, settled, with_unknown
-from torchcal.discovery.local import ENDS, is_window
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.noise import LEAST, Noise
 from torchcal.discovery.own_noise import suited
@@ -31,12 +31,6 @@ from torchcal.terms import Term
 
 __all__ = ["BETTER", "Search", "alike"]
 
-#: Prior odds against an estimate on a physical bound that it wants to cross.
-UNPHYSICAL = math.log(1e-3)
-#: Single terms that are refitted at most.
-MOST = 40
-#: Refitted in any case: this many, and those with at least this share of the largest score.
-FEW, CHANCE = 6, 0.2
 #: Log evidence that a refit must gain for its time steps to be looked at, by how much several terms may fall short of
 #: the best fit for that, and how often steps are chosen anew at most.
 WORTH, NEAR, ROUNDS = 3.0, 20.0, 3
@@ -48,9 +42,6 @@ CLEARLY = 5.0
 HOPELESS = 0.5
 #: Log weight that a term's refit from another start must gain to take the place of the first.
 BETTER = 1.0
-#: Share of the misfit of a bent base that the best term leaves at most, and the probability of as much structure in
-#: noise below which it leaves something, for others to be tried from its base.
-MOSTLY, PLAINLY = 0.5, 0.01
 #: Correlation of projected tangents above which two candidates are one.
 SAME = 0.9999
 
@@ -206,49 +197,6 @@ class Search:
         u, v = (self.candidates[k].tangents[0, :, 0] for k in (i, j))
         return alike(u, v)
 
-    def refit_singles(self, *, detected: bool = True) -> None:
-        """Every candidate that the screening leaves a chance; where nothing was detected only the leading few."""
-        count = len(self.candidates)
-        prior = self.prior
-        order = sorted((i for i in range(count) if self.screening.best[i] >= 0), key=lambda i: -self.screening.score(i))
-        top = self.screening.score(order[0]) if order else 0.0
-        promising = [i for k, i in enumerate(order) if k < FEW or self.screening.score(i) >= CHANCE * top]
-        chosen = promising[:MOST] if detected else order[:FEW]
-        guess = first_guess(self.base, self.fixed, self.seed) if is_far(self.base) else None
-        chances = [*chosen, *self.blind]
-        begin = (beginnings(self.residual, self.screening, i, self.candidates[i], guess) for i in chances)
-        wanted = [Hypothetical((i,), self.candidates[i], rows, prior) for i, rows in zip(chances, begin, strict=True)]
-        found = self.refit_together(wanted)
-        none = {one.numbers[0] for one, model in zip(wanted, found, strict=True) if model is None}
-        self.left = none if self.stop.is_set() else set()
-        self.failed = none - self.left
-        self.models += [model for model in found if model is not None]
-        self.reweigh()
-        self._learn()
-        self.merge()
-
-    def _learn(self) -> None:
-        """Where the best term explains most of a large misfit, but not all, the others begin again at its base.
-
-        A base that is bent far may show the right term with the wrong sign.
-        """
-        lead = self.leader
-        if self.exact or self.stop.is_set() or lead is None or self.base.chi2 < BENT * self.problem.n:
-            return
-        if lead.found.chi2 > MOSTLY * self.base.chi2 or self.examine(lead).p_value >= PLAINLY:
-            return
-        others = [i for i, c in enumerate(self.candidates) if self.screening.best[i] >= 0 and i not in lead.numbers]
-        wanted = []
-        for i in others:
-            try:
-                rows = learned(lead.found, self.base, self.candidates[i])
-            except SimulatorError:  # a function may raise at sizes that are far off: its first fit stays
-                continue
-            if len(rows):
-                wanted.append(Hypothetical((i,), self.candidates[i], rows, self.prior))
-        self.improve(wanted)
-        self.reweigh()
-
     def improve(self, wanted: Sequence[Hypothetical]) -> None:
         """Refit single terms from other starts, and keep what is better than what was found before."""
         for one, model in zip(wanted, self.refit_together(wanted), strict=True):
@@ -332,38 +280,9 @@ class Search:
             return found
 
     def _judge(self, model: Model) -> Model:
-        """Evidence, bounds, where it acts and what speaks against it."""
-        found, candidate = model.found, model.candidate
-        names = [q.name for q in candidate.problem.parameters]
-        if model.window is not None:
-            low, high = model.window.low, model.window.high
-            for i in candidate.own:
-                low = float(found.values[i]) if names[i].endswith(ENDS["from"]) else low
-                high = float(found.values[i]) if names[i].endswith(ENDS["to"]) else high
-            model.window = dataclasses.replace(model.window, low=low, high=high)
-        before = self.base.stuck
-        new = [name for name in found.stuck if name not in before and not is_window(name)]
-        amplitude = {names[i] for i in candidate.amplitudes}
-        off = set()
-        for i, at in zip(found.free, found.at_bound.tolist(), strict=True):
-            if at and names[i] in amplitude:
-                value, q = float(found.values[i]), candidate.problem.parameters[i]
-                end = min((one for one in (q.low, q.high) if one is not None), key=lambda one: abs(one - value))
-                if end == float(candidate.neutral[candidate.own.index(i)]):
-                    off.add(names[i])
-        closed = model.window is not None and model.window.low >= model.window.high
-        model.physical = not new and not closed
-        if closed:
-            model.note = "its window has closed"
-        elif off:
-            model.note = f"wants the wrong sign: {', '.join(sorted(off))} stays at its neutral value"
-        elif new:
-            model.note = f"at its bound: {', '.join(new)}"
-        else:
-            model.note = ""
-        parameters = len([i for i in candidate.own if names[i] not in off])
-        model.price = -0.5 * parameters * math.log(self.problem.n) + (UNPHYSICAL if new else 0.0) + _expected(model)
-        model.log_evidence = self.gain(found.chi2) + model.price
+        """The model with its evidence and what speaks against it."""
+        judge(model, self.base)
+        model.log_evidence = self.gain(model.found.chi2) + model.price
         return model
 
     def gain(self, chi2: float) -> float:
@@ -429,20 +348,6 @@ class Search:
             model.residual = Residual(model.found, self.noise, seed=self.seed, draws=500)
             model.structure = analyse(model.residual)
         return model.structure
-
-
-def _expected(model: Model) -> float:
-    """Log density of a model's estimates where its terms say what these are in nature, relative to its largest."""
-    known = {term.full(name): told for term in model.candidate.terms for name, told in term.expected.items()}
-    if not known:
-        return 0.0
-    found = model.found
-    values, spread = found.by_name, dict(zip(found.by_name, found.sd().tolist(), strict=True))
-    total = 0.0
-    for name, (value, sd) in known.items():
-        own = spread[name] if math.isfinite(spread[name]) else math.inf
-        total -= 0.5 * (values[name] - value) ** 2 / (sd**2 + own**2)
-    return total
 
 
 def alike(u: Tensor, v: Tensor) -> bool:
