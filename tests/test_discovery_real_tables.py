@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import torchcal as tc
-from torchcal.discovery import doubts
+from torchcal.discovery import instruments
 from torchcal.discovery.fitting import fit
 from torchcal.discovery.outliers import spikes
 from torchcal.discovery.problem import Problem
@@ -79,7 +79,7 @@ def falling(base, recording, term, values, sd=0.01):
         exact=False,
         noise=SimpleNamespace(open=False, sd=torch.full((recording.n,), sd, dtype=F64)),
     )
-    return bool(doubts._no_instrument(search, SimpleNamespace(found=found, candidate=candidate)))
+    return bool(instruments.no_instrument(search, SimpleNamespace(found=found, candidate=candidate)))
 
 
 SHOWN = {

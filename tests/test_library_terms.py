@@ -532,6 +532,9 @@ def test_static_sensors():
         torch.testing.assert_close(term.outputs["y"](x, p, y), wanted[term.name], **EXACT)
     drift = term_of(terms, "drift of y")
     torch.testing.assert_close(drift.outputs["y"](x["T0"], p, y), wanted["drift of y"], **EXACT)
+    drift = term_of(sensor(("y",), static=True, drift={"T0": 2.0}), "drift of y")
+    torch.testing.assert_close(drift.outputs["y"](x, p, y), tensor(2.5, -4.0), **EXACT)
+    assert drift.formula == "y → y + b (T0 - 2)"
 
 
 def precession(term, p, *, mu, a, e, positions=("x", "y"), velocities=("vx", "vy")):
@@ -637,6 +640,8 @@ def test_a_distant_third_body_is_a_tide():
         (lambda: sensor(outputs=("x", "x")), "once"),
         (lambda: sensor(outputs={"x": 3.0}), "functions"),
         (lambda: sensor(drift="T0"), "static"),
+        (lambda: sensor(static=True, drift={"T0": float("nan")}), "drift"),
+        (lambda: sensor(static=True, drift=2.0), "drift"),
         (lambda: sensor(units="m"), "units"),
     ],
 )

@@ -273,6 +273,22 @@ class Recording:
             put(twin, "runs", tuple(change(r, outputs={k: kept[k][i].clone() for k in r.outputs}) for i, r in runs))
         return twin
 
+    def without_initial(self, states: Sequence[Sequence[str]]) -> "Recording":
+        """The same recording with the initial values of some states, of each run in turn, unknown.
+
+        Raises:
+            RecordingError: If it is no recording of as many runs.
+        """
+        if self.runs is None or len(states) != len(self.runs):
+            have = "none" if self.runs is None else len(self.runs)
+            raise RecordingError(f"Expected states for each run. Got {len(states)} for {have} (give one list a run).")
+        twin = copy.copy(self)
+        pairs = zip(self.runs, states, strict=True)
+        known = [{state: v for state, v in run.initial.items() if state not in mine} for run, mine in pairs]
+        runs = tuple(change(run, initial=left) for run, left in zip(self.runs, known, strict=True))
+        object.__setattr__(twin, "runs", runs)
+        return twin
+
     @classmethod
     def from_frame(
         cls, frame: Any, x: str | Sequence[str], y: str | Sequence[str], **options: Any

@@ -20,6 +20,8 @@ REMOVED = 0.9
 #: The same of a recording whose noise is unknown, how much more of the misfit every rival must leave, how many times
 #: its noise may be left, and data a free parameter that tell what is noise.
 NEARLY, BEATEN, LEFT, PLENTY = 0.97, 3.0, 3.0, 20
+#: Log odds by which a hypothesis of other terms, or more, is clearly likelier.
+OUTDONE = 5.0
 
 
 def decide_exact(search: Search, ranked: list[Model], mask: Tensor | None, decision: Decision) -> Decision:
@@ -89,6 +91,9 @@ def nearly(search: Search, ranked: list[Model], mask: Tensor | None, decision: D
         few = distinct(search.problem) < PLENTY * len(best.found.free)
         if best.found.chi2 > most or few or left_open(search, best):
             continue  # most of the misfit was noise, or most of what is left is not; or the data leave it open
+        leading = ranked[0]
+        if not set(best.names) <= set(decision.beside) or leading.weight > best.weight + OUTDONE:
+            continue  # what is left is likelier without it, or with others beside it
         left = 1.0 - explain.removed(search, best)
         rivals = [m for m in mine[1:] if frozenset(m.names) != frozenset(best.names)]
         if not other_names(search, best) and all(1.0 - explain.removed(search, m) > BEATEN * left for m in rivals):

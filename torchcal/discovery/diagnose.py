@@ -32,7 +32,7 @@ from torchcal.discovery.result import Diagnosis
 from torchcal.discovery.rounds import settle, with_all, with_explained, without_others
 from torchcal.discovery.search import Search
 from torchcal.discovery.several import refit_several
-from torchcal.discovery.symptoms import symptoms, unlike
+from torchcal.discovery.symptoms import from_samples, more_than_replicates, symptoms, unlike
 from torchcal.discovery.verdict import PLAINLY_WHITE, decide
 from torchcal.discovery.where import locate, missing_rate, needed_shifts
 from torchcal.display import NONE
@@ -306,6 +306,7 @@ def _result(
         improved = _improved(simulator, best)
     left = search.base if best is None else best.found
     apart = unlike(search, left) if decision.verdict in ("consistent", "named") else []
+    else_ = [] if decision.verdict == "consistent" else [*from_samples(search), *more_than_replicates(search)]
     remaining, depends = 0.0 if decision.verdict == "consistent" else 1.0, ""
     if best is not None:
         white = best.structure is not None and best.structure.p_value >= PLAINLY_WHITE and not search.exact
@@ -332,7 +333,7 @@ def _result(
         before=before,
         after=after,
         improved=improved,
-        symptoms=[*symptoms(search, best), *apart],
+        symptoms=[*else_, *symptoms(search, best), *apart],
         noise=_told_noise(search, decision, 1.0 - confidence).record(search.problem),
         base=base,
         final=final,

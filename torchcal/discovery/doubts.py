@@ -1,20 +1,18 @@
 """Why the best explanation of a recording may be no name, however probable it is."""
 
-import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from torchcal.discovery.candidates import spread_values
 from torchcal.discovery.explain import misfit_size
+from torchcal.discovery.instruments import no_instrument, unnatural
 from torchcal.discovery.local import force, is_window
 from torchcal.discovery.model import Model
 from torchcal.discovery.own_noise import beside
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.search import Search
-from torchcal.terms import Term, extend
 
 __all__ = ["distinct", "doubt", "left_open"]
 
@@ -35,20 +33,13 @@ CLEARLY_OPEN = 2.0
 LEVELS, NEARLY = 3, 0.2
 #: Log odds against a nameless change from which on a term in a window is there for its own shape.
 CLEARLY = 3.0
-#: Noise sd by which an instrument's reading must fall while the true value rises to be no instrument's: a hard limit is
-#: one. And the least sd, in the data's spread.
-FALL, ROUNDING = 2.0, 1e-3
-#: Variation that an instrument may add, in that of what it measures: with more it is another model of the thing.
-ADDED = 1.0
-#: Share of the range of the true values by which it is looked at beyond them.
-BEYOND = 0.2
 #: Share of the largest effect of the base's parameters below which a direction of them moves no datum.
 UNSEEN = 1e-7
 
 
 def doubt(search: Search, model: Model) -> str:
     """Why a model is no name, however probable, in a sentence; empty if it may be one."""
-    found = left_open(search, model) or _no_better(search, model) or _no_instrument(search, model)
+    found = left_open(search, model) or _no_better(search, model) or unnatural(model) or no_instrument(search, model)
     return found or ("" if search.exact else _noise_or_physics(search, model))
 
 
@@ -139,95 +130,6 @@ def _beside(columns: Tensor, moved: Tensor) -> float:
     unit = columns / columns.norm(dim=0).clamp_min(1e-300)
     left = moved - unit @ torch.linalg.lstsq(unit, moved[:, None], rcond=1e-10, driver="gelsd").solution[:, 0]
     return float(left.norm())
-
-
-def _no_instrument(search: Search, model: Model) -> str:
-    """Why a model's instruments are none: the reading of one falls where the true value rises, or shows more of the
-    instrument than of what it measures."""
-    problem = model.found.problem
-    instruments = [term for term in model.candidate.terms if term.is_sensor and not term.states]
-    if not instruments:
-        return ""
-    others = [term for term in model.candidate.terms if term not in instruments]
-    bare = search.problem.with_simulator(extend(search.problem.simulator, others))
-    bare = dataclasses.replace(bare, keep=problem.keep)
-    values = spread_values(bare, [q.name for q in problem.parameters], model.found.values)
-    true = bare.evaluate(values[None], [], bare.guess(model.found.warm, values[None]))[0][0]
-    drivers = problem.drivers_at_data(model.found.values[None], model.found.warm)
-    p = {name: values.new_tensor(value) for name, value in model.found.by_name.items()}
-    sd = _noise_at_data(search, model)
-    for term in instruments:
-        for name, function in term.outputs.items():
-            number = problem.recording.outputs.index(name) if name in problem.recording.outputs else 0
-            here = (problem.output_of == number).nonzero()[:, 0]
-            reading = _reading(problem, term, function, {d: along[here] for d, along in drivers.items()}, p)
-            if reading is None:
-                continue
-            y = _range(true[here])
-            slope = _slope(reading, y)
-            fall = -(y.diff() * 0.5 * (slope[:-1] + slope[1:]).clamp_max(0)).nansum()
-            if float(fall) > FALL * float(sd[here].median()):
-                return (
-                    f"By it the reading of {name} falls where the true value rises, at the recorded values or just "
-                    "beyond them, as that of no instrument does."
-                )
-            shown = reading(true[here])
-            if float((shown - true[here]).std()) > ADDED * float(true[here].std()):
-                return f"By it the reading of {name} varies more by the instrument's error than by the true value."
-            true[here] = shown
-    return ""
-
-
-def _noise_at_data(search: Search, model: Model) -> Tensor:
-    """Sd of the noise, or of what a model leaves where there is none, ``(n,)``."""
-    problem = model.found.problem
-    if not search.exact:
-        return beside(search, model).sd[problem.index]
-    left = torch.zeros(problem.n, dtype=torch.float64)
-    for output in problem.output_of.unique():
-        mine = problem.output_of == output
-        left[mine] = model.found.residual[mine].square().mean().sqrt()
-    return torch.maximum(left, ROUNDING * problem.recording.spread[problem.index])
-
-
-def _reading(
-    problem: Problem, term: Term, function: Callable[..., Tensor], drivers: dict[str, Tensor], p: dict[str, Tensor]
-) -> Callable[[Tensor], Tensor] | None:
-    """What an instrument shows of true values ``(m,)``; None where that depends on anything but these."""
-
-    def reading(y: Tensor, by: int = 0) -> Tensor:
-        at = {name: along.roll(by) for name, along in drivers.items()}
-        x = at if isinstance(problem.recording.x, dict) else next(iter(at.values()))
-        shown = function(at["t"], at, term.own(p), at, y) if problem.in_time else function(x, term.own(p), y)
-        return shown + 0 * y
-
-    y = torch.linspace(1.0, 2.0, len(next(iter(drivers.values()))), dtype=torch.float64)
-    try:
-        shown = reading(y)
-        same = all(torch.allclose(shown, reading(y, by), rtol=0, atol=0, equal_nan=True) for by in (1, len(y) // 2))
-    except Exception:  # the simulator calls it otherwise, and tells what is wrong
-        return None
-    return reading if same else None
-
-
-def _range(true: Tensor) -> Tensor:
-    """As many values from somewhat below the true ones ``(m,)`` to somewhat above, but not beyond 0 if all are on one
-    side of it: a fit likes the turning point of a response, where it bends most, and stops just short of it."""
-    low, high = true.min(), true.max()
-    beyond = BEYOND * (high - low)
-    return torch.linspace(
-        float((low - beyond).clamp_min(0) if low >= 0 else low - beyond),
-        float((high + beyond).clamp_max(0) if high <= 0 else high + beyond),
-        len(true),
-        dtype=true.dtype,
-    )
-
-
-def _slope(reading: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
-    """Of what is shown by what is true, ``(m,)``; 0 where the one does not follow from the other."""
-    with torch.enable_grad():
-        leaf = y.detach().clone().requires_grad_(True)
-        return torch.autograd.grad(reading(leaf).sum(), leaf)[0].detach()
 
 
 def _noise_or_physics(search: Search, model: Model) -> str:

@@ -255,7 +255,8 @@ def other_minima(search: Search, model: Model) -> list[str]:
         away = (again.ends[k] - found.values).abs()
         if more < RIVAL and any(float(away[i]) > ELSEWHERE * float(sd[i]) for i in places):
             values = [f"{found.problem.parameters[i].name} = {float(again.ends[k, i]):.3g}" for i in places]
-            return [f"{', '.join(values)} fits about as well (χ² {more:+.2g}): the sd given holds around one minimum"]
+            told = f"{', '.join(values)} fits about as well (χ² {max(more, 0.0):+.1f})"
+            return [f"{told}: the sd given holds around one minimum"]
     return []
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +14,8 @@ from torchcal.simulators import Parameter
 from torchcal.terms import Term
 
 __all__ = [
-    "EDGE", "ENDS", "SHORT", "WIDTHS", "Span", "beyond", "driver_at", "force", "is_window", "localised", "region_text",
+    "EDGE", "ENDS", "SHORT", "WIDTHS", "Span", "beyond", "driver_at", "force", "is_window", "localised", "multiplied",
+    "region_text",
 ]  # fmt: skip
 
 #: Width of a window's edges, as a share of the driver's range: wide enough for a fit to move them; and the limits
@@ -110,29 +111,29 @@ def localised(
     def now(t: Any, s: Any, p: Any, u: Any) -> Any:
         return force(span, at(t + term.began(p), s, p, u), p)  # windows are on the clock
 
-    def moving(function: Callable[..., Any]) -> Callable[..., Any]:
-        return lambda t, s, p, u: now(t, s, p, u) * function(t, s, p, u)
+    share = (lambda x, p: force(span, at(x), p)) if static else now
+    formula = f"{term.formula or term.name} where {region_text(driver, low, high, span)}"
+    return multiplied(term, term.name, share, parameters=ends, formula=formula)
 
-    def sensing(function: Callable[..., Any]) -> Callable[..., Any]:
-        def observe(t: Any, s: Any, p: Any, u: Any, y: Any) -> Any:
-            return y + now(t, s, p, u) * (function(t, s, p, u, y) - y)
 
-        return observe
+def multiplied(
+    term: Term, name: str, share: Callable[..., Any], *, parameters: Sequence[Parameter] = (), formula: str = ""
+) -> Term:
+    """Another term that does a share of what a term does, by what its functions are given (but the output they see)."""
 
-    def still(function: Callable[..., Any]) -> Callable[..., Any]:
-        return lambda x, p: force(span, at(x), p) * function(x, p)
+    def acting(function: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda *given: share(*given) * function(*given)
 
     def seeing(function: Callable[..., Any]) -> Callable[..., Any]:
-        return lambda x, p, y: y + force(span, at(x), p) * (function(x, p, y) - y)
+        return lambda *given: given[-1] + share(*given[:-1]) * (function(*given) - given[-1])
 
-    around = still if static else moving
     return Term(
-        term.name,
-        rates={state: moving(function) for state, function in term.rates.items()},
-        outputs={name: (seeing if static else sensing)(function) for name, function in term.outputs.items()},
-        shifts={name: around(function) for name, function in term.shifts.items()},
-        parameters=[*term.parameters, *ends],
-        formula=f"{term.formula or term.name} where {region_text(driver, low, high, span)}",
+        name,
+        rates={state: acting(function) for state, function in term.rates.items()},
+        outputs={output: seeing(function) for output, function in term.outputs.items()},
+        shifts={parameter: acting(function) for parameter, function in term.shifts.items()},
+        parameters=[*term.parameters, *parameters],
+        formula=formula or term.formula,
         description=term.description,
         scales=term.scales,
         elapsed=term.elapsed,

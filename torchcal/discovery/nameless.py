@@ -19,7 +19,17 @@ from torch import Tensor
 
 from torchcal.discovery.candidates import Candidate, prepare
 from torchcal.discovery.channels import channels
-from torchcal.discovery.local import EDGE, ENDS, WIDTH_OF_EDGE, WIDTHS, Span, driver_at, is_window, localised
+from torchcal.discovery.local import (
+    EDGE,
+    ENDS,
+    WIDTH_OF_EDGE,
+    WIDTHS,
+    Span,
+    driver_at,
+    is_window,
+    localised,
+    multiplied,
+)
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.own_noise import likeliest_alone
 from torchcal.discovery.problem import is_value_of
@@ -42,6 +52,8 @@ TRIED, CUTS = 4, 14
 INSIDE, STARTS = 10, 2
 #: Shares of a window by which its ends are moved for other starts; not at all first.
 MOVES = (0.0, -0.15, 0.15, -0.3, 0.3)
+#: Share that is left of a fading change at the end of its window.
+FADED = 0.05
 #: Relative difference up to which two effects are one, and relative size from which on two are independent.
 SAME, RANK = 1e-4, 1e-7
 
@@ -76,7 +88,7 @@ def refit_nameless(search: Search) -> None:
 @dataclass(eq=False)
 class _Changes:
     """Changes without a name that leading terms in windows are held against: constant ones, and such as grow from the
-    end of an open window.
+    end of an open window, or fade towards it.
 
     Attributes:
         search: Whose terms these are.
@@ -106,8 +118,8 @@ class _Changes:
         return cls(search, prior, named, _elsewhere(search, list(listed.values())))
 
     def hold_against(self, lead: Model) -> None:
-        """Refit changes beside the leading terms in windows: where these act, but not in places that a constant of the
-        list names; and those elsewhere that come nearest."""
+        """Refit changes beside the leading terms in windows: where these act, but no constants that the list names; and
+        those elsewhere that come nearest."""
         search = self.search
         near = [m for m in search.models if m.physical and m.window is not None and m.weight > lead.weight - CLOSE]
         wanted: dict[tuple[Places, str], list[Hypothetical]] = {}
@@ -120,10 +132,10 @@ class _Changes:
             fresh = [k for k, own in self.elsewhere.items() if mine is None or not _within(own, mine)]
             for place in dict.fromkeys([where, *fresh]):
                 key = (place, window.driver, window.low, window.high)
-                if (place, window.driver) in wanted or key in self.tried or place in self.named:
+                if (place, window.driver) in wanted or key in self.tried:
                     continue
                 self.tried.add(key)
-                begun, chi2 = _wanted(search, model, place, self.prior)
+                begun, chi2 = _wanted(search, model, place, self.prior, self.named)
                 if place == where:
                     wanted[place, window.driver] = begun
                 elif chi2 < search.base.chi2:
@@ -209,9 +221,12 @@ def _is_constant(search: Search, candidate: Candidate, own: Tensor) -> bool:
     return constant is not None and own.shape[1] == 1 and _within(own, constant)
 
 
-def _wanted(search: Search, model: Model, where: Places, prior: float) -> tuple[list[Hypothetical], float]:
-    """A constant in a model's window, with steep edges and with edges to fit; an open window closed as well, and with a
-    change that grows from its end. And the least χ² of all their beginnings, for linear."""
+def _wanted(
+    search: Search, model: Model, where: Places, prior: float, named: set[Places | None]
+) -> tuple[list[Hypothetical], float]:
+    """A constant in a model's window, with steep edges and with edges to fit; an open window closed as well, with a
+    change that grows from its end, and with one that fades towards it. And the least χ² of all their beginnings, for
+    linear."""
     w = model.window
     if w is None:
         return [], math.inf
@@ -226,11 +241,17 @@ def _wanted(search: Search, model: Model, where: Places, prior: float) -> tuple[
         last = w.low if math.isfinite(w.low) else w.high  # the end that it has, which need not be one of the data
         cuts = sorted({*cuts[1:], last}) if math.isfinite(w.low) else sorted({*cuts[:-1], last})
         ends += [list(itertools.combinations(cuts, 2))] if len(cuts) > 1 else []
-    constant = _constant(where, search.problem.in_time)
-    shapes = [(constant, chosen, edge) for chosen in ends for edge in (False, True)]
+    still = _constant(where, search.problem.in_time)
+    shapes = [(still, chosen, edge) for chosen in ends for edge in (False, True)] if where not in named else []
     if len(ends) > 1:
-        grows = _distance(w.driver, ENDS["from" if math.isfinite(w.low) else "to"], span, search.problem.in_time)
-        shapes.append((_constant(where, search.problem.in_time, grows), ends[0], False))
+        in_time, end = search.problem.in_time, ENDS["from" if math.isfinite(w.low) else "to"]
+        grows = _distance(w.driver, end, span, in_time)
+        shapes.append((_constant(where, in_time, grows), ends[0], False))
+        fading = _fading(w.driver, end, span, in_time)
+        shapes.append((_constant(where, in_time, fading), ends[0], False))
+        term = search.candidates[model.numbers[0]].terms[0]
+        if where == _places(model.candidate) and not term.elapsed:  # whose t is not the window's
+            shapes.append((multiplied(term, f"a fading {term.name}", fading), ends[0], False))
     found, least = [], math.inf
     for change, chosen, edge in shapes:
         low, high = chosen[0]
@@ -272,6 +293,20 @@ def _distance(driver: str, end: str, span: Span, in_time: bool) -> Callable[...,
     """How far a driver is beyond an end of a window, in its range; of what a term's functions are given."""
     at = driver_at(driver, static=not in_time)
     return lambda *given: span.distance(at(*given), given[2 if in_time else 1][end]) / span.size
+
+
+def _fading(driver: str, end: str, span: Span, in_time: bool) -> Callable[..., Any]:
+    """What decays from the open side of a window to `FADED` at its end; of what a term's functions are given."""
+    at = driver_at(driver, static=not in_time)
+    edge = span.low if end == ENDS["to"] else span.high
+
+    def share(*given: Any) -> Any:
+        last = given[2 if in_time else 1][end]
+        length = span.distance(last, edge)
+        length = torch.where(length.abs() > SAME * span.size, length, SAME * span.size)
+        return FADED ** (span.distance(at(*given), edge) / length).clamp(0.0, 1.0)
+
+    return share
 
 
 def _constant(where: Places, in_time: bool, grows: Callable[..., Any] | None = None) -> Term:

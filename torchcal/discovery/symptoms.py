@@ -1,19 +1,24 @@
 """What gives a mismatch away beside the residual's structure: bent values, and noise that is not as it should be."""
 
+import dataclasses
 import math
 
 import torch
 from torch import Tensor
 
 from torchcal.discovery.explain import estimates, stated_sd
-from torchcal.discovery.fitting import Fitted
+from torchcal.discovery.fitting import Fitted, fit
 from torchcal.discovery.model import Model
 from torchcal.discovery.noise import GRID, estimate
 from torchcal.discovery.problem import Problem, remembered
+from torchcal.discovery.residual import Residual
 from torchcal.discovery.search import Search
+from torchcal.discovery.structure import analyse
 from torchcal.display import with_unit
+from torchcal.errors import SimulatorError
+from torchcal.simulators import Trajectories
 
-__all__ = ["symptoms", "unlike"]
+__all__ = ["from_samples", "more_than_replicates", "symptoms", "unlike"]
 
 #: A base parameter that moves by this many sd when a term is added was bent by it.
 BENT = 3.0
@@ -23,6 +28,12 @@ SMALLER, ENOUGH, WHITE = 0.5, 20, 0.4
 #: Data of a run or sweep from which on its noise is compared with that of others; the probability by chance below which
 #: and the ratio of sd from which on they are told to be unlike.
 COMPARED, UNLIKE, RATIO = 12, 0.01, 2.0
+#: Probability by chance of what freeing given initial values removes, from which on that is told; and of what is left
+#: then, from which on that is noise.
+REMOVES, NOISE = 1e-3, 0.05
+#: Times what replicates tell of the noise that means of conditions scatter by, from which on that is told where these
+#: are white; and conditions that it takes.
+SCATTER, MEANS = 1.5, 8
 
 
 def symptoms(search: Search, best: Model | None) -> list[str]:
@@ -130,3 +141,75 @@ def _by_memory(problem: Problem, places: Tensor, residual: Tensor) -> tuple[Tens
     rho = remembered(GRID, problem.gaps(places))
     new = (residual[1:, None] - rho * residual[:-1, None]) / (1 - rho.square()).sqrt()
     return 0.5 * torch.log1p(-rho.square()).sum(0), residual[0].square() + new.square().sum(0)
+
+
+def from_samples(search: Search) -> list[str]:
+    """Initial values that were given as the first sample recorded, with its noise, in words, where that matters."""
+    problem, base = search.problem, search.base
+    bound, recording = base.problem.simulator, problem.recording
+    if search.exact or recording.runs is None or not isinstance(bound, Trajectories):
+        return []
+    several = len(recording.runs) > 1
+    shown = [
+        [name for name in run.initial if name in run.outputs and run.initial[name] == float(run.outputs[name][0])]
+        for run in recording.runs
+    ]
+    taken = {
+        f"{name}(0)[{r}]" if several else f"{name}(0)": run.initial[name]
+        for r, (run, names) in enumerate(zip(recording.runs, shown, strict=True)) for name in names
+    }  # fmt: skip
+    if not taken:
+        return []
+    twin = recording.without_initial(shown)
+    open_ = dataclasses.replace(base.problem, recording=twin, simulator=bound.ode.bind(twin))
+    known = base.by_name | taken
+    begin = torch.tensor([[known[q.name] for q in open_.parameters]], dtype=torch.float64)
+    names = {base.problem.parameters[i].name for i in base.free} | set(taken)
+    free = [i for i, q in enumerate(open_.parameters) if q.name in names]
+    try:
+        found = fit(open_, search.noise.whitening(open_), begin, free)
+    except SimulatorError:
+        return []
+    gain = 0.0 if found is None else base.chi2 - found.chi2
+    chance = torch.special.gammaincc(torch.tensor(0.5 * len(taken)), torch.tensor(0.5 * max(gain, 0.0)))
+    if found is None or float(chance) > REMOVES:
+        return []
+    left = analyse(Residual(found, search.noise, seed=search.seed)).p_value
+    excess = max(base.chi2 - problem.n, 1e-300)
+    told = "leaves no more than noise" if left >= NOISE else f"misses {min(gain / excess, 1.0):.0%} less"
+    which = ", ".join(taken)
+    return [
+        f"{which} {'was' if len(taken) == 1 else 'were'} given as the first value recorded, noise and all: with "
+        f"{'it' if len(taken) == 1 else 'them'} unknown (left out of initial=) the base {told}"
+    ]
+
+
+def more_than_replicates(search: Search) -> list[str]:
+    """Outputs whose means at the conditions scatter by more than replicates do, but white, in words: a preparation that
+    replicates share is noise that they do not show."""
+    rows: list[str] = []
+    problem, x = search.base.problem, search.problem.recording.x
+    if search.noise.source != "replicates":
+        return rows
+    columns = torch.stack(list(x.values()) if isinstance(x, dict) else [x], dim=-1).double()
+    levels, group = columns.unique(dim=0, return_inverse=True)
+    standard = search.base.residual / search.noise.sd[problem.index]
+    for number, name in enumerate(problem.recording.outputs):
+        mine = problem.output_of == number
+        which = group[problem.condition_of[mine]]
+        count = torch.bincount(which, minlength=len(levels)).double()
+        seen = count > 0
+        mean = torch.zeros(len(levels), dtype=torch.float64).index_add_(0, which, standard[mine])[seen]
+        mean = mean / count[seen].sqrt()
+        if len(mean) < MEANS:
+            continue
+        size = math.sqrt(float(mean.square().sum()) / max(len(mean) - len(search.base.free), 1))
+        ordered = [mean[levels[seen][:, k].argsort(stable=True)] for k in range(levels.shape[1])]
+        slow = max(float(m[1:] @ m[:-1]) for m in ordered)
+        if size > SCATTER and slow < WHITE * float(mean @ mean):
+            of = f" of {name}" if len(problem.recording.outputs) > 1 else ""
+            rows.append(
+                f"the means of replicates{of} are {size:.1f} times as far off as these tell, in no order: replicates "
+                "that share a preparation or a calibration do not show all of the noise"
+            )
+    return rows

@@ -7,7 +7,8 @@ from torch import Tensor
 
 from torchcal.discovery.by_share import decide_exact, nearly
 from torchcal.discovery.decision import Decision, certain, groups_of, other_names, tie_other_names, weigh
-from torchcal.discovery.doubts import doubt
+from torchcal.discovery.doubts import doubt, left_open
+from torchcal.discovery.instruments import only_instruments
 from torchcal.discovery.model import PRIOR, Model
 from torchcal.discovery.own_noise import weigh_alone
 from torchcal.discovery.proof import prove
@@ -161,7 +162,11 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     # One alone is not sure enough, or it had been named; and where several do what something unknown there would do.
     rival = any(m.weight > best.weight - BEHIND for m in search.nameless)
     local = rival and all(model.window is not None for model in decision.tied_models)
-    if len(decision.tied) < 2 or decision.none > min(1 - UNKNOWN, _second(decision, ranked)) or local:
+    decision.doubt = left_open(search, best)
+    # Windows and instruments bend to what no term of the list explains.
+    pliant = all(m.window is not None or only_instruments(m) for m in decision.tied_models)
+    likely = decision.none > min(1 - UNKNOWN, _second(decision, ranked))
+    if len(decision.tied) < 2 or likely or local or pliant or decision.doubt:
         decision.tied.append(list(NONE))
     return decision
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchcal.errors import DomainError
 from torchcal.simulators import Parameter
 from torchcal.terms.pieces import amplitude, check_name, check_names, excess, shape
-from torchcal.terms.term import Term, outer
+from torchcal.terms.term import Term, is_finite, outer
 
 __all__ = ["sensor"]
 
@@ -26,7 +26,7 @@ def sensor(
     outputs: str | Sequence[str] | Mapping[str, Signal] = ("x",),
     *,
     static: bool = False,
-    drift: str | None = None,
+    drift: str | Mapping[str, float] | None = None,
     dynamic: bool = True,
     units: Mapping[str, str] | None = None,
     time: str = "s",
@@ -48,7 +48,8 @@ def sensor(
             from states and parameters alone; where it depends on t or an input, say ``dynamic=False``.
         static: Whether they are outputs of a static simulator: then there is neither lag nor delay, and a drift only
             against a condition.
-        drift: Condition against which the instrument of a static simulator drifts.
+        drift: Condition against which the instrument of a static simulator drifts, and the value at which it reads
+            right, ``{"T": 293.15}``. With the name alone that is 0; far from there a drift is an offset, nearly.
         dynamic: Whether to offer lag and delay, each of which brings hidden states.
         units: Units of the outputs, for reports; ``[x]`` stands for that of x otherwise.
         time: Unit of time, for reports.
@@ -79,7 +80,8 @@ def sensor(
         unit = (units or {}).get(output, f"[{output}]")
         terms += _instant(output, unit, static)
         if static and drift is not None:
-            terms.append(_drift(output, f"{unit}/[{check_name(drift, 'drift')}]", drift))
+            ((condition, origin),) = _origin(drift).items()
+            terms.append(_drift(output, f"{unit}/[{condition}]", condition, origin))
         if not static:
             terms.append(_drift(output, f"{unit}/{check_name(time, 'time')}", None))
             if dynamic:
@@ -120,14 +122,26 @@ def _instant(output: str, unit: str, static: bool) -> list[Term]:
     ]  # fmt: skip
 
 
-def _drift(output: str, unit: str, condition: str | None) -> Term:
+def _origin(drift: str | Mapping[str, float]) -> dict[str, float]:
+    """The condition of a drift, and where it is nothing."""
+    found = {drift: 0.0} if isinstance(drift, str) else drift
+    if not isinstance(found, Mapping) or len(found) != 1 or not all(map(is_finite, found.values())):
+        raise DomainError(
+            f'Expected drift= as a condition, or as one with the value at which it is nothing, {{"T": 293.15}}. '
+            f"Got {drift!r}."
+        )
+    return {check_name(name, "drift"): float(value) for name, value in found.items()}
+
+
+def _drift(output: str, unit: str, condition: str | None, origin: float = 0.0) -> Term:
     if condition is None:
         seen: Signal = lambda t, s, p, u, y: y + p["b"] * t  # noqa: E731
     else:
-        seen = lambda x, p, y: y + p["b"] * (x[condition] if isinstance(x, Mapping) else x)  # noqa: E731
+        seen = lambda x, p, y: y + p["b"] * ((x[condition] if isinstance(x, Mapping) else x) - origin)  # noqa: E731
+    against = (condition or "t") if not origin else f"({condition} - {origin:g})"
     return Term(
         f"drift of {output}", outputs={output: seen}, parameters=[amplitude("b", unit)],
-        formula=f"{output} → {output} + b {condition or 't'}", description="The instrument's zero moves steadily.",
+        formula=f"{output} → {output} + b {against}", description="The instrument's zero moves steadily.",
         elapsed="recording" if condition is None else None,
     )  # fmt: skip
 

@@ -1,0 +1,136 @@
+"""What looks like missing physics and is none, and names that stand in for what is in no list."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+import torchcal as tc
+from torchcal.display import NONE
+
+F64 = torch.float64
+
+
+def diagnose(simulator, recording, terms):
+    return tc.diagnose(simulator, recording, terms, seed=0, progress=False)
+
+
+def cleared(seed, store, lag=0.0, noise=0.02):
+    """A concentration after a dose, with a store beside it or an instrument that lags, each absent at 0."""
+    t = np.linspace(0.0, 12.0, 60)
+
+    def rates(_, s):
+        out = store * (s[0] - s[1])
+        return [-0.5 * s[0] - out, 0.6 * out, (s[0] - s[2]) * np.log(10) / max(lag, 1e-6)]
+
+    y = solve_ivp(rates, (0, 12), [2.0, 0.0, 2.0], t_eval=t, rtol=1e-9, atol=1e-12, method="LSODA").y[2 if lag else 0]
+    model = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"C": -p["k"] * s["C"]},
+        states={"C": "mg/l"},
+        parameters=[tc.Parameter("k", low=0.0, initial=0.4)],
+    )
+    y = y + noise * np.random.default_rng(seed).standard_normal(60)
+    return model, tc.Recording(runs=[tc.Run(time=t, outputs={"C": y}, initial={"C": 2.0})], noise=noise)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_store_that_is_in_no_list_is_no_lag_of_an_instrument(seed):
+    # Half of the signal late, and the rest at once, is no instrument.
+    terms = [term for term in tc.terms.sensor("C") if term.name.split(" of ")[0] in ("lag", "delay", "offset")]
+    d = diagnose(*cleared(seed, store=0.5), terms)
+    assert d.verdict in ("ambiguous", "unexplained")
+    if d.verdict == "ambiguous":
+        assert list(NONE) in d.tied
+    d = diagnose(*cleared(seed, store=0.0, lag=1.5), terms)
+    assert ["lag of C"] in ([d.terms] if d.verdict == "named" else d.tied)
+
+
+def rate(seed, offset=0.0, saturates=None, noise=0.01):
+    """Michaelis and Menten's law with replicates, as an instrument shows it."""
+    s = torch.tensor([0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 20.0], dtype=F64).repeat(3)
+    v = 2.0 * s / (1.0 + s)
+    v = v if saturates is None else v - 0.7 * (v - saturates).clamp_min(0)
+    y = v + offset + noise * torch.as_tensor(np.random.default_rng(seed).standard_normal(len(s)))
+    base = tc.Simulator(
+        lambda x, p: {"v": p["V"] * x["S"] / (p["K"] + x["S"])},
+        [tc.Parameter("V", low=0.0, initial=1.0), tc.Parameter("K", low=0.0, initial=2.0)],
+    )
+    return base, tc.Recording(x={"S": s}, y={"v": y}, noise=noise)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_an_offset_that_is_in_no_list_is_no_saturation_below_all_data(seed):
+    terms = [term for term in tc.terms.sensor("v", static=True) if "offset" not in term.name]
+    d = diagnose(*rate(seed, offset=0.15), terms)
+    assert d.verdict != "named"
+    assert d.verdict == "unexplained" or list(NONE) in d.tied
+    d = diagnose(*rate(seed, saturates=1.3), terms)
+    assert "saturation of v" in (d.terms if d.verdict == "named" else [name for tied in d.tied for name in tied])
+
+
+def discharged(seed, tau=2.0, until=None, noise=0.01):
+    """A capacitor with a loss that fades, or that ends."""
+    t = np.linspace(0.0, 20.0, 100)
+
+    def rates(t, v):
+        more = 0.1 * (np.exp(-t / tau) if until is None else float(t < until))
+        return [-(0.08 + more) * v[0]]
+
+    v = solve_ivp(rates, (0, 20), [5.0], t_eval=t, rtol=1e-8, atol=1e-10, max_step=0.1).y[0]
+    model = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"v": -p["a"] * s["v"]},
+        states={"v": "V"},
+        parameters=[tc.Parameter("a", low=0.0, initial=0.1)],
+    )
+    v = v + noise * np.random.default_rng(seed).standard_normal(100)
+    shunt = tc.Term(
+        "shunt", equation="v", rate=lambda t, s, p, u: -p["g"] * s["v"], parameters=[tc.Parameter("g", low=0.0)]
+    )
+    return model, tc.Recording(runs=[tc.Run(time=t, outputs={"v": v})], noise=noise), [shunt]
+
+
+def test_a_loss_that_fades_is_none_that_ends():
+    # It was named where t < 3, from a window's better fit than that of no change.
+    d = diagnose(*discharged(0, tau=4.0))
+    assert d.verdict == "unexplained"
+    assert any("fading shunt" in row.note for row in d.ranking)
+    d = diagnose(*discharged(0, until=6.0))
+    assert d.verdict == "named"
+    assert d.terms == ["shunt"]
+
+
+def test_an_initial_value_that_is_the_first_sample_is_told():
+    t, told = np.linspace(0.0, 5.0, 60), 0
+    model = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"n": -p["k"] * s["n"]},
+        states={"n": "1"},
+        parameters=[tc.Parameter("k", low=0.0, initial=0.4)],
+    )
+    terms = list(tc.terms.sensor("n", dynamic=False))
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        y = 2.0 * np.exp(-0.3 * t) + 0.05 * rng.standard_normal(60)
+        y[0] = 2.0 + 0.15  # three sd
+        run = tc.Run(time=t, outputs={"n": y}, initial={"n": y[0]})
+        d = diagnose(model, tc.Recording(runs=[run], noise=0.05), terms)
+        rows = [row for row in d.symptoms if row.startswith("n(0) was given as the first value recorded")]
+        assert bool(rows) == (d.verdict != "consistent")
+        told += any("no more than noise" in row for row in rows)
+        d = diagnose(model, tc.Recording(runs=[tc.Run(time=t, outputs={"n": y})], noise=0.05), terms)
+        assert d.verdict == "consistent"
+    assert told >= 2
+
+
+def test_replicates_that_share_a_preparation_are_told():
+    rng = np.random.default_rng(0)
+    x = np.linspace(0.0, 1.0, 14).repeat(3)
+    base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    terms = [tc.Term("cube", outputs={"y": lambda x, p, y: y + p["c"] * x**3}, parameters=[tc.Parameter("c")])]
+    y = 1 + 2 * x + 0.05 * rng.standard_normal(14).repeat(3) + 0.01 * rng.standard_normal(42)
+    d = diagnose(base, tc.Recording(x=x, y=y), terms)
+    assert d.verdict != "consistent"
+    assert any("share a preparation" in row for row in d.symptoms)
+    y = 1 + 2 * x + 0.5 * x**3 + 0.01 * rng.standard_normal(42)
+    d = diagnose(base, tc.Recording(x=x, y=y), terms)
+    assert d.terms == ["cube"]
+    assert not any("share a preparation" in row for row in d.symptoms)

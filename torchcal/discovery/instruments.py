@@ -1,0 +1,181 @@
+"""Why what a model takes for an instrument is none."""
+
+import dataclasses
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.candidates import spread_values
+from torchcal.discovery.model import Model
+from torchcal.discovery.own_noise import beside
+from torchcal.discovery.problem import Problem
+from torchcal.discovery.search import Search
+from torchcal.terms import Term, extend
+
+__all__ = ["no_instrument", "only_instruments", "unnatural"]
+
+#: Noise sd by which an instrument's reading must fall while the true value rises to be no instrument's: a hard limit is
+#: one. And the least sd, in the data's spread.
+FALL, ROUNDING = 2.0, 1e-3
+#: Variation that an instrument may add, in that of what it measures: with more it is another model of the thing.
+ADDED = 1.0
+#: Share of the range of the true values by which it is looked at beyond them.
+BEYOND = 0.2
+#: Data at distinct true values at which an instrument must bend away from a straight line, by so many noise sd together
+#: and each by this share of the most.
+BENT, SEEN, PART = 3, 2.0, 0.1
+#: Times the recorded range in which it is looked for bends, and the share of the largest value up to which what a
+#: straight line leaves is rounding.
+FAR, STRAIGHT = 3.0, 1e-9
+#: Own sd from which on an estimate is not what its term has in nature.
+APART = 3.0
+
+
+def unnatural(model: Model) -> str:
+    """Which estimate of a model's terms is not what these have in nature, in a sentence; empty if all are."""
+    values, sd = model.found.by_name, dict(zip(model.found.by_name, model.found.sd().tolist(), strict=True))
+    for term in model.candidate.terms:
+        for name, (expected, spread) in term.expected.items():
+            full = term.full(name)
+            away = abs(values[full] - expected)
+            if away > spread and away > APART * sd[full]:
+                return (
+                    f"In nature its {name} is {expected:g} within {spread:g}, and not {values[full]:.2g} ± "
+                    f"{sd[full]:.1g}: something else may have left as much."
+                )
+    return ""
+
+
+def only_instruments(model: Model) -> bool:
+    """Whether all that a model adds is instruments: what shows a true value otherwise, and reads nothing else of a
+    static recording."""
+    problem = model.found.problem
+    drivers = problem.drivers_at_data(model.found.values[None], model.found.warm)
+    p = {name: model.found.values.new_tensor(value) for name, value in model.found.by_name.items()}
+    for term in model.candidate.terms:
+        if not term.outputs or term.shifts or term.frees or not set(term.rates) <= set(term.states):
+            return False
+        if not problem.in_time and not all(_reading(problem, term, f, drivers, p) for f in term.outputs.values()):
+            return False
+    return True
+
+
+def no_instrument(search: Search, model: Model) -> str:
+    """Why a model's instruments are none: the reading of one falls where the true value rises, or shows more of the
+    instrument than of what it measures."""
+    problem = model.found.problem
+    instruments = [term for term in model.candidate.terms if term.is_sensor and not term.states]
+    if not instruments:
+        return ""
+    others = [term for term in model.candidate.terms if term not in instruments]
+    bare = search.problem.with_simulator(extend(search.problem.simulator, others))
+    bare = dataclasses.replace(bare, keep=problem.keep)
+    values = spread_values(bare, [q.name for q in problem.parameters], model.found.values)
+    true = bare.evaluate(values[None], [], bare.guess(model.found.warm, values[None]))[0][0]
+    drivers = problem.drivers_at_data(model.found.values[None], model.found.warm)
+    p = {name: values.new_tensor(value) for name, value in model.found.by_name.items()}
+    sd = _noise_at_data(search, model)
+    for term in instruments:
+        for name, function in term.outputs.items():
+            number = problem.recording.outputs.index(name) if name in problem.recording.outputs else 0
+            here = (problem.output_of == number).nonzero()[:, 0]
+            reading = _reading(problem, term, function, {d: along[here] for d, along in drivers.items()}, p)
+            if reading is None:
+                continue
+            y = _range(true[here])
+            slope = _slope(reading, y)
+            fall = -(y.diff() * 0.5 * (slope[:-1] + slope[1:]).clamp_max(0)).nansum()
+            if float(fall) > FALL * float(sd[here].median()):
+                return (
+                    f"By it the reading of {name} falls where the true value rises, at the recorded values or just "
+                    "beyond them, as that of no instrument does."
+                )
+            shown = reading(true[here])
+            if float((shown - true[here]).std()) > ADDED * float(true[here].std()):
+                return f"By it the reading of {name} varies more by the instrument's error than by the true value."
+            if _bends(reading, true[here]) and _straight(reading, true[here], sd[here]):
+                return (
+                    f"By it the reading of {name} is a straight line at the recorded values, as with an offset and a "
+                    "gain error: where it bends there are hardly any data."
+                )
+            true[here] = shown
+    return ""
+
+
+def _bends(reading: Callable[[Tensor], Tensor], true: Tensor) -> bool:
+    """Whether a reading is no straight line of the true value anywhere near, as with an offset or a gain error."""
+    y = FAR * _range(true)
+    shown = reading(y)
+    if not bool(shown.isfinite().all()):
+        return True
+    return float(_off_line(y, shown).abs().max()) > STRAIGHT * float(y.abs().max())
+
+
+def _straight(reading: Callable[[Tensor], Tensor], true: Tensor, sd: Tensor) -> bool:
+    """Whether a reading follows a straight line at the recorded values, but for a few or for less than noise shows."""
+    shown = reading(true)
+    order = true.argsort()
+    slopes = _slope(reading, true)[order]
+    usual = slopes.median()
+    off = (slopes - usual).abs()
+    apart = true[order][off > PART * off.max().clamp_min(1e-300)].unique()
+    return float((_off_line(true, shown) / sd).norm()) < SEEN or len(apart) < BENT
+
+
+def _off_line(y: Tensor, shown: Tensor) -> Tensor:
+    """What a straight line through readings of true values leaves, ``(m,)``."""
+    line = torch.stack([torch.ones_like(y), y], dim=-1)
+    return shown - line @ torch.linalg.lstsq(line, shown[:, None], driver="gelsd").solution[:, 0]
+
+
+def _noise_at_data(search: Search, model: Model) -> Tensor:
+    """Sd of the noise, or of what a model leaves where there is none, ``(n,)``."""
+    problem = model.found.problem
+    if not search.exact:
+        return beside(search, model).sd[problem.index]
+    left = torch.zeros(problem.n, dtype=torch.float64)
+    for output in problem.output_of.unique():
+        mine = problem.output_of == output
+        left[mine] = model.found.residual[mine].square().mean().sqrt()
+    return torch.maximum(left, ROUNDING * problem.recording.spread[problem.index])
+
+
+def _reading(
+    problem: Problem, term: Term, function: Callable[..., Tensor], drivers: dict[str, Tensor], p: dict[str, Tensor]
+) -> Callable[[Tensor], Tensor] | None:
+    """What an instrument shows of true values ``(m,)``; None where that depends on anything but these."""
+
+    def reading(y: Tensor, by: int = 0) -> Tensor:
+        at = {name: along.roll(by) for name, along in drivers.items()}
+        x = at if isinstance(problem.recording.x, dict) else next(iter(at.values()))
+        shown = function(at["t"], at, term.own(p), at, y) if problem.in_time else function(x, term.own(p), y)
+        return shown + 0 * y
+
+    y = torch.linspace(1.0, 2.0, len(next(iter(drivers.values()))), dtype=torch.float64)
+    try:
+        shown = reading(y)
+        same = all(torch.allclose(shown, reading(y, by), rtol=0, atol=0, equal_nan=True) for by in (1, len(y) // 2))
+    except Exception:  # the simulator calls it otherwise, and tells what is wrong
+        return None
+    return reading if same else None
+
+
+def _range(true: Tensor) -> Tensor:
+    """As many values from somewhat below the true ones ``(m,)`` to somewhat above, but not beyond 0 if all are on one
+    side of it: a fit likes the turning point of a response, where it bends most, and stops just short of it."""
+    low, high = true.min(), true.max()
+    beyond = BEYOND * (high - low)
+    return torch.linspace(
+        float((low - beyond).clamp_min(0) if low >= 0 else low - beyond),
+        float((high + beyond).clamp_max(0) if high <= 0 else high + beyond),
+        len(true),
+        dtype=true.dtype,
+    )
+
+
+def _slope(reading: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
+    """Of what is shown by what is true, ``(m,)``; 0 where the one does not follow from the other."""
+    with torch.enable_grad():
+        leaf = y.detach().clone().requires_grad_(True)
+        return torch.autograd.grad(reading(leaf).sum(), leaf)[0].detach()
