@@ -306,7 +306,9 @@ def _result(
         improved = _improved(simulator, best)
     left = search.base if best is None else best.found
     apart = unlike(search, left) if decision.verdict in ("consistent", "named") else []
-    else_ = [] if decision.verdict == "consistent" else [*from_samples(search), *more_than_replicates(search)]
+    any_unlike = bool(apart)
+    if decision.verdict != "consistent":
+        apart = [*from_samples(search), *more_than_replicates(search, left), *apart]
     remaining, depends = 0.0 if decision.verdict == "consistent" else 1.0, ""
     if best is not None:
         white = best.structure is not None and best.structure.p_value >= PLAINLY_WHITE and not search.exact
@@ -333,7 +335,7 @@ def _result(
         before=before,
         after=after,
         improved=improved,
-        symptoms=[*else_, *symptoms(search, best), *apart],
+        symptoms=[*apart, *symptoms(search, best)],
         noise=_told_noise(search, decision, 1.0 - confidence).record(search.problem),
         base=base,
         final=final,
@@ -367,7 +369,7 @@ def _result(
             "unknown_beside": decision.beside,
             "nearly": decision.nearly,
             "lost": lost,
-            "unlike": bool(apart),
+            "unlike": any_unlike,
             "set_aside": suspect,
             "interrupted": interrupted,
             "region": None if best is None else best.where,

@@ -1,12 +1,15 @@
 """Why what a model takes for an instrument is none."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from torchcal.discovery.candidates import spread_values
+from torchcal.discovery.explain import stated_sd
+from torchcal.discovery.local import is_window
 from torchcal.discovery.model import Model
 from torchcal.discovery.own_noise import beside
 from torchcal.discovery.problem import Problem
@@ -22,24 +25,22 @@ FALL, ROUNDING = 2.0, 1e-3
 ADDED = 1.0
 #: Share of the range of the true values by which it is looked at beyond them.
 BEYOND = 0.2
-#: Data at distinct true values at which an instrument must bend away from a straight line, by so many noise sd together
-#: and each by this share of the most.
-BENT, SEEN, PART = 3, 2.0, 0.1
-#: Times the recorded range in which it is looked for bends, and the share of the largest value up to which what a
-#: straight line leaves is rounding.
+#: Noise sd, together, by which a reading must leave a straight line at the recorded values, but for so many of them.
+SEEN, FEW = 2.0, 2
+#: Times the recorded range in which it is looked for bends, and the share of that up to which what a straight line
+#: leaves is rounding.
 FAR, STRAIGHT = 3.0, 1e-9
-#: Own sd from which on an estimate is not what its term has in nature.
-APART = 3.0
+#: Joint sd of an estimate and of what it is in nature, from which on it is not that.
+APART = 2.0
 
 
 def unnatural(model: Model) -> str:
     """Which estimate of a model's terms is not what these have in nature, in a sentence; empty if all are."""
-    values, sd = model.found.by_name, dict(zip(model.found.by_name, model.found.sd().tolist(), strict=True))
+    values, sd = model.found.by_name, dict(zip(model.found.by_name, stated_sd(model.found).tolist(), strict=True))
     for term in model.candidate.terms:
         for name, (expected, spread) in term.expected.items():
             full = term.full(name)
-            away = abs(values[full] - expected)
-            if away > spread and away > APART * sd[full]:
+            if abs(values[full] - expected) > APART * math.hypot(spread, sd[full]):
                 return (
                     f"In nature its {name} is {expected:g} within {spread:g}, and not {values[full]:.2g} ± "
                     f"{sd[full]:.1g}: something else may have left as much."
@@ -48,15 +49,17 @@ def unnatural(model: Model) -> str:
 
 
 def only_instruments(model: Model) -> bool:
-    """Whether all that a model adds is instruments: what shows a true value otherwise, and reads nothing else of a
-    static recording."""
+    """Whether all that a model adds is instruments: what shows a true value otherwise, and reads nothing else but what
+    has a memory of its own, or counts from the first sample."""
     problem = model.found.problem
     drivers = problem.drivers_at_data(model.found.values[None], model.found.warm)
     p = {name: model.found.values.new_tensor(value) for name, value in model.found.by_name.items()}
     for term in model.candidate.terms:
         if not term.outputs or term.shifts or term.frees or not set(term.rates) <= set(term.states):
             return False
-        if not problem.in_time and not all(_reading(problem, term, f, drivers, p) for f in term.outputs.values()):
+        if term.states or term.elapsed:
+            continue
+        if not all(_reading(problem, term, f, drivers, p) for f in term.outputs.values()):
             return False
     return True
 
@@ -76,6 +79,8 @@ def no_instrument(search: Search, model: Model) -> str:
     drivers = problem.drivers_at_data(model.found.values[None], model.found.warm)
     p = {name: values.new_tensor(value) for name, value in model.found.by_name.items()}
     sd = _noise_at_data(search, model)
+    names = [q.name for q in problem.parameters]
+    shapes = set(model.candidate.own) - set(model.candidate.amplitudes)
     for term in instruments:
         for name, function in term.outputs.items():
             number = problem.recording.outputs.index(name) if name in problem.recording.outputs else 0
@@ -94,7 +99,8 @@ def no_instrument(search: Search, model: Model) -> str:
             shown = reading(true[here])
             if float((shown - true[here]).std()) > ADDED * float(true[here].std()):
                 return f"By it the reading of {name} varies more by the instrument's error than by the true value."
-            if _bends(reading, true[here]) and _straight(reading, true[here], sd[here]):
+            shaped = any(names[i] in term.brings and not is_window(names[i]) for i in shapes)
+            if shaped and _bends(reading, true[here]) and _straight(reading, true[here], sd[here]):
                 return (
                     f"By it the reading of {name} is a straight line at the recorded values, as with an offset and a "
                     "gain error: where it bends there are hardly any data."
@@ -104,23 +110,29 @@ def no_instrument(search: Search, model: Model) -> str:
 
 
 def _bends(reading: Callable[[Tensor], Tensor], true: Tensor) -> bool:
-    """Whether a reading is no straight line of the true value anywhere near, as with an offset or a gain error."""
-    y = FAR * _range(true)
-    shown = reading(y)
-    if not bool(shown.isfinite().all()):
-        return True
-    return float(_off_line(y, shown).abs().max()) > STRAIGHT * float(y.abs().max())
+    """Whether a reading is no straight line of the true value near the recorded ones, as with an offset or a gain
+    error."""
+    middle = true.mean()
+    wide = middle + FAR * (_range(true) - middle)
+    for y in (true, wide):
+        shown = reading(y)
+        if not bool(shown.isfinite().all()):
+            return True
+        if float(_off_line(y, shown).abs().max()) > STRAIGHT * float(wide.max() - wide.min()):
+            return True
+    return False
 
 
 def _straight(reading: Callable[[Tensor], Tensor], true: Tensor, sd: Tensor) -> bool:
-    """Whether a reading follows a straight line at the recorded values, but for a few or for less than noise shows."""
-    shown = reading(true)
-    order = true.argsort()
-    slopes = _slope(reading, true)[order]
-    usual = slopes.median()
-    off = (slopes - usual).abs()
-    apart = true[order][off > PART * off.max().clamp_min(1e-300)].unique()
-    return float((_off_line(true, shown) / sd).norm()) < SEEN or len(apart) < BENT
+    """Whether a reading follows a straight line at the recorded values, but for a few, as far as noise shows."""
+    kept, shown = torch.ones_like(true, dtype=torch.bool), reading(true)
+    if not bool(shown.isfinite().all()):
+        return False
+    for _ in range(FEW):
+        off = torch.zeros_like(true)
+        off[kept] = (_off_line(true[kept], shown[kept]) / sd[kept]).abs()
+        kept &= true != true[off.argmax()]
+    return float((_off_line(true[kept], shown[kept]) / sd[kept]).norm()) < SEEN
 
 
 def _off_line(y: Tensor, shown: Tensor) -> Tensor:

@@ -54,6 +54,8 @@ INSIDE, STARTS = 10, 2
 MOVES = (0.0, -0.15, 0.15, -0.3, 0.3)
 #: Share that is left of a fading change at the end of its window.
 FADED = 0.05
+#: What the name of a term that fades begins with.
+FADING = "a fading "
 #: Relative difference up to which two effects are one, and relative size from which on two are independent.
 SAME, RANK = 1e-4, 1e-7
 
@@ -251,7 +253,7 @@ def _wanted(
         shapes.append((_constant(where, in_time, fading), ends[0], False))
         term = search.candidates[model.numbers[0]].terms[0]
         if where == _places(model.candidate) and not term.elapsed:  # whose t is not the window's
-            shapes.append((multiplied(term, f"a fading {term.name}", fading), ends[0], False))
+            shapes.append((multiplied(term, f"{FADING}{term.name}", fading), ends[0], False))
     found, least = [], math.inf
     for change, chosen, edge in shapes:
         low, high = chosen[0]
@@ -342,6 +344,7 @@ def _begin(
 ) -> tuple[Tensor, float]:
     """Starting values at a model's base, of the best size each, those of the best few; and the least χ², for linear."""
     known, problem = model.found.by_name, candidate.problem
+    known |= {f"{FADING}{name}": value for name, value in known.items()}  # a term that fades begins at its shape
     names = [q.name for q in problem.parameters]
     places = candidate.amplitudes
     widths = [share * span.size for share in (EDGE, *WIDTHS)]

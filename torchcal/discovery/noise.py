@@ -96,6 +96,7 @@ class Noise:
             source=self.source,
             outliers=int((problem.recording.observed & ~problem.keep).sum()),
             quantisation=self.step,
+            memory=("sample" if problem.by_sample else "time") if problem.uneven and self.correlation.any() else "",
         )
 
 

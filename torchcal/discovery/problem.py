@@ -169,13 +169,13 @@ class Problem:
 
         Noise forgets over them: they are infinite between sweeps.
         """
-        at = self.order[self.condition_of[places]] if self.in_time else places.double()  # type: ignore[index]
+        number = self.condition_of[places].double()  # what is not used was recorded all the same
+        at = self.order[self.condition_of[places]] if self.in_time and not self.by_sample else number  # type: ignore[index]
         found = at.diff()
         if not len(found):
             return found
-        found = (found / found.median().clamp_min(1e-300)).clamp(SHORTEST, LONGEST)
-        if self.by_sample:
-            found = torch.ones_like(found)
+        usual = found.median().clamp_min(1e-300) if at is not number else 1.0
+        found = (found / usual).clamp(SHORTEST, LONGEST)
         if self.sweeps is None:
             return torch.full_like(found, math.inf)
         return torch.where(self.sweeps[self.condition_of[places]].diff() == 0, found, math.inf)
@@ -183,9 +183,9 @@ class Problem:
     @cached_property
     def uneven(self) -> bool:
         """Whether it matters if noise forgets with time or with every sample."""
-        if not self.in_time:
-            return False
-        return any(bool((self.gaps(places) - 1).abs().amax() > UNEVEN) for places in self.recorded if len(places) > 2)
+        timed = dataclasses.replace(self, by_sample=False)
+        each = [timed.gaps(places) for places in self.recorded if len(places) > 2] if self.in_time else []
+        return any(bool((gaps - 1).abs().amax() > UNEVEN) for gaps in each)
 
     def whitening(self, sd: Tensor, correlation: Tensor) -> Whitening:
         """Of noise with sd ``(n_total,)`` and an AR(1) coefficient for each output, ``(outputs,)``."""

@@ -120,6 +120,8 @@ class NoiseModel:
         outliers: Number of samples that were set aside as outliers.
         quantisation: Step by output where the recording is quantised.
         range: Smallest and largest sd by output, where it varies.
+        memory: Where runs are sampled unevenly, whether correlated noise forgets with ``"time"``, the correlation being
+            that over the usual gap, or with every ``"sample"``; else empty.
     """
 
     sd: dict[str, float]
@@ -128,6 +130,7 @@ class NoiseModel:
     outliers: int = 0
     quantisation: dict[str, float] = dataclasses.field(default_factory=dict)
     range: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    memory: str = ""
 
 
 @dataclass(frozen=True, eq=False)

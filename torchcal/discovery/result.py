@@ -48,7 +48,7 @@ class Diagnosis:
         before: Scores of the base.
         after: Scores with the accepted terms; None where nothing was accepted.
         improved: The simulator with the accepted terms; the simulator as it was where there are none.
-        symptoms: Calibrated values that give the mismatch away, in words.
+        symptoms: Calibrated values, noise and initial values that give the mismatch away, in words.
         noise: What was taken for noise.
         base: The base's fit.
         final: The fit with the accepted terms (the base's where there are none).

@@ -23,8 +23,9 @@ __all__ = ["refit_several", "scores_beside"]
 
 #: Pairs that are refitted at most; where one term leaves noise alone.
 MOST, FEWER = 20, 10
-#: Second terms that are tried beside one of the best, and how many of them at most whose tangents vanish.
-NEXT, UNSEEN = 7, 3
+#: Second terms that are tried beside one of the best, third ones beside the best two, and how many more whose tangents
+#: vanish.
+NEXT, THIRD, UNSEEN = 7, 4, 3
 #: Share of the misfit that one term removes of a recording without noise, and nothing need be sought beside it.
 ALL = 0.99999
 #: Of them from the linear search, and from that of a base that is far off, which linear estimates do not reach; and the
@@ -56,7 +57,7 @@ def refit_several(search: Search) -> None:
         lead = model.numbers[0]  # in a window merged ones may differ, beside others not
         leads.setdefault(search.twins[lead] if lead in search.gone else lead, model)
     beside = [
-        [tuple(sorted((lead, j))) for j in _next_terms(search, model) if j != lead]
+        [tuple(sorted((lead, j))) for j in _next_terms(search, model, NEXT) if j != lead]
         for lead, model in itertools.islice(leads.items(), 1 if enough else 3)
     ]
     for pair in itertools.chain(*itertools.zip_longest(*beside)):  # the best of each lead first
@@ -84,7 +85,7 @@ def refit_several(search: Search) -> None:
     best = max(fitted, key=lambda m: m.weight)
     if search.examine(best).p_value < 0.01 or search.exact:
         third = math.log(0.2 * PRIOR["several"] / (count * (count - 1) * max(count - 2, 1) / 6))
-        more = [tuple(sorted((*best.numbers, j))) for j in _next_terms(search, best)[:4] if j not in best.numbers]
+        more = [tuple(sorted((*best.numbers, j))) for j in _next_terms(search, best, THIRD) if j not in best.numbers]
         search.models += _refit_sets(search, [(numbers, None) for numbers in more], third)
         leader = search.physical_leader
         if leader is not None and len(leader.numbers) == 3:
@@ -213,14 +214,14 @@ def _linear_row(search: Search, candidate: Candidate, columns: tuple[int, int]) 
     return make_up(search.base, candidate, row, effect)
 
 
-def _next_terms(search: Search, model: Model) -> list[int]:
-    """Other candidates by their score at a model's fit, and some that only large effects show."""
+def _next_terms(search: Search, model: Model, most: int) -> list[int]:
+    """The best other candidates by their score at a model's fit, and some that only large effects show."""
     residual = model.residual or Residual(model.found, search.noise, seed=search.seed, draws=10)
     scores = scores_beside(search, model.found, residual, model.numbers)
     scored = [j for _, j in sorted(scores, key=lambda one: (-one[0], one[1]))]
     # What no tangent shows may be seen beside another that none shows, or that has taken its part.
     unseen = [j for j in search.blind if j not in {*scored, *model.numbers, *search.gone}][:UNSEEN]
-    return [*scored[: NEXT - len(unseen)], *unseen]
+    return [*scored[:most], *unseen]
 
 
 def scores_beside(

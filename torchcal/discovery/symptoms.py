@@ -28,11 +28,11 @@ SMALLER, ENOUGH, WHITE = 0.5, 20, 0.4
 #: Data of a run or sweep from which on its noise is compared with that of others; the probability by chance below which
 #: and the ratio of sd from which on they are told to be unlike.
 COMPARED, UNLIKE, RATIO = 12, 0.01, 2.0
-#: Probability by chance of what freeing given initial values removes, from which on that is told; and of what is left
-#: then, from which on that is noise.
-REMOVES, NOISE = 1e-3, 0.05
+#: Probability by chance of what is left when given initial values are free, from which on it is noise; and noise sd up
+#: to which one that is found so is the one that was given.
+NOISE, CONFIRMED = 0.05, 0.2
 #: Times what replicates tell of the noise that means of conditions scatter by, from which on that is told where these
-#: are white; and conditions that it takes.
+#: are in no order; and levels of a condition that it takes.
 SCATTER, MEANS = 1.5, 8
 
 
@@ -110,14 +110,19 @@ def unlike(search: Search, found: Fitted) -> list[str]:
         common = -log_det.sum(0) - 0.5 * counts.sum() * (square.sum(0) / counts.sum()).clamp_min(1e-300).log()
         ratio = float(own.amax(1).sum() - common.max())
         chance = float(torch.special.gammaincc(torch.tensor(len(told) - 1.0), torch.tensor(max(ratio, 0.0))))
+        chance *= len(problem.recording.outputs)
         size = (square[:, 0] / counts).sqrt()
         if chance < UNLIKE and float(size.max()) > RATIO * float(size.min()):
             kind = "runs" if problem.in_time else "sweeps"
             of = f" of {name}" if len(problem.recording.outputs) > 1 else ""
-            which = next(k for k, part in enumerate(parts) if part is told[int(size.argmax())])
+            worst = told[int(size.argmax())]
+            which, count = next(k for k, part in enumerate(parts) if part is worst), len(parts)
+            if problem.recording.runs is not None:  # not all of which need have this output
+                which = int(problem.recording.x["run"][problem.condition_of[worst[0]]])  # type: ignore[index]
+                count = len(problem.recording.runs)
             rows.append(
                 f"the residual{of} is not alike in all {kind}: its sd is {float(size.min()):.3g} to "
-                f"{float(size.max()):.3g}, largest in the {kind[:-1]} that is number {which + 1} of {len(parts)}. "
+                f"{float(size.max()):.3g}, largest in the {kind[:-1]} that is number {which + 1} of {count}. "
                 "Either the noise differs, or something acts in some of them alone and was taken for slow noise"
             )
     return rows
@@ -144,56 +149,64 @@ def _by_memory(problem: Problem, places: Tensor, residual: Tensor) -> tuple[Tens
 
 
 def from_samples(search: Search) -> list[str]:
-    """Initial values that were given as the first sample recorded, with its noise, in words, where that matters."""
+    """Initial values that were given as the first sample recorded, in words, where noise alone is left without them."""
     problem, base = search.problem, search.base
     bound, recording = base.problem.simulator, problem.recording
-    if search.exact or recording.runs is None or not isinstance(bound, Trajectories):
+    if search.exact or search.stop.is_set() or recording.runs is None or not isinstance(bound, Trajectories):
         return []
     several = len(recording.runs) > 1
     shown = [
-        [name for name in run.initial if name in run.outputs and run.initial[name] == float(run.outputs[name][0])]
+        [name for name, value in run.initial.items()
+         if name in run.outputs and name not in bound.ode.initial and value == float(run.outputs[name][0])]
         for run in recording.runs
-    ]
+    ]  # fmt: skip
     taken = {
-        f"{name}(0)[{r}]" if several else f"{name}(0)": run.initial[name]
+        f"{name}(0)[{r}]" if several else f"{name}(0)": (name, r, run.initial[name])
         for r, (run, names) in enumerate(zip(recording.runs, shown, strict=True)) for name in names
     }  # fmt: skip
     if not taken:
         return []
     twin = recording.without_initial(shown)
-    open_ = dataclasses.replace(base.problem, recording=twin, simulator=bound.ode.bind(twin))
-    known = base.by_name | taken
-    begin = torch.tensor([[known[q.name] for q in open_.parameters]], dtype=torch.float64)
+    known = base.by_name | {name: value for name, (_, _, value) in taken.items()}
     names = {base.problem.parameters[i].name for i in base.free} | set(taken)
-    free = [i for i, q in enumerate(open_.parameters) if q.name in names]
     try:
+        again = Trajectories(
+            bound.ode, twin, subdivide=bound.subdivide, denser=bound.denser, implicit=bound.implicit
+        )  # fmt: skip
+        open_ = dataclasses.replace(base.problem, recording=twin, simulator=again)
+        begin = torch.tensor([[known[q.name] for q in open_.parameters]], dtype=torch.float64)
+        free = [i for i, q in enumerate(open_.parameters) if q.name in names]
         found = fit(open_, search.noise.whitening(open_), begin, free)
     except SimulatorError:
         return []
-    gain = 0.0 if found is None else base.chi2 - found.chi2
-    chance = torch.special.gammaincc(torch.tensor(0.5 * len(taken)), torch.tensor(0.5 * max(gain, 0.0)))
-    if found is None or float(chance) > REMOVES:
+    if found is None or analyse(Residual(found, search.noise, seed=search.seed)).p_value < NOISE:
         return []
-    left = analyse(Residual(found, search.noise, seed=search.seed)).p_value
-    excess = max(base.chi2 - problem.n, 1e-300)
-    told = "leaves no more than noise" if left >= NOISE else f"misses {min(gain / excess, 1.0):.0%} less"
-    which = ", ".join(taken)
+    sd = recording.split(search.noise.sd)
+    moved = [
+        full for full, (name, r, value) in taken.items()
+        if abs(found.by_name[full] - value) > CONFIRMED * float(sd[name][recording.x["run"] == r].median())  # type: ignore[index]
+    ]  # fmt: skip
+    if not moved:
+        return []
+    it, was = ("it", "was") if len(moved) == 1 else ("them", "were")
     return [
-        f"{which} {'was' if len(taken) == 1 else 'were'} given as the first value recorded, noise and all: with "
-        f"{'it' if len(taken) == 1 else 'them'} unknown (left out of initial=) the base {told}"
+        f"{', '.join(moved)} {was} given as the first value recorded, noise and all: with {it} unknown (left out of "
+        "initial=) the base leaves no more than noise"
     ]
 
 
-def more_than_replicates(search: Search) -> list[str]:
-    """Outputs whose means at the conditions scatter by more than replicates do, but white, in words: a preparation that
-    replicates share is noise that they do not show."""
+def more_than_replicates(search: Search, found: Fitted) -> list[str]:
+    """Outputs whose means at the conditions a fit misses by more than replicates tell, but in no order, in words: a
+    preparation that replicates share is noise that they do not show."""
     rows: list[str] = []
-    problem, x = search.base.problem, search.problem.recording.x
+    problem, x = found.problem, search.problem.recording.x
     if search.noise.source != "replicates":
         return rows
     columns = torch.stack(list(x.values()) if isinstance(x, dict) else [x], dim=-1).double()
     levels, group = columns.unique(dim=0, return_inverse=True)
-    standard = search.base.residual / search.noise.sd[problem.index]
+    if max(len(c.unique()) for c in columns.T) < MEANS:
+        return rows
+    standard = found.residual / search.noise.sd[problem.index]
     for number, name in enumerate(problem.recording.outputs):
         mine = problem.output_of == number
         which = group[problem.condition_of[mine]]
@@ -203,13 +216,14 @@ def more_than_replicates(search: Search) -> list[str]:
         mean = mean / count[seen].sqrt()
         if len(mean) < MEANS:
             continue
-        size = math.sqrt(float(mean.square().sum()) / max(len(mean) - len(search.base.free), 1))
+        size = math.sqrt(float(mean.square().sum()) / max(len(mean) - len(found.free), 1))
         ordered = [mean[levels[seen][:, k].argsort(stable=True)] for k in range(levels.shape[1])]
         slow = max(float(m[1:] @ m[:-1]) for m in ordered)
         if size > SCATTER and slow < WHITE * float(mean @ mean):
             of = f" of {name}" if len(problem.recording.outputs) > 1 else ""
             rows.append(
-                f"the means of replicates{of} are {size:.1f} times as far off as these tell, in no order: replicates "
-                "that share a preparation or a calibration do not show all of the noise"
+                f"the means of replicates{of} are {size:.1f} times as far off as these tell, in no order: something "
+                "faster than the conditions are apart, or noise that replicates do not show, as they share a "
+                "preparation or a calibration"
             )
     return rows

@@ -119,7 +119,9 @@ def _detected(d: Any) -> str:
         return f"The recording is declared free of noise; the calibrated base leaves an RMSE of {rmse:.4g}{unit}."
     text = f"Noise sd ({noise.source}): {sd}"
     correlated = [f"{name} {c:.2f}" for name, c in noise.correlation.items() if c >= 0.05]
-    text += f", correlated from sample to sample ({', '.join(correlated)})" if correlated else ""
+    over = {"time": "over the usual gap", "sample": "from sample to sample, however far apart"}
+    how = over.get(noise.memory, "from sample to sample")
+    text += f", correlated {how} ({', '.join(correlated)})" if correlated else ""
     text += f", {noise.outliers} outlier{'s' if noise.outliers > 1 else ''} set aside" if noise.outliers else ""
     text += f". The calibrated base leaves an RMSE of {d.before.fitted.rmse:.4g}{_rmse_unit(d)}; "
     return text + f"noise alone would leave so much structure with probability {_probability(d.p_detect)}."

@@ -10,14 +10,14 @@ from torch import Tensor
 from torchcal.errors import DomainError
 from torchcal.simulators import Parameter
 from torchcal.terms.pieces import amplitude, check_name, check_names, excess, shape
-from torchcal.terms.term import Term, is_finite, outer
+from torchcal.terms.term import Term, outer
 
 __all__ = ["sensor"]
 
 #: A first-order instrument shows 90 % of a step after ln 10 time constants.
 RESPONSE = math.log(10.0)
 #: An instrument shows the signal late, and all of it: the share of it, and how far its estimate may be off.
-NATURE = (1.0, 0.25)
+NATURE = (1.0, 0.15)
 
 Signal = Callable[..., Any]
 
@@ -34,7 +34,7 @@ def sensor(
     r"""Errors of the instrument behind every output: offset, gain, non-linearity, saturation, drift, lag and delay.
 
     A lag is an instrument of first order, :math:`y + a (z - y)` with :math:`\dot z = (y - z) \ln 10 / t_{90}`: a = 1 in
-    nature, with an sd of 0.25 as its prior, and t90 is the time to 90 % of a step. A delay by D, with the same a, is
+    nature, with an sd of 0.15 as its prior, and t90 is the time to 90 % of a step. A delay by D, with the same a, is
     the Padé approximant
 
     .. math:: e^{-D s} \approx \frac{1 - 2 D s/5 + (D s)^2/20}{1 + 3 D s/5 + 3 (D s)^2/20 + (D s)^3/60},
@@ -125,12 +125,17 @@ def _instant(output: str, unit: str, static: bool) -> list[Term]:
 def _origin(drift: str | Mapping[str, float]) -> dict[str, float]:
     """The condition of a drift, and where it is nothing."""
     found = {drift: 0.0} if isinstance(drift, str) else drift
-    if not isinstance(found, Mapping) or len(found) != 1 or not all(map(is_finite, found.values())):
+    try:
+        ((name, value),) = found.items()
+        origin = float(value)
+    except (AttributeError, TypeError, ValueError):
+        name, origin = "", math.nan
+    if not math.isfinite(origin):
         raise DomainError(
-            f'Expected drift= as a condition, or as one with the value at which it is nothing, {{"T": 293.15}}. '
+            'Expected drift= as a condition, or as one with the number at which it is nothing, {"T": 293.15}. '
             f"Got {drift!r}."
         )
-    return {check_name(name, "drift"): float(value) for name, value in found.items()}
+    return {check_name(name, "drift"): origin}
 
 
 def _drift(output: str, unit: str, condition: str | None, origin: float = 0.0) -> Term:
@@ -138,7 +143,7 @@ def _drift(output: str, unit: str, condition: str | None, origin: float = 0.0) -
         seen: Signal = lambda t, s, p, u, y: y + p["b"] * t  # noqa: E731
     else:
         seen = lambda x, p, y: y + p["b"] * ((x[condition] if isinstance(x, Mapping) else x) - origin)  # noqa: E731
-    against = (condition or "t") if not origin else f"({condition} - {origin:g})"
+    against = (condition or "t") if not origin else f"({condition} {'-' if origin > 0 else '+'} {abs(origin):g})"
     return Term(
         f"drift of {output}", outputs={output: seen}, parameters=[amplitude("b", unit)],
         formula=f"{output} → {output} + b {against}", description="The instrument's zero moves steadily.",

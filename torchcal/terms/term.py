@@ -29,7 +29,7 @@ class _Own(Values):
         self.outer = outer
 
 
-def is_finite(value: Any) -> bool:
+def _is_finite(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
@@ -170,7 +170,7 @@ class Term:
         for own, known in (expected or {}).items():
             if own not in names:
                 raise DomainError(f"Expected values of parameters {names} of the term {name!r}. Got {own!r}.")
-            if not (isinstance(known, Sequence) and len(known) == 2 and all(map(is_finite, known)) and known[1] > 0):
+            if not (isinstance(known, Sequence) and len(known) == 2 and all(map(_is_finite, known)) and known[1] > 0):
                 raise DomainError(
                     f"Expected expected={{{own!r}: (value, sd)}} of the term {name!r}, finite, with sd > 0. Got "
                     f"{known!r}."
