@@ -156,7 +156,7 @@ def test_an_estimate_apart_from_what_nature_has_costs_by_a_normal_density():
 def test_a_partial_delay_is_less_likely_than_a_whole_one():
     for name in ("lag of x", "delay of x"):
         (term,) = (t for t in tc.terms.sensor(outputs=("x",)) if t.name == name)
-        assert term.expected == {"a": (1.0, 0.25)}
+        assert term.expected == {"a": (1.0, 0.15)}
         assert dataclasses.replace(term, description="").expected == term.expected
 
 

@@ -410,7 +410,7 @@ def test_an_instrument_that_adds_more_than_it_measures_is_no_name(size, verdict)
     assert ("varies more by the instrument's error than by the true value" in str(d)) == (verdict != "named")
 
 
-DECAY = tc.ODESimulator(
+LOSS = tc.ODESimulator(
     rates=lambda t, s, p, u: {"n": -p["k"] * s["n"]},
     states={"n": "1"},
     parameters=[tc.Parameter("k", low=0.0, initial=0.4)],
@@ -418,7 +418,7 @@ DECAY = tc.ODESimulator(
 
 
 def uneven(seed, by_sample, phi=0.75, sd=0.02):
-    """Two unevenly sampled runs of `DECAY` with noise that forgets with every sample, or with time."""
+    """Two unevenly sampled runs of `LOSS` with noise that forgets with every sample, or with time."""
     rng, runs = np.random.default_rng(seed), []
     for start in (1.0, 2.0):
         t = np.concatenate([[0.0], np.sort(rng.uniform(0, 8, 59))])
@@ -436,7 +436,7 @@ def test_noise_of_uneven_runs_forgets_with_time_or_with_every_sample(by_sample):
     # What forgets with every sample was something missing: close samples do not agree as they would have to.
     seeds, seen = 12, []
     for seed in range(seeds):
-        problem = Problem.of(DECAY, uneven(seed, by_sample))
+        problem = Problem.of(LOSS, uneven(seed, by_sample))
         base, noise = calibrate_base(problem, {}, 4, seed)
         seen.append((base.problem.by_sample, float(noise.correlation[0]), float(noise.sd[0])))
         fewer = base.problem.keeping(torch.arange(120) % 60 != 30)  # it was recorded all the same
@@ -453,7 +453,7 @@ def test_correlated_noise_of_uneven_runs_is_nothing_missing(by_sample):
         "second order", equation="n", rate=lambda t, s, p, u: -p["a"] * s["n"] ** 2,
         parameters=[tc.Parameter("a", low=0.0)],
     )  # fmt: skip
-    found = [tc.diagnose(DECAY, uneven(seed, by_sample), [term], seed=0, progress=False) for seed in range(4, 10)]
+    found = [tc.diagnose(LOSS, uneven(seed, by_sample), [term], seed=0, progress=False) for seed in range(4, 10)]
     assert sum(d.verdict != "consistent" for d in found) <= 1
 
 

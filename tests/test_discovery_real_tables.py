@@ -73,7 +73,7 @@ def falling(base, recording, term, values, sd=0.01):
     row = torch.tensor([[values[q.name] for q in extended.parameters]], dtype=F64)
     noise = problem.whitening(torch.full((recording.n,), sd, dtype=F64), torch.zeros(1, dtype=F64))
     found = fit(extended, noise, row, [])
-    candidate = SimpleNamespace(terms=(term,))
+    candidate = SimpleNamespace(terms=(term,), own=[], amplitudes=[])
     search = SimpleNamespace(
         problem=problem,
         exact=False,
