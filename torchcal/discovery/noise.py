@@ -16,8 +16,8 @@ from torchcal.discovery.records import NoiseModel
 from torchcal.errors import DomainError
 
 __all__ = [
-    "GRID", "LEAST", "Noise", "estimate", "growth", "least", "log_prior", "mine", "orthonormal", "quantisation",
-    "smooth_columns",
+    "GRID", "LEAST", "Noise", "decorrelated", "estimate", "growth", "least", "log_prior", "mine", "orthonormal",
+    "quantisation", "smooth_columns",
 ]  # fmt: skip
 
 #: AR(1) coefficients that are tried.
@@ -205,7 +205,8 @@ def estimate(
             square, log_det, count = 0.0, 0.0, 0
             for places, r, basis, apart in zip(parts, scaled, bases, gaps, strict=True):
                 each = remembered(rho, apart)
-                e, b = _decorrelate(r[:, None], each)[:, 0], _decorrelate(basis, each)
+                e, b = (decorrelated(values, each[:, None]) for values in (r[:, None], basis))
+                e = e[:, 0]
                 q, upper = torch.linalg.qr(b)
                 left = e - q @ (q.T @ e)
                 square += float(left.square().sum())
@@ -329,12 +330,11 @@ def least(problem: Problem, step: dict[str, float]) -> Tensor:
     return sd
 
 
-def _decorrelate(values: Tensor, rho: Tensor) -> Tensor:
-    """Successive values ``(m, k)`` with what follows from the one before, by correlations ``(m - 1,)``, taken out."""
-    if not bool((rho != 0).any()):
-        return values
-    rho = rho[:, None]
-    return torch.cat([values[:1], (values[1:] - rho * values[:-1]) / (1 - rho.square()).sqrt()])
+def decorrelated(values: Tensor, rho: Tensor) -> Tensor:
+    """Successive values ``(m, k)`` with what follows from the one before, by correlations ``(m - 1, k)``, taken out;
+    one column of either goes with all of the other."""
+    rest = (values[1:] - rho * values[:-1]) / (1 - rho.square()).sqrt()
+    return torch.cat([values[:1].expand(1, rest.shape[1]), rest])
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from torchcal.data import Recording
 from torchcal.errors import SimulatorError
 from torchcal.simulators import Parameter, Simulator, Solution, Trajectories
 
-__all__ = ["Problem", "Whitening", "is_value_of", "remembered"]
+__all__ = ["Problem", "Whitening", "breaks", "is_value_of", "remembered"]
 
 #: Combinations of all levels of all conditions, in the number of rows, up to which these are a grid; the levels of a
 #: condition up to which it switches between sweeps of another one; and the rows of a sweep, on average, at least.
@@ -139,10 +139,7 @@ class Problem:
         levels = [len(column.unique()) for column in columns.T]
         if sum(count > SWITCH for count in levels) == 1 or math.prod(levels) > GRID * len(one):
             return one
-        change = columns.diff(dim=0) != 0
-        swept = int((change & (change.sum(1, keepdim=True) == 1)).sum(0).argmax())
-        others = [k for k in range(len(levels)) if k != swept]
-        one[1:] = change[:, others].any(1).cumsum(0)
+        one[1:] = breaks(columns).cumsum(0)
         return one if len(one) >= SWEEP * (int(one[-1]) + 1) else None
 
     @cached_property
@@ -261,6 +258,15 @@ class Problem:
     def kinds(self) -> tuple[str, str]:
         """Kinds of channels that something unknown is sought in."""
         return ("equation", "output") if self.in_time else ("parameter", "output")
+
+
+def breaks(columns: Tensor) -> Tensor:
+    """Where successive rows of conditions ``(m, k)`` belong to two sweeps, bool ``(m - 1,)``: others change there than
+    the one that most often changes alone."""
+    change = columns.diff(dim=0) != 0
+    swept = int((change & (change.sum(1, keepdim=True) == 1)).sum(0).argmax())
+    others = [k for k in range(columns.shape[1]) if k != swept]
+    return change[:, others].any(1)
 
 
 def remembered(phi: Tensor, gaps: Tensor) -> Tensor:

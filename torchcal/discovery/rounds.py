@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from typing import Any
 
 import torch
 
@@ -65,8 +66,7 @@ def _without_isolated(
     kept = search.problem.keep if apart is None else search.problem.keep & ~apart
     if apart is None or float(kept.sum()) < (1 - MOST) * observed.n:
         return search, detected
-    fewer = dataclasses.replace(search, problem=observed.keeping(kept), clean=True)
-    fewer.calibrate_base()
+    fewer = _of(search, observed.keeping(kept))
     still = _refit(fewer, confidence)
     if not search.stop.is_set() and outliers_alone(fewer, search, still):
         return fewer, still
@@ -90,9 +90,8 @@ def _again(search: Search, observed: Problem, detected: bool, confidence: float)
             break
         # Others than at the base, whose misfit hides them and looks like some; and noise that grows, or does not.
         kept = search.problem if sticking is None else observed.keeping(~sticking)
-        other = dataclasses.replace(search, problem=kept, clean=True, unit=search.unit if unit is None else unit)
-        seen.append(other.problem.keep)
-        other.calibrate_base()
+        seen.append(kept.keep)
+        other = _of(search, kept, unit=search.unit if unit is None else unit)
         still = _refit(other, confidence)
         if not search.stop.is_set():
             search, detected = other, still
@@ -106,8 +105,7 @@ def with_all(
 
     Where they are too few to prove it, the names of what may explain them are returned instead.
     """
-    every = dataclasses.replace(search, problem=observed, clean=True, unit=None)
-    every.calibrate_base()
+    every = _of(search, observed, unit=None)
     every.screen_all()
     refit_singles(every)
     if search.stop.is_set():
@@ -135,8 +133,7 @@ def with_explained(search: Search, observed: Problem, confidence: float) -> Sear
         return None
     if not _may_explain(search, best, observed):
         return None
-    every = dataclasses.replace(search, problem=observed, clean=True)
-    every.calibrate_base()
+    every = _of(search, observed)
     if not _refit(every, confidence) or search.stop.is_set():
         return None
     refit_several(every)
@@ -160,11 +157,17 @@ def without_others(search: Search, observed: Problem) -> Search:
     sticking = outliers(search, observed.keep)
     if sticking is None or torch.equal(observed.keep & ~sticking, search.problem.keep):
         return search
-    other = dataclasses.replace(search, problem=observed.keeping(~sticking), clean=True)
-    other.calibrate_base()
+    other = _of(search, observed.keeping(~sticking))
     other.screen_all()
     other.take_over(search.models)
     return other if not search.stop.is_set() and other.physical_leader is not None else search
+
+
+def _of(search: Search, problem: Problem, **changes: Any) -> Search:
+    """The same search of other data, whose outliers are known, with their base calibrated and nothing else fitted."""
+    other = dataclasses.replace(search, problem=problem, clean=True, **changes)
+    other.calibrate_base()
+    return other
 
 
 def _may_explain(search: Search, best: Model, observed: Problem) -> bool:

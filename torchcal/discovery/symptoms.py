@@ -9,14 +9,15 @@ from torch import Tensor
 from torchcal.discovery.explain import estimates, stated_sd
 from torchcal.discovery.fitting import Fitted, fit
 from torchcal.discovery.model import Model
-from torchcal.discovery.noise import GRID, estimate
-from torchcal.discovery.problem import Problem, remembered
+from torchcal.discovery.noise import GRID, decorrelated, estimate
+from torchcal.discovery.problem import Problem, breaks, remembered
 from torchcal.discovery.residual import Residual
 from torchcal.discovery.search import Search
 from torchcal.discovery.structure import analyse
 from torchcal.display import with_unit
 from torchcal.errors import SimulatorError
 from torchcal.simulators import Trajectories
+from torchcal.simulators.layout import initial_name
 
 __all__ = ["from_samples", "more_than_replicates", "symptoms", "unlike"]
 
@@ -134,18 +135,14 @@ def _sweeps(problem: Problem, places: Tensor) -> list[Tensor]:
     if problem.in_time or not isinstance(x, dict) or len(x) < 2:
         return [places]
     columns = torch.stack([column[problem.condition_of[places]] for column in x.values()], dim=1)
-    change = columns.diff(dim=0) != 0
-    swept = int(change.sum(0).argmax())
-    others = [k for k in range(columns.shape[1]) if k != swept]
-    return list(places.tensor_split(change[:, others].any(1).nonzero()[:, 0] + 1))
+    return list(places.tensor_split(breaks(columns).nonzero()[:, 0] + 1))
 
 
 def _by_memory(problem: Problem, places: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
     """Half the log determinant of the correlation of a sweep's noise, and the sum of squares of what is new in each
     datum, for each coefficient in `GRID`, ``(grid,)`` each."""
     rho = remembered(GRID, problem.gaps(places))
-    new = (residual[1:, None] - rho * residual[:-1, None]) / (1 - rho.square()).sqrt()
-    return 0.5 * torch.log1p(-rho.square()).sum(0), residual[0].square() + new.square().sum(0)
+    return 0.5 * torch.log1p(-rho.square()).sum(0), decorrelated(residual[:, None], rho).square().sum(0)
 
 
 def from_samples(search: Search) -> list[str]:
@@ -154,14 +151,13 @@ def from_samples(search: Search) -> list[str]:
     bound, recording = base.problem.simulator, problem.recording
     if search.exact or search.stop.is_set() or recording.runs is None or not isinstance(bound, Trajectories):
         return []
-    several = len(recording.runs) > 1
     shown = [
         [name for name, value in run.initial.items()
          if name in run.outputs and name not in bound.ode.initial and value == float(run.outputs[name][0])]
         for run in recording.runs
     ]  # fmt: skip
     taken = {
-        f"{name}(0)[{r}]" if several else f"{name}(0)": (name, r, run.initial[name])
+        initial_name(name, r, len(recording.runs)): (name, r, run.initial[name])
         for r, (run, names) in enumerate(zip(recording.runs, shown, strict=True)) for name in names
     }  # fmt: skip
     if not taken:

@@ -14,7 +14,7 @@ from torchcal.simulators.parameter import Parameter
 if TYPE_CHECKING:
     from torchcal.simulators.ode import ODESimulator
 
-__all__ = ["Layout", "Values"]
+__all__ = ["Layout", "Values", "initial_name"]
 
 
 class Values(dict[str, Any]):
@@ -86,7 +86,7 @@ class Layout:
                 elif state in ode.initial:
                     known[state] = ode.initial[state]
                 else:
-                    name = f"{state}(0)" if len(runs) == 1 else f"{state}(0)[{r}]"
+                    name = initial_name(state, r, len(runs))
                     known[state] = ("free", len(parameters))
                     self.initial_names.append(name)
                     seen = state in recording.outputs and state in ode.outputs
@@ -221,6 +221,11 @@ def _from_copies(result: Tensor, inputs: Sequence[Tensor]) -> Iterator[_Componen
         grads = torch.autograd.grad(parts.sum(), inputs, allow_unused=True)
     for k, part in enumerate(parts.unbind(-1)):
         yield part, [None if grad is None else grad.unflatten(0, (count, -1))[k] for grad in grads]
+
+
+def initial_name(state: str, run: int, runs: int) -> str:
+    """Of the unknown initial value of a state in one of some runs."""
+    return f"{state}(0)" if runs == 1 else f"{state}(0)[{run}]"
 
 
 def _first_seen(run: Run, output: str) -> float | None:
