@@ -369,3 +369,21 @@ def test_a_base_no_better_than_a_constant_is_warned_of():
     recording = tc.Recording(x=x, y=3 + torch.sin(x) + 0.02 * normal(60, 2), noise=0.02)
     with pytest.warns(ConvergenceWarning, match="no more than a constant"):
         diagnose(base, recording, [SQUARE])
+
+
+@pytest.mark.parametrize("shown", [False, True])
+def test_what_all_likelier_hypotheses_hold_is_named_for_its_share_where_it_is_no_instrument(shown):
+    # A wave leaves more than noise after all of them, and which other power acts beside the square is not told.
+    x = torch.linspace(0, 1, 150, dtype=F64)
+    y = x + 2 * x**2 + 0.3 * x**5 + 0.02 * torch.sin(40 * x) + 0.01 * normal(150, 0)
+    terms = []
+    for power in (2, 5, 6):
+        shift = {"a": lambda x, p, power=power: p["c"] * x**power}
+        output = {"y": lambda x, p, y, power=power: y + p["c"] * y**power}
+        how = {"outputs": output} if shown else {"shifts": shift}
+        terms.append(tc.Term(f"power {power}", parameters=[tc.Parameter("c")], **how))
+    d = diagnose(straight(), tc.Recording(x=x, y=y), terms)
+    assert d.settings["nearly"] is not shown
+    assert d.terms == ([] if shown else ["power 2"])
+    if not shown:
+        assert "Likelier still is that power 6 acts beside it" in " ".join(str(d).split())

@@ -168,6 +168,9 @@ def test_the_mug_is_told_to_evaporate(among: str):
     assert diagnosis.after.held_out.rmse < 0.6
     room, _ = estimates(diagnosis)["Ta"]
     assert 15.0 < room < 30.0
+    if among == "all":  # all that are likelier hold it, and more
+        assert diagnosis.terms == ["evaporation"]
+        assert "Likelier still is that ambient drift and second heat capacity act beside it" in " ".join(str(diagnosis).split())
 
 
 # --- solar cell --------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ from torch import Tensor
 from torchcal.discovery import explain
 from torchcal.discovery.decision import Decision, other_names, tie_other_names, weigh
 from torchcal.discovery.doubts import distinct, doubt, left_open
+from torchcal.discovery.instruments import only_instruments
 from torchcal.discovery.model import Model
 from torchcal.discovery.proof import gain, prove
 from torchcal.discovery.search import Search
@@ -78,25 +79,42 @@ def _least_part(models: Sequence[Model], model: Model) -> float:
 def nearly(search: Search, ranked: list[Model], mask: Tensor | None, decision: Decision) -> None:
     """Real recordings are never quite white: name what removes nearly all, on held-out data too, far before rivals."""
     clean = [m for m in ranked if not m.note and m.window is None]  # a window bends to whatever is left
-    if search.problem.recording.noise is not None or not clean:
+    if search.problem.recording.noise is not None:
         return
+    shared: Model | None = None
     for size in (1, 2):  # three bend to almost anything
         mine = sorted((m for m in clean if len(m.numbers) == size), key=lambda m: m.found.chi2)
-        if not mine:
+        if not mine or not _leaves_little(search, mine[0], mask):
             continue
         best = mine[0]
-        if explain.removed(search, best) < NEARLY or gain(search, best, mask) < REMOVED:
-            continue
-        most = min((1 - REMOVED) * search.base.chi2, LEFT**2 * search.problem.n)
-        few = distinct(search.problem) < PLENTY * len(best.found.free)
-        if best.found.chi2 > most or few or left_open(search, best):
-            continue  # most of the misfit was noise, or most of what is left is not; or the data leave it open
-        leading = ranked[0]
-        if not set(best.names) <= set(decision.beside) or leading.weight > best.weight + OUTDONE:
-            continue  # what is left is likelier without it, or with others beside it
-        left = 1.0 - explain.removed(search, best)
-        rivals = [m for m in mine[1:] if frozenset(m.names) != frozenset(best.names)]
-        if not other_names(search, best) and all(1.0 - explain.removed(search, m) > BEATEN * left for m in rivals):
-            decision.verdict, decision.best, decision.nearly = "named", best, True
-            prove(search, decision, mask)
-        return
+        likelier = [m for m in ranked if m.weight > best.weight + OUTDONE]
+        if not set(best.names) <= set(decision.beside):
+            continue  # what is left is likelier without it
+        if not likelier:
+            if _far_before(search, mine):
+                shared = best
+            break
+        # Physics that they all have is there, whatever else is; an instrument bends to much, as a pair does.
+        if size == 1 and all(set(best.names) <= set(m.names) for m in likelier) and not only_instruments(best):
+            shared = best if _far_before(search, mine) else None
+    if shared is not None:
+        decision.verdict, decision.best, decision.nearly = "named", shared, True
+        prove(search, decision, mask)
+
+
+def _leaves_little(search: Search, model: Model, mask: Tensor | None) -> bool:
+    """Whether a model leaves a small share of the misfit, not much more than noise, and nothing of itself open."""
+    if explain.removed(search, model) < NEARLY or gain(search, model, mask) < REMOVED:
+        return False
+    most = min((1 - REMOVED) * search.base.chi2, LEFT**2 * search.problem.n)
+    few = distinct(search.problem) < PLENTY * len(model.found.free)
+    return model.found.chi2 <= most and not few and not left_open(search, model)
+
+
+def _far_before(search: Search, models: Sequence[Model]) -> bool:
+    """Whether the first of models leaves far less of the misfit than those of other terms, and has one name alone."""
+    best = models[0]
+    left = 1.0 - explain.removed(search, best)
+    rivals = [m for m in models[1:] if frozenset(m.names) != frozenset(best.names)]
+    alone = all(1.0 - explain.removed(search, m) > BEATEN * left for m in rivals)
+    return alone and not other_names(search, best)

@@ -231,6 +231,7 @@ def _named(d: Any) -> list[str]:
             "What is left is more than noise, as on most real recordings; the name rests on the share that is removed, "
             f"{apart}and on every rival of as many terms leaving at least three times as much."
         )
+        parts += _beside(d)
     else:
         parts += _rival(d, probability)
     parts.append(_proof(d))
@@ -273,6 +274,17 @@ def _behind(p: float, first: float) -> float:
 def _holds(d: Any, row: Any) -> bool:
     """Whether a row of the ranking has the named terms, alone or with others."""
     return bool(row.refitted and row.physical and not row.note and set(row.terms) >= set(d.terms))
+
+
+def _beside(d: Any) -> list[str]:
+    """What would be likelier together with what is named, though too much of it is left to be a name."""
+    rows = [row for row in d.ranking if row.refitted and row.physical and set(row.terms) >= set(d.terms)]
+    best = max(rows, key=lambda row: row.probability)
+    more = [name for name in best.terms if name not in d.terms]
+    if not more:
+        return []
+    share = share_in_words(best.misfit_removed)
+    return [f"Likelier still is that {_and(more)} {'acts' if len(more) == 1 else 'act'} beside it ({share} removed)."]
 
 
 def _larger(d: Any) -> list[str]:
