@@ -170,7 +170,8 @@ def test_the_mug_is_told_to_evaporate(among: str):
     assert 15.0 < room < 30.0
     if among == "all":  # all that are likelier hold it, and more
         assert diagnosis.terms == ["evaporation"]
-        assert "Likelier still is that ambient drift and second heat capacity act beside it" in " ".join(str(diagnosis).split())
+        told = " ".join(str(diagnosis).split())
+        assert "Likelier still is that ambient drift and second heat capacity act beside it" in told
 
 
 # --- solar cell --------------------------------------------------------------------------------------------
