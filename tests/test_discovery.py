@@ -623,7 +623,7 @@ def test_an_estimate_that_wants_to_cross_its_bound_is_not_named(truth, bounds):
         return tc.Term("cubic", equation="v", rate=lambda t, s, p, u: -p["k"] * s["x"] ** 3,
                        parameters=[tc.Parameter("k", **bounds)])  # fmt: skip
 
-    body, _, x = spring([term()], noise=0.01, cubic__k=truth)
+    body, _, x = spring([term()], noise=0.01, seed=12, cubic__k=truth)
     motion = tc.Recording(runs=[run_of(x)], noise=0.01)
     assert quiet(body, motion, [term()]).terms == ["cubic"]
     d = quiet(body, motion, [term(**bounds)])

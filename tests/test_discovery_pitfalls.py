@@ -78,7 +78,7 @@ def test_what_does_the_same_is_tied_in_whatever_order_it_is_given(heated, order)
 @pytest.mark.slow
 def test_a_base_that_only_a_combination_of_can_be_told_still_gets_its_candidates():
     # A rigid body of which one rotation is not seen: it and the coefficients can be scaled against each other.
-    t, rng, runs = np.linspace(0, 12, 80), np.random.default_rng(22), []
+    t, rng, runs = np.linspace(0, 12, 80), np.random.default_rng(2), []
     for begin in ([1.0, 0.1, 0.8], [0.3, 1.5, 0.2]):
         w = solve(lambda t, w: [0.4 * w[1] * w[2], -0.7 * w[0] * w[2], 0.3 * w[0] * w[1] - 0.04 * w[2]], begin, t)
         w = w[:2] + 0.02 * rng.standard_normal((2, 80))
