@@ -53,7 +53,7 @@ def only_instruments(model: Model) -> bool:
     has a memory of its own, or counts from the first sample."""
     problem = model.found.problem
     drivers = problem.drivers_at_data(model.found.values[None], model.found.warm)
-    p = {name: model.found.values.new_tensor(value) for name, value in model.found.by_name.items()}
+    p = problem.parameters_at_data(model.found.values)
     for term in model.candidate.terms:
         if not term.outputs or term.shifts or term.frees or not set(term.rates) <= set(term.states):
             return False
@@ -77,7 +77,7 @@ def no_instrument(search: Search, model: Model) -> str:
     values = spread_values(bare, [q.name for q in problem.parameters], model.found.values)
     true = bare.evaluate(values[None], [], bare.guess(model.found.warm, values[None]))[0][0]
     drivers = problem.drivers_at_data(model.found.values[None], model.found.warm)
-    p = {name: values.new_tensor(value) for name, value in model.found.by_name.items()}
+    p = problem.parameters_at_data(model.found.values)
     sd = _noise_at_data(search, model)
     names = [q.name for q in problem.parameters]
     shapes = set(model.candidate.own) - set(model.candidate.amplitudes)
@@ -85,7 +85,8 @@ def no_instrument(search: Search, model: Model) -> str:
         for name, function in term.outputs.items():
             number = problem.recording.outputs.index(name) if name in problem.recording.outputs else 0
             here = (problem.output_of == number).nonzero()[:, 0]
-            reading = _reading(problem, term, function, {d: along[here] for d, along in drivers.items()}, p)
+            along = {d: each[here] for d, each in drivers.items()}
+            reading = _reading(problem, term, function, along, {q: v[here] if v.ndim else v for q, v in p.items()})
             if reading is None:
                 continue
             y = _range(true[here])
@@ -159,9 +160,9 @@ def _reading(
     """What an instrument shows of true values ``(m,)``; None where that depends on anything but these."""
 
     def reading(y: Tensor, by: int = 0) -> Tensor:
-        at = {name: along.roll(by) for name, along in drivers.items()}
+        at, own = ({name: each.roll(by) if each.ndim else each for name, each in many.items()} for many in (drivers, p))
         x = at if isinstance(problem.recording.x, dict) else next(iter(at.values()))
-        shown = function(at["t"], at, term.own(p), at, y) if problem.in_time else function(x, term.own(p), y)
+        shown = function(at["t"], at, term.own(own), at, y) if problem.in_time else function(x, term.own(own), y)
         return shown + 0 * y
 
     y = torch.linspace(1.0, 2.0, len(next(iter(drivers.values()))), dtype=torch.float64)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchcal.data import Recording
 from torchcal.errors import SimulatorError
-from torchcal.simulators import Parameter, Simulator, Solution, Trajectories
+from torchcal.simulators import Parameter, Simulator, Solution, Trajectories, Values
 
 __all__ = ["Problem", "Whitening", "breaks", "is_value_of", "remembered"]
 
@@ -253,6 +253,15 @@ class Problem:
     def drivers_at_data(self, values: Tensor, warm: Solution | None) -> dict[str, Tensor]:
         """The same at the data in use, ``(n,)`` each."""
         return {name: along[self.condition_of] for name, along in self.drivers(values, warm).items()}
+
+    def parameters_at_data(self, values: Tensor) -> Values:
+        """Parameters ``(P,)`` by the names that the functions of a model get: a number each, or where they differ from
+        run to run ``(n,)``."""
+        bound = self.simulator
+        if not isinstance(bound, Trajectories):
+            return Values({q.name: value for q, value in zip(self.parameters, values, strict=True)}, 0.0, 0.0)
+        found = bound.layout.by_name(values[None], bound.grid.run_of[self.condition_of])
+        return found | {name: each[0] if each.shape[-1] > 1 else each[0, 0] for name, each in found.items()}
 
     @property
     def kinds(self) -> tuple[str, str]:

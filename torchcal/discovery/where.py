@@ -12,8 +12,7 @@ from torchcal.discovery.places import Place
 from torchcal.discovery.problem import is_value_of
 from torchcal.discovery.records import Location, MissingRate, NeededShift, Table
 from torchcal.discovery.search import Search
-from torchcal.errors import SimulatorError
-from torchcal.simulators import Values
+from torchcal.errors import TorchcalError
 from torchcal.terms import Term
 
 __all__ = ["locate", "missing_rate", "needed_shifts"]
@@ -147,16 +146,16 @@ def _reads(model: Model) -> set[str]:
     if not isinstance(problem.recording.x, dict):
         return set()
     drivers = _Noting(problem.drivers_at_data(found.values[None], found.warm))
-    p = {name: found.values.new_tensor(value) for name, value in found.by_name.items()}
+    p = problem.parameters_at_data(found.values)
     for term in model.candidate.terms:
+        own = term.own(p)
+        given = (dict(drivers)["t"], drivers, own, drivers) if problem.in_time else (drivers, own)
         try:
-            own = term.own(Values(p, 0.0, 0.0))
-            given = (dict(drivers)["t"], drivers, own, drivers) if problem.in_time else (drivers, own)
             for function in (*term.rates.values(), *term.shifts.values()):
                 term.call(function, *given)
             for function in term.outputs.values():
                 term.call(function, *given, found.y)
-        except (KeyError, SimulatorError):  # it asks for what differs from run to run
+        except TorchcalError:  # not every function works on a row of data, and this is but for words
             continue
     return drivers.noted
 
