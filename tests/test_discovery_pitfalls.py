@@ -799,3 +799,24 @@ def test_a_term_may_read_what_differs_from_run_to_run():
     assert d.terms == ["evaporation"]
     assert d.where[0].driver == "T"
     assert [float(e.value) for e in d.final.estimates if e.name.startswith("Ta")] == pytest.approx([20, 23, 17], abs=3)
+
+
+def test_a_term_may_free_what_differs_from_run_to_run():
+    # Two ramps, each tilted by an angle of its own that nobody measured.
+    t, rng, runs = np.linspace(0, 4, 60), np.random.default_rng(1), []
+    for tilt, begin in ((0.3, 1.0), (-0.2, 2.0)):
+        v = begin * np.exp(-0.5 * t) + tilt / 0.5 * (1 - np.exp(-0.5 * t))
+        runs.append(tc.Run(time=t, outputs={"v": v + 0.02 * rng.standard_normal(60)}))
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"v": p["pull"] - p["c"] * s["v"]},
+        {"v": "m/s"},
+        [tc.Parameter("c", low=0.0, initial=0.3), tc.Parameter("pull", unit="m/s^2", neutral=0.0, per_run=True)],
+    )
+    tilt = tc.Term("tilt", frees=("pull",), formula="dv/dt ∋ g sin(a)")
+    d = diagnose(base, tc.Recording(runs=runs, noise=0.02), [tilt, *tc.terms.sensor("v", dynamic=False)])
+    assert d.terms == ["tilt"]
+    found = {e.name: float(e.value) for e in d.final.estimates}
+    assert [found["pull[0]"], found["pull[1]"]] == pytest.approx([0.3, -0.2], abs=0.05)
+    assert "pull[0] = 0." in d.equations[0]
+    assert "pull[1] = -0." in d.equations[0]
+    assert d.where[0].driver == "run"

@@ -210,12 +210,11 @@ def prepare(
     begin = spread_values(problem, [q.name for q in base.parameters], found.values)
     own, neutral, certain = [], [], []
     terms_names = {term.full(q.name): (term, q) for term in terms for q in term.parameters}
-    freed = {name for term in terms for name in term.frees}
     base_parameters = {q.name: q for q in base.parameters}
     for i, q in enumerate(problem.parameters):
         if q.name in terms_names:
             at = neutral_of(terms_names[q.name][1])
-        elif q.name in freed:
+        elif any(term.brings(q.name) for term in terms):
             at = base_parameters[q.name].neutral
             at = float(begin[i]) if at is None else at
         else:

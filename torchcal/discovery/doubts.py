@@ -47,8 +47,8 @@ def left_open(search: Search, model: Model) -> str:
     """Why the data do not determine what a model adds; empty if they do."""
     names = [q.name for q in model.found.problem.parameters]
     for term in model.candidate.terms:
-        shapes = [i for i in model.candidate.own if names[i] in term.brings and not is_window(names[i])]
-        places = [i for i in model.candidate.amplitudes if names[i] in term.brings]
+        shapes = [i for i in model.candidate.own if term.brings(names[i]) and not is_window(names[i])]
+        places = [i for i in model.candidate.amplitudes if term.brings(names[i])]
         sure = model.window is None and len(model.candidate.terms) == 1 and not search.exact
         least = OPEN if sure else CLEARLY_OPEN
         # Without noise the misfit is what an amplitude is uncertain by.

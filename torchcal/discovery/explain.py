@@ -186,7 +186,7 @@ def _one_law(model: Model) -> list[str]:
     without = found.values.repeat(len(candidate.terms), 1)
     for row, term in zip(without, candidate.terms, strict=True):
         for i in candidate.amplitudes:
-            if names[i] in term.brings:
+            if term.brings(names[i]):
                 row[i] = candidate.neutral[candidate.own.index(i)]
     if len(without) < 2:
         return []
@@ -270,7 +270,7 @@ def formulas(model: Model) -> list[str]:
     """The accepted terms' formulas with their estimates."""
     rows = []
     for term in model.candidate.terms:
-        own = [i for i in model.candidate.own if model.found.problem.parameters[i].name in term.brings]
+        own = [i for i in model.candidate.own if term.brings(model.found.problem.parameters[i].name)]
         text = term.formula or term.name
         if model.window is not None:
             text = text.split(" where ")[0]

@@ -100,7 +100,7 @@ def no_instrument(search: Search, model: Model) -> str:
             shown = reading(true[here])
             if float((shown - true[here]).std()) > ADDED * float(true[here].std()):
                 return f"By it the reading of {name} varies more by the instrument's error than by the true value."
-            shaped = any(names[i] in term.brings and not is_window(names[i]) for i in shapes)
+            shaped = any(term.brings(names[i]) and not is_window(names[i]) for i in shapes)
             if shaped and _bends(reading, true[here]) and _straight(reading, true[here], sd[here]):
                 return (
                     f"By it the reading of {name} is a straight line at the recorded values, as with an offset and a "

@@ -32,12 +32,11 @@ from torchcal.discovery.local import (
 )
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.own_noise import likeliest_alone
-from torchcal.discovery.problem import is_value_of
 from torchcal.discovery.search import BETTER, Search
 from torchcal.discovery.verdict import PLAINLY_WHITE
 from torchcal.discovery.windows import long_enough, stepped
 from torchcal.errors import DomainError, SimulatorError
-from torchcal.simulators import Parameter, Trajectories
+from torchcal.simulators import Parameter, Trajectories, is_value_of
 from torchcal.terms import Term
 
 __all__ = ["refit_nameless"]

@@ -12,7 +12,7 @@ from torchcal.data import Recording
 from torchcal.errors import SimulatorError
 from torchcal.simulators import Parameter, Simulator, Solution, Trajectories, Values
 
-__all__ = ["Problem", "Whitening", "breaks", "is_value_of", "remembered"]
+__all__ = ["Problem", "Whitening", "breaks", "remembered"]
 
 #: Combinations of all levels of all conditions, in the number of rows, up to which these are a grid; the levels of a
 #: condition up to which it switches between sweeps of another one; and the rows of a sweep, on average, at least.
@@ -281,8 +281,3 @@ def breaks(columns: Tensor) -> Tensor:
 def remembered(phi: Tensor, gaps: Tensor) -> Tensor:
     """Correlation of noise over distances ``(m,)``, for each AR(1) coefficient, ``(m, *phi.shape)``."""
     return (phi ** gaps.reshape(-1, *[1] * phi.ndim)).clamp_max(CLOSEST)
-
-
-def is_value_of(name: str, parameter: str) -> bool:
-    """Whether a name is that of a parameter, or of its value in one run."""
-    return name == parameter or name.startswith(f"{parameter}[")

@@ -9,10 +9,10 @@ from torch import Tensor
 from torchcal.discovery.explain import removed
 from torchcal.discovery.model import Model
 from torchcal.discovery.places import Place
-from torchcal.discovery.problem import is_value_of
 from torchcal.discovery.records import Location, MissingRate, NeededShift, Table
 from torchcal.discovery.search import Search
 from torchcal.errors import TorchcalError
+from torchcal.simulators import is_value_of
 from torchcal.terms import Term
 
 __all__ = ["locate", "missing_rate", "needed_shifts"]

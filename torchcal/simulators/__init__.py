@@ -6,7 +6,7 @@ from torchcal.simulators.external import ExternalSimulator
 from torchcal.simulators.held_out import HeldOutError
 from torchcal.simulators.layout import Values
 from torchcal.simulators.ode import ODESimulator
-from torchcal.simulators.parameter import Parameter, Scaling, free_parameters
+from torchcal.simulators.parameter import Parameter, Scaling, free_parameters, is_value_of
 from torchcal.simulators.solution import Solution
 from torchcal.simulators.static import Conditions, Linearisation, Simulator, check_parameters
 from torchcal.simulators.stepping import (
@@ -39,6 +39,7 @@ __all__ = [
     "check_parameters",
     "focused",
     "free_parameters",
+    "is_value_of",
     "may_change",
     "outgrown",
     "settled",

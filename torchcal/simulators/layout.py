@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchcal.data import Recording, Run
 from torchcal.errors import RecordingError, SimulatorError
-from torchcal.simulators.parameter import Parameter
+from torchcal.simulators.parameter import Parameter, in_run
 
 if TYPE_CHECKING:
     from torchcal.simulators.ode import ODESimulator
@@ -64,7 +64,7 @@ class Layout:
             if parameter.per_run and len(runs) > 1:
                 self._places[parameter.name] = [first + r for r in range(len(runs))]
                 parameters += [
-                    dataclasses.replace(parameter, name=f"{parameter.name}[{r}]") for r in range(len(runs))
+                    dataclasses.replace(parameter, name=in_run(parameter.name, r)) for r in range(len(runs))
                 ]
             else:
                 self._places[parameter.name] = [first]

@@ -9,7 +9,25 @@ from torch import Tensor
 
 from torchcal.errors import DomainError, EmbeddingError, ShapeError
 
-__all__ = ["Parameter", "Scaling", "free_parameters", "spans"]
+__all__ = ["Parameter", "Scaling", "free_parameters", "in_run", "is_value_of", "spans"]
+
+
+def in_run(parameter: str, run: int) -> str:
+    """The name of a parameter's value in one run.
+
+    >>> in_run("k", 0)
+    'k[0]'
+    """
+    return f"{parameter}[{run}]"
+
+
+def is_value_of(name: str, parameter: str) -> bool:
+    """Whether a name is that of a parameter, or of its value in one run.
+
+    >>> [is_value_of(name, "k") for name in ("k", "k[2]", "kappa")]
+    [True, True, False]
+    """
+    return name == parameter or name.startswith(f"{parameter}[")
 
 
 def spans(values: Mapping[str, Tensor]) -> str:

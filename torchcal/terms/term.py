@@ -13,7 +13,15 @@ from torch import Tensor
 
 from torchcal.display import NONE
 from torchcal.errors import DomainError, SimulatorError, TorchcalError
-from torchcal.simulators import ExternalSimulator, ODESimulator, Parameter, Simulator, Trajectories, Values
+from torchcal.simulators import (
+    ExternalSimulator,
+    ODESimulator,
+    Parameter,
+    Simulator,
+    Trajectories,
+    Values,
+    is_value_of,
+)
 
 __all__ = ["Term", "extend", "outer"]
 
@@ -197,10 +205,10 @@ class Term:
         """How results call one of its own parameters."""
         return f"{self.name}.{parameter}"
 
-    @property
-    def brings(self) -> set[str]:
-        """What results call the parameters that it adds or frees."""
-        return {*(self.full(q.name) for q in self.parameters), *self.frees}
+    def brings(self, name: str) -> bool:
+        """Whether it adds or frees the parameter that results call so, or whose value in one run they do."""
+        added = name in (self.full(q.name) for q in self.parameters)
+        return added or any(is_value_of(name, freed) for freed in self.frees)
 
     def own(self, p: Mapping[str, Any]) -> dict[str, Any]:
         """``p`` as the term's functions see it."""
