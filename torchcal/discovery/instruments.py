@@ -14,6 +14,7 @@ from torchcal.discovery.model import Model
 from torchcal.discovery.own_noise import beside
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.search import Search
+from torchcal.simulators import Values
 from torchcal.terms import Term, extend
 
 __all__ = ["no_instrument", "only_instruments", "unnatural"]
@@ -32,6 +33,9 @@ SEEN, FEW = 2.0, 2
 FAR, STRAIGHT = 3.0, 1e-9
 #: Joint sd of an estimate and of what it is in nature, from which on it is not that.
 APART = 2.0
+
+Reading = Callable[..., Tensor]
+"""What is shown of true values."""
 
 
 def unnatural(model: Model) -> str:
@@ -59,8 +63,10 @@ def only_instruments(model: Model) -> bool:
             return False
         if term.states or term.elapsed:
             continue
-        if not all(_reading(problem, term, f, drivers, p) for f in term.outputs.values()):
-            return False
+        for function in term.outputs.values():
+            reading = _reading(problem, term, function, drivers, p)
+            if reading is None or not _of_true_value(reading, problem.n):
+                return False
     return True
 
 
@@ -86,8 +92,14 @@ def no_instrument(search: Search, model: Model) -> str:
             number = problem.recording.outputs.index(name) if name in problem.recording.outputs else 0
             here = (problem.output_of == number).nonzero()[:, 0]
             along = {d: each[here] for d, each in drivers.items()}
-            reading = _reading(problem, term, function, along, {q: v[here] if v.ndim else v for q, v in p.items()})
+            reading = _reading(problem, term, function, along, p.at(here))
             if reading is None:
+                continue
+            shown = reading(true[here])
+            if float((shown - true[here]).std()) > ADDED * float(true[here].std()):
+                return f"By it the reading of {name} varies more by the instrument's error than by the true value."
+            if not _of_true_value(reading, len(here)):
+                true[here] = shown
                 continue
             y = _range(true[here])
             slope = _slope(reading, y)
@@ -97,9 +109,6 @@ def no_instrument(search: Search, model: Model) -> str:
                     f"By it the reading of {name} falls where the true value rises, at the recorded values or just "
                     "beyond them, as that of no instrument does."
                 )
-            shown = reading(true[here])
-            if float((shown - true[here]).std()) > ADDED * float(true[here].std()):
-                return f"By it the reading of {name} varies more by the instrument's error than by the true value."
             shaped = any(term.brings(names[i]) and not is_window(names[i]) for i in shapes)
             if shaped and _bends(reading, true[here]) and _straight(reading, true[here], sd[here]):
                 return (
@@ -110,7 +119,7 @@ def no_instrument(search: Search, model: Model) -> str:
     return ""
 
 
-def _bends(reading: Callable[[Tensor], Tensor], true: Tensor) -> bool:
+def _bends(reading: Reading, true: Tensor) -> bool:
     """Whether a reading is no straight line of the true value near the recorded ones, as with an offset or a gain
     error."""
     middle = true.mean()
@@ -124,7 +133,7 @@ def _bends(reading: Callable[[Tensor], Tensor], true: Tensor) -> bool:
     return False
 
 
-def _straight(reading: Callable[[Tensor], Tensor], true: Tensor, sd: Tensor) -> bool:
+def _straight(reading: Reading, true: Tensor, sd: Tensor) -> bool:
     """Whether a reading follows a straight line at the recorded values, but for a few, as far as noise shows."""
     kept, shown = torch.ones_like(true, dtype=torch.bool), reading(true)
     if not bool(shown.isfinite().all()):
@@ -155,23 +164,31 @@ def _noise_at_data(search: Search, model: Model) -> Tensor:
 
 
 def _reading(
-    problem: Problem, term: Term, function: Callable[..., Tensor], drivers: dict[str, Tensor], p: dict[str, Tensor]
-) -> Callable[[Tensor], Tensor] | None:
-    """What an instrument shows of true values ``(m,)``; None where that depends on anything but these."""
+    problem: Problem, term: Term, function: Callable[..., Tensor], drivers: dict[str, Tensor], p: Values
+) -> Reading | None:
+    """What an instrument shows of true values ``(m,)`` at the data, or at those so many places further on; None where
+    its function cannot be asked."""
 
     def reading(y: Tensor, by: int = 0) -> Tensor:
-        at, own = ({name: each.roll(by) if each.ndim else each for name, each in many.items()} for many in (drivers, p))
+        order = torch.arange(len(y)).roll(by)
+        at, own = {name: each[order] for name, each in drivers.items()}, term.own(p.at(order))
         x = at if isinstance(problem.recording.x, dict) else next(iter(at.values()))
-        shown = function(at["t"], at, term.own(own), at, y) if problem.in_time else function(x, term.own(own), y)
-        return shown + 0 * y
+        given = (at["t"], at, own, at, y) if problem.in_time else (x, own, y)
+        shown: Tensor = term.call(function, *given) + 0 * y
+        return shown
 
-    y = torch.linspace(1.0, 2.0, len(next(iter(drivers.values()))), dtype=torch.float64)
     try:
-        shown = reading(y)
-        same = all(torch.allclose(shown, reading(y, by), rtol=0, atol=0, equal_nan=True) for by in (1, len(y) // 2))
+        reading(torch.linspace(1.0, 2.0, len(next(iter(drivers.values()))), dtype=torch.float64))
     except Exception:  # the simulator calls it otherwise, and tells what is wrong
         return None
-    return reading if same else None
+    return reading
+
+
+def _of_true_value(reading: Reading, count: int) -> bool:
+    """Whether what is shown depends on the true value alone, and not on where in the data that is."""
+    y = torch.linspace(1.0, 2.0, count, dtype=torch.float64)
+    shown = reading(y)
+    return all(torch.allclose(shown, reading(y, by), rtol=0, atol=0, equal_nan=True) for by in (1, count // 2))
 
 
 def _range(true: Tensor) -> Tensor:
@@ -187,7 +204,7 @@ def _range(true: Tensor) -> Tensor:
     )
 
 
-def _slope(reading: Callable[[Tensor], Tensor], y: Tensor) -> Tensor:
+def _slope(reading: Reading, y: Tensor) -> Tensor:
     """Of what is shown by what is true, ``(m,)``; 0 where the one does not follow from the other."""
     with torch.enable_grad():
         leaf = y.detach().clone().requires_grad_(True)

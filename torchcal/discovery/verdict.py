@@ -8,9 +8,10 @@ from torch import Tensor
 from torchcal.discovery.by_share import decide_exact, nearly
 from torchcal.discovery.decision import Decision, certain, groups_of, other_names, tie_other_names, weigh
 from torchcal.discovery.doubts import doubt, left_open
-from torchcal.discovery.instruments import only_instruments
+from torchcal.discovery.instruments import no_instrument, only_instruments, unnatural
 from torchcal.discovery.model import PRIOR, Model
 from torchcal.discovery.own_noise import weigh_alone
+from torchcal.discovery.places import Place
 from torchcal.discovery.proof import prove
 from torchcal.discovery.search import Search
 from torchcal.discovery.structure import Structure
@@ -51,7 +52,7 @@ def _unknown(search: Search, structure: Structure, *, calibrated: bool) -> float
     Calibrated, it is held against what noise alone gives: at most −1/(e p ln p) for a probability p (Sellke, Bayarri &
     Berger 2001), and beyond the largest simulated value the surplus.
     """
-    places = [p.evidence for p in structure.places if p.channel.kind in search.problem.kinds]
+    places = [place.evidence for place in _counting(search, structure)]
     if not places:
         return -math.inf
     seen = max(places)
@@ -60,6 +61,12 @@ def _unknown(search: Search, structure: Structure, *, calibrated: bool) -> float
     p = structure.p_value
     bound = -math.log(-math.e * p * math.log(p)) if p < 1.0 / math.e else 0.0
     return bound + max(seen - float(structure.null_best.max()), 0.0)
+
+
+def _counting(search: Search, structure: Structure) -> list[Place]:
+    """The places that speak for something unknown: in time a parameter's smooth change is one of the equation's, but
+    its swings are not."""
+    return [p for p in structure.places if p.channel.kind in search.problem.kinds or p.period is not None]
 
 
 def _none_evidence(search: Search, ranked: list[Model], here: float) -> tuple[float, Model | None]:
@@ -109,7 +116,7 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
             (unknown + decision.none_evidence, beside), found, key=lambda one: one[0]
         )
         nameless = max(search.nameless, key=lambda m: m.weight, default=None)
-        leading = next((p for p in search.structure.places if p.channel.kind in search.problem.kinds), None)
+        leading = next(iter(_counting(search, search.structure)), None)
         search.unnamed = None
         if nameless is not None and nameless.weight > decision.none_evidence:
             search.unnamed = nameless
@@ -162,9 +169,9 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     # One alone is not sure enough, or it had been named; and where several do what something unknown there would do.
     rival = any(m.weight > best.weight - BEHIND for m in search.nameless)
     local = rival and all(model.window is not None for model in decision.tied_models)
-    decision.doubt = left_open(search, best)
-    # Windows and instruments bend to what no term of the list explains.
-    pliant = all(m.window is not None or only_instruments(m) for m in decision.tied_models)
+    decision.doubt = left_open(search, best) or unnatural(best) or no_instrument(search, best)
+    # Windows, instruments and several terms together bend to what no term of the list explains.
+    pliant = all(m.window is not None or len(m.numbers) > 1 or only_instruments(m) for m in decision.tied_models)
     likely = decision.none > min(1 - UNKNOWN, _second(decision, ranked))
     if len(decision.tied) < 2 or likely or local or pliant or decision.doubt:
         decision.tied.append(list(NONE))

@@ -69,7 +69,8 @@ def _headline(d: Any) -> str:
     if d.settings.get("interrupted") and d.verdict != "ambiguous":
         return f"Verdict: {d.verdict}, as far as the search went before it was interrupted"
     if d.verdict == "consistent":
-        return "Verdict: consistent (nothing is missing that these data could show)"
+        told = "nothing is surely missing" if _yet(d) else "nothing is missing that these data could show"
+        return f"Verdict: consistent ({told})"
     if d.verdict == "named":
         return f"Verdict: named: {_and([_with_region(d, name) for name in d.terms])}"
     if d.verdict == "ambiguous":

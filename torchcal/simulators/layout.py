@@ -34,6 +34,14 @@ class Values(dict[str, Any]):
         """The same, to be changed."""
         return Values(self, self.first, self.start)
 
+    def at(self, places: Tensor) -> "Values":
+        """Those at some of the points ``(n,)`` that values are for, where they differ from point to point."""
+
+        def cut(value: Any) -> Any:
+            return value[places] if isinstance(value, Tensor) and value.ndim else value
+
+        return Values({name: cut(value) for name, value in self.items()}, self.first, cut(self.start))
+
     def __or__(self, other: Mapping[str, Any]) -> "Values":  # type: ignore[override]
         """The same with others beside or in place of them."""
         return Values({**self, **other}, self.first, self.start)
