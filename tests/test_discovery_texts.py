@@ -158,9 +158,10 @@ def test_a_name_acts_by_what_it_is_a_function_of(monkeypatch):
 def test_what_a_term_in_time_is_a_function_of():
     drivers = {name: torch.ones(3, dtype=F64) for name in ("t", "z", "v", "F")}
     problem = SimpleNamespace(
-        in_time=True, drivers_at_data=lambda values, warm: dict(drivers), recording=SimpleNamespace(x={"time": T})
-    )
-    found = SimpleNamespace(problem=problem, values=T, warm=None, by_name={"k": 1.0, "one.q": 2.0}, y=T)
+        in_time=True, drivers_at_data=lambda values, warm: dict(drivers), recording=SimpleNamespace(x={"time": T}),
+        parameters_at_data=lambda values: {"k": T[0], "one.q": T[1]},
+    )  # fmt: skip
+    found = SimpleNamespace(problem=problem, values=T, warm=None, y=T)
     for term, read in (
         (tc.Term("one", rates={"v": lambda t, s, p, u: p["q"] * s["v"] * u["F"]}, **Q), {"v", "F"}),
         (tc.Term("one", shifts={"k": lambda t, s, p, u: p["q"] * t}, **Q), set()),
@@ -380,7 +381,7 @@ def test_a_parameter_on_its_bound_is_told_once(monkeypatch):
 @pytest.mark.parametrize("stuck", [["k"], []])
 def test_a_bound_of_the_base_may_be_why_a_size_is_open(monkeypatch, stuck):
     problem = SimpleNamespace(parameters=[tc.Parameter("k"), tc.Parameter("drag.a")])
-    candidate = SimpleNamespace(terms=[SimpleNamespace(brings=["drag.a"])], own=[1], amplitudes=[1])
+    candidate = SimpleNamespace(terms=[SimpleNamespace(brings="drag.a".__eq__)], own=[1], amplitudes=[1])
     model = SimpleNamespace(candidate=candidate, window=None, found=SimpleNamespace(problem=problem))
     search = SimpleNamespace(exact=False, base=SimpleNamespace(stuck=stuck))
     monkeypatch.setattr(doubts, "_distance", lambda *given: 0.0)
@@ -394,7 +395,7 @@ def test_a_bound_of_the_base_may_be_why_a_size_is_open(monkeypatch, stuck):
 )
 def test_what_one_of_several_adds_must_be_clearly_there(monkeypatch, count, away, is_open):
     problem = SimpleNamespace(parameters=[tc.Parameter("drag.a"), tc.Parameter("bias.b")][:count])
-    terms = [SimpleNamespace(brings=[q.name]) for q in problem.parameters]
+    terms = [SimpleNamespace(brings=q.name.__eq__) for q in problem.parameters]
     candidate = SimpleNamespace(terms=terms, own=[*range(count)], amplitudes=[*range(count)])
     found = SimpleNamespace(problem=problem, free=[*range(count)])
     model = SimpleNamespace(candidate=candidate, window=None, found=found)

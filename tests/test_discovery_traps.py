@@ -1,11 +1,14 @@
 """What looks like missing physics and is none, and names that stand in for what is in no list."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 from scipy.integrate import solve_ivp
 
 import torchcal as tc
+from torchcal.discovery import verdict
 from torchcal.display import NONE
 
 F64 = torch.float64
@@ -205,3 +208,41 @@ def test_an_interaction_is_no_shared_preparation(listed):
     d = diagnose(base, tc.Recording(x={"u": u, "v": v}, y={"y": y}), [term] if listed else [])
     assert d.verdict == ("named" if listed else "unexplained")
     assert not any("preparation" in row for row in d.symptoms)
+
+
+def test_a_wind_that_is_in_no_list_is_no_drift_of_a_camera():
+    # Seen from the wind the ball flies as without it; launched backwards, and seen by a camera that moves.
+    t, rng, runs = np.linspace(0, 3, 40), np.random.default_rng(0), []
+    for launch in ([15.0, 12.0], [8.0, 14.0]):
+        def rates(_, s):
+            through = [s[2] - 15.0, s[3]]
+            drag = 0.02 * np.hypot(*through)
+            return [s[2], s[3], -drag * through[0], -9.81 - drag * through[1]]
+
+        x, z = solve_ivp(rates, (0, 3), [0.0, 0.0, *launch], t_eval=t, rtol=1e-9).y[:2]
+        outputs = {"x": x + 0.03 * rng.standard_normal(40), "z": z + 0.03 * rng.standard_normal(40)}
+        runs.append(tc.Run(time=t, outputs=outputs, initial={"x": 0.0, "z": 0.0}))
+
+    def model(t, s, p, u):
+        drag = p["c"] * torch.sqrt(s["vx"] ** 2 + s["vz"] ** 2)
+        return {"x": s["vx"], "z": s["vz"], "vx": -drag * s["vx"], "vz": -9.81 - drag * s["vz"]}
+
+    c = tc.Parameter("c", low=0.0, initial=0.01)  # calibrated it is 0, where a drift is another launch
+    base = tc.ODESimulator(model, ["x", "z", "vx", "vz"], [c], observe=("x", "z"))
+    terms = [term for term in tc.terms.sensor(("x", "z"), dynamic=False) if term.name.startswith("drift")]
+    d = diagnose(base, tc.Recording(runs=runs, noise=0.03), terms)
+    assert d.verdict == "ambiguous"
+    assert d.tied == [["drift of x"], list(NONE)]
+    assert "varies more by the instrument's error than by the true value" in " ".join(str(d).split())
+
+
+def test_what_swings_a_parameter_speaks_for_something_unknown():
+    # In time a smooth change of a parameter is one of a rate, which has been counted; swings are looked for in both.
+    def place(kind, evidence, period=None):
+        channel = SimpleNamespace(kind=kind)
+        return SimpleNamespace(channel=channel, evidence=evidence, period=period)
+
+    places = [place("parameter", 204.0, 30.6), place("parameter", 190.0), place("equation", 181.0)]
+    search = SimpleNamespace(problem=SimpleNamespace(kinds=("equation", "output")))
+    found = verdict._unknown(search, SimpleNamespace(places=places), calibrated=False)
+    assert found == pytest.approx(204.0 - np.log(2))

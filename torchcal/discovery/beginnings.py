@@ -12,7 +12,17 @@ from torchcal.discovery.fitting import Fitted, fit, follow_slopes, starts
 from torchcal.discovery.residual import Residual
 from torchcal.discovery.screen import Screening
 
-__all__ = ["BENT", "beginnings", "blind_rows", "first_guess", "is_far", "larger_effects", "learned", "make_up"]
+__all__ = [
+    "BENT",
+    "beginnings",
+    "blind_rows",
+    "first_guess",
+    "is_far",
+    "larger_effects",
+    "learned",
+    "make_up",
+    "within_bounds",
+]
 
 #: Shapes that a refit begins at, by their tangents; the same where the base is far off.
 SHAPES, SHAPES_FAR = 3, 8
@@ -26,6 +36,8 @@ BLIND, MAGNITUDES = (0.1, 0.3, 0.5, 0.7, 0.9), range(-4, 3)
 #: Sizes, in those of the misfit, at which an effect whose tangent is the base's is looked at; steps in which the base
 #: makes up for it; and the χ² a datum that it must leave to be something else.
 LARGER, MADE_UP, SEEN = (1.0, 4.0), 12, 0.01
+#: Share of a tangent that the base's leave of it, from which on it is none of theirs.
+NEW = 1e-3
 #: Shares of the linear estimate from which refits begin; of it at the base of another fit, those that are tried.
 STEPS, LADDER = (0.05, 1.0), tuple(4.0**k for k in range(-2, 6))
 
@@ -62,6 +74,17 @@ def first_guess(base: Fitted, fixed: Mapping[str, float], seed: int) -> Tensor:
     return follow_slopes(base.problem, starts(base.problem, 1, seed, held))[0]
 
 
+def within_bounds(base: Fitted, fixed: Mapping[str, float], seed: int) -> Tensor | None:
+    """The base's parameters ``(P,)`` with first guesses of those that ran to a bound; None where there are none."""
+    if not bool(base.at_bound.any()):
+        return None
+    held = base_columns(base.problem, fixed)[1]
+    stuck = [i for i, at in zip(base.free, base.at_bound.tolist(), strict=True) if at]
+    found = base.values.clone()
+    found[stuck] = starts(base.problem, 1, seed, held)[0, stuck]
+    return found
+
+
 def make_up(base: Fitted, candidate: Candidate, row: Tensor, effect: Tensor) -> Tensor:
     """A candidate's starting values, moved to first order so that the base makes up for an effect ``(n,)``."""
     w = base.whitening
@@ -74,10 +97,11 @@ def make_up(base: Fitted, candidate: Candidate, row: Tensor, effect: Tensor) -> 
     return moved
 
 
-def larger_effects(residual: Residual, candidate: Candidate) -> Tensor | None:
+def larger_effects(residual: Residual, candidate: Candidate, within: Tensor | None) -> Tensor | None:
     """Larger effects of a candidate whose tangents are the base's, as starts of a refit; None where these are too.
 
-    At each size the base's parameters make up for the effect as far as they can.
+    At each size the base's parameters make up for the effect as far as they can. Where some of these ran to bounds, and
+    with them ``within`` the tangents are not the base's, it begins there.
     """
     base = residual.found
     columns = _columns(base, candidate)
@@ -100,7 +124,27 @@ def larger_effects(residual: Residual, candidate: Candidate) -> Tensor | None:
     free = [i for i, at in zip(columns, base.at_bound.tolist(), strict=True) if not at]
     bound = (found.ends[:, free] <= low[free]) | (found.ends[:, free] >= high[free])
     seen = (found.ends_chi2 > 1.0 + SEEN * n) & ~bound.any(-1)  # where the base is not held back
-    return found.ends[seen] if bool(seen.any()) else None
+    if bool(seen.any()):
+        return found.ends[seen]
+    return None if within is None else _off_bounds(base, candidate, torch.stack(rows), within)
+
+
+def _off_bounds(base: Fitted, candidate: Candidate, rows: Tensor, within: Tensor) -> Tensor | None:
+    """Starts from where the base's parameters are within their bounds, if a candidate's tangents there are not theirs.
+    """
+    begin = _from_guess(base, candidate, rows, within)
+    if not len(begin):
+        return None
+    row = begin[0].clone()
+    row[candidate.own] = candidate.neutral
+    columns = _columns(base, candidate)
+    slopes = base.whitening(candidate.problem.evaluate(row[None], [*columns, *candidate.amplitudes])[1][0])
+    if not bool(slopes.isfinite().all()):
+        return None
+    theirs, own = slopes.split([len(columns), len(candidate.amplitudes)], dim=1)
+    unit = theirs / theirs.norm(dim=0).clamp_min(1e-300)
+    left = own - unit @ torch.linalg.lstsq(unit, own, rcond=1e-7, driver="gelsd").solution
+    return begin if bool((left.norm(dim=0) > NEW * own.norm(dim=0)).any()) else None
 
 
 def learned(other: Fitted, base: Fitted, candidate: Candidate) -> Tensor:

@@ -95,21 +95,17 @@ def no_instrument(search: Search, model: Model) -> str:
             reading = _reading(problem, term, function, along, p.at(here))
             if reading is None:
                 continue
-            shown = reading(true[here])
-            if float((shown - true[here]).std()) > ADDED * float(true[here].std()):
-                return f"By it the reading of {name} varies more by the instrument's error than by the true value."
-            if not _of_true_value(reading, len(here)):
-                true[here] = shown
-                continue
-            y = _range(true[here])
-            slope = _slope(reading, y)
-            fall = -(y.diff() * 0.5 * (slope[:-1] + slope[1:]).clamp_max(0)).nansum()
-            if float(fall) > FALL * float(sd[here].median()):
+            curve = _of_true_value(reading, len(here))
+            if curve and _falls(reading, true[here]) > FALL * float(sd[here].median()):
                 return (
                     f"By it the reading of {name} falls where the true value rises, at the recorded values or just "
                     "beyond them, as that of no instrument does."
                 )
-            shaped = any(term.brings(names[i]) and not is_window(names[i]) for i in shapes)
+            shown = reading(true[here])
+            drifts = curve or (problem.in_time and _of_true_value(reading, len(here), and_time=True))
+            if drifts and float((shown - true[here]).std()) > ADDED * float(true[here].std()):
+                return f"By it the reading of {name} varies more by the instrument's error than by the true value."
+            shaped = curve and any(term.brings(names[i]) and not is_window(names[i]) for i in shapes)
             if shaped and _bends(reading, true[here]) and _straight(reading, true[here], sd[here]):
                 return (
                     f"By it the reading of {name} is a straight line at the recorded values, as with an offset and a "
@@ -166,12 +162,14 @@ def _noise_at_data(search: Search, model: Model) -> Tensor:
 def _reading(
     problem: Problem, term: Term, function: Callable[..., Tensor], drivers: dict[str, Tensor], p: Values
 ) -> Reading | None:
-    """What an instrument shows of true values ``(m,)`` at the data, or at those so many places further on; None where
-    its function cannot be asked."""
+    """What an instrument shows of true values ``(m,)`` at the data, or at those so many places further on (at the same
+    time even so, where it is to be timely); None where its function cannot be asked."""
 
-    def reading(y: Tensor, by: int = 0) -> Tensor:
+    def reading(y: Tensor, by: int = 0, timely: bool = False) -> Tensor:
         order = torch.arange(len(y)).roll(by)
         at, own = {name: each[order] for name, each in drivers.items()}, term.own(p.at(order))
+        if timely:
+            at["t"] = drivers["t"]
         x = at if isinstance(problem.recording.x, dict) else next(iter(at.values()))
         given = (at["t"], at, own, at, y) if problem.in_time else (x, own, y)
         shown: Tensor = term.call(function, *given) + 0 * y
@@ -184,11 +182,12 @@ def _reading(
     return reading
 
 
-def _of_true_value(reading: Reading, count: int) -> bool:
-    """Whether what is shown depends on the true value alone, and not on where in the data that is."""
+def _of_true_value(reading: Reading, count: int, *, and_time: bool = False) -> bool:
+    """Whether what is shown depends on the true value alone, or on the time too, and not on where in the data that is.
+    """
     y = torch.linspace(1.0, 2.0, count, dtype=torch.float64)
-    shown = reading(y)
-    return all(torch.allclose(shown, reading(y, by), rtol=0, atol=0, equal_nan=True) for by in (1, count // 2))
+    moved = [reading(y, by, and_time) for by in (1, count // 2)]
+    return all(torch.allclose(reading(y), one, rtol=0, atol=0, equal_nan=True) for one in moved)
 
 
 def _range(true: Tensor) -> Tensor:
@@ -202,6 +201,13 @@ def _range(true: Tensor) -> Tensor:
         len(true),
         dtype=true.dtype,
     )
+
+
+def _falls(reading: Reading, true: Tensor) -> float:
+    """By how much a reading falls while the true value rises, at the recorded values or just beyond them."""
+    y = _range(true)
+    slope = _slope(reading, y)
+    return -float((y.diff() * 0.5 * (slope[:-1] + slope[1:]).clamp_max(0)).nansum())
 
 
 def _slope(reading: Reading, y: Tensor) -> Tensor:

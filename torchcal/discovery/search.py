@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.base import calibrate_base
-from torchcal.discovery.beginnings import larger_effects
+from torchcal.discovery.beginnings import larger_effects, within_bounds
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare
 from torchcal.discovery.fitting import Fitted, refit, weighed
 from torchcal.discovery.judge import judge
@@ -120,9 +120,11 @@ class Search:
             self.tick(f"screen {term.name}")
             self.candidates.append(prepare(self.base.problem, self.base, [term], self.fixed, scale))
         self.screening = screen(self.residual, self.candidates)
+        within = within_bounds(self.base, self.fixed, self.seed)
         for i, candidate in enumerate(self.candidates):
             if self.screening.best[i] < 0 and not candidate.blind:
-                self.candidates[i] = dataclasses.replace(candidate, bent=larger_effects(self.residual, candidate))
+                bent = larger_effects(self.residual, candidate, within)
+                self.candidates[i] = dataclasses.replace(candidate, bent=bent)
         self._alike()
         self.structure = analyse(self.residual, every=True)
         self.local, local_null = windows(self.residual, self.candidates, self.screening)

@@ -170,8 +170,13 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     rival = any(m.weight > best.weight - BEHIND for m in search.nameless)
     local = rival and all(model.window is not None for model in decision.tied_models)
     decision.doubt = left_open(search, best) or unnatural(best) or no_instrument(search, best)
-    # Windows, instruments and several terms together bend to what no term of the list explains.
-    pliant = all(m.window is not None or len(m.numbers) > 1 or only_instruments(m) for m in decision.tied_models)
+    # Windows, instruments and several terms, of which they share none, bend to what no term of the list explains.
+    shared = set(best.names).intersection(*(m.names for m in decision.tied_models))
+    several = [not shared and len(m.names) > 1 for m in decision.tied_models]
+    pliant = all(
+        m.window is not None or many or only_instruments(m)
+        for m, many in zip(decision.tied_models, several, strict=True)
+    )
     likely = decision.none > min(1 - UNKNOWN, _second(decision, ranked))
     if len(decision.tied) < 2 or likely or local or pliant or decision.doubt:
         decision.tied.append(list(NONE))

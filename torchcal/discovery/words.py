@@ -69,8 +69,9 @@ def _headline(d: Any) -> str:
     if d.settings.get("interrupted") and d.verdict != "ambiguous":
         return f"Verdict: {d.verdict}, as far as the search went before it was interrupted"
     if d.verdict == "consistent":
-        told = "nothing is surely missing" if _yet(d) else "nothing is missing that these data could show"
-        return f"Verdict: consistent ({told})"
+        if _yet(d):
+            return "Verdict: consistent (nothing is surely missing)"
+        return "Verdict: consistent (nothing is missing that these data could show)"
     if d.verdict == "named":
         return f"Verdict: named: {_and([_with_region(d, name) for name in d.terms])}"
     if d.verdict == "ambiguous":
