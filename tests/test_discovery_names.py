@@ -371,19 +371,45 @@ def test_a_base_no_better_than_a_constant_is_warned_of():
         diagnose(base, recording, [SQUARE])
 
 
-@pytest.mark.parametrize("shown", [False, True])
-def test_what_all_likelier_hypotheses_hold_is_named_for_its_share_where_it_is_no_instrument(shown):
-    # A wave leaves more than noise after all of them, and which other power acts beside the square is not told.
-    x = torch.linspace(0, 1, 150, dtype=F64)
-    y = x + 2 * x**2 + 0.3 * x**5 + 0.02 * torch.sin(40 * x) + 0.01 * normal(150, 0)
-    terms = []
-    for power in (2, 5, 6):
-        shift = {"a": lambda x, p, power=power: p["c"] * x**power}
-        output = {"y": lambda x, p, y, power=power: y + p["c"] * y**power}
-        how = {"outputs": output} if shown else {"shifts": shift}
-        terms.append(tc.Term(f"power {power}", parameters=[tc.Parameter("c")], **how))
-    d = diagnose(straight(), tc.Recording(x=x, y=y), terms)
-    assert d.settings["nearly"] is not shown
-    assert d.terms == ([] if shown else ["power 2"])
-    if not shown:
-        assert "Likelier still is that power 6 acts beside it" in " ".join(str(d).split())
+def powers(bend, kind="shifts", wave=0.02):
+    """A line and what bends it, noise of unknown size, and three powers of which none leaves noise alone."""
+    x = torch.linspace(0, 1, 180, dtype=F64)
+    y = x + bend(x) + wave * torch.sin(40 * x) + 0.01 * normal(180, 1)
+
+    def added(power):
+        how = {
+            "shifts": {"a": lambda x, p: p["c"] * x**power},
+            "outputs": {"y": lambda x, p, y: y + p["c"] * y**power},
+            "drift": {"y": lambda x, p, y: y + p["c"] * x**power},
+        }[kind]
+        where = "shifts" if kind == "shifts" else "outputs"
+        return tc.Term(f"power {power}", parameters=[tc.Parameter("c")], **{where: how})
+
+    return diagnose(straight(), tc.Recording(x=x, y=y), [added(power) for power in (2, 5, 6)])
+
+
+def test_what_all_likelier_hypotheses_hold_is_named_for_its_share():
+    d = powers(lambda x: 6 * x**2 + 0.3 * x**5)  # which other power acts beside the square is not told
+    assert d.settings["nearly"]
+    assert d.terms == ["power 2"]
+    told = " ".join(str(d).split())
+    assert "Likelier still is that power 6 acts beside it" in told
+    assert "That something which is not in this library acts too has a probability of" in told
+
+
+@pytest.mark.parametrize("kind", ["outputs", "drift"])
+def test_an_instrument_that_all_likelier_hypotheses_hold_is_no_name(kind):
+    assert powers(lambda x: 6 * x**2 + 0.3 * x**5, kind).verdict == "unexplained"
+
+
+@pytest.mark.parametrize(
+    "bend",
+    [
+        lambda x: 4 * (x - 0.15).clamp_min(0) ** 2,
+        lambda x: 4 * (x - 0.25).clamp_min(0) ** 2,
+        lambda x: 3 * (x - 0.2).clamp_min(0) ** 1.5,
+        lambda x: torch.sin(3 * x),
+    ],
+)
+def test_three_terms_together_and_windows_make_no_name_of_one(bend):
+    assert powers(bend, wave=0.0).verdict == "unexplained"

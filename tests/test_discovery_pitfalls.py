@@ -820,3 +820,6 @@ def test_a_term_may_free_what_differs_from_run_to_run():
     assert "pull[0] = 0." in d.equations[0]
     assert "pull[1] = -0." in d.equations[0]
     assert d.where[0].driver == "run"
+    assert next(q.initial for q in d.improved.parameters if q.name == "pull") == pytest.approx(0.05, abs=0.05)
+    with pytest.raises(tc.errors.DomainError, match="without the parameters that candidates free"):
+        diagnose(base, tc.Recording(runs=runs, noise=0.02), [tilt], fixed={"pull[0]": 0.0})

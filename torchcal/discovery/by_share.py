@@ -8,7 +8,6 @@ from torch import Tensor
 from torchcal.discovery import explain
 from torchcal.discovery.decision import Decision, other_names, tie_other_names, weigh
 from torchcal.discovery.doubts import distinct, doubt, left_open
-from torchcal.discovery.instruments import only_instruments
 from torchcal.discovery.model import Model
 from torchcal.discovery.proof import gain, prove
 from torchcal.discovery.search import Search
@@ -21,6 +20,8 @@ REMOVED = 0.9
 #: The same of a recording whose noise is unknown, how much more of the misfit every rival must leave, how many times
 #: its noise may be left, and data a free parameter that tell what is noise.
 NEARLY, BEATEN, LEFT, PLENTY = 0.97, 3.0, 3.0, 20
+#: The share that a term must remove to be named although others beside it are clearly likelier.
+SURELY = 0.99
 #: Log odds by which a hypothesis of other terms, or more, is clearly likelier.
 OUTDONE = 5.0
 
@@ -94,12 +95,26 @@ def nearly(search: Search, ranked: list[Model], mask: Tensor | None, decision: D
             if _far_before(search, mine):
                 shared = best
             break
-        # Physics that they all have is there, whatever else is; an instrument bends to much, as a pair does.
-        if size == 1 and all(set(best.names) <= set(m.names) for m in likelier) and not only_instruments(best):
-            shared = best if _far_before(search, mine) else None
+        if size == 1 and _holds_whatever_else(search, best, likelier) and _far_before(search, mine):
+            shared = best
     if shared is not None:
         decision.verdict, decision.best, decision.nearly = "named", shared, True
         prove(search, decision, mask)
+
+
+def _holds_whatever_else(search: Search, model: Model, likelier: Sequence[Model]) -> bool:
+    """Whether physics that removes nearly all is there, whatever else may be, by all likelier hypotheses.
+
+    They add terms to it that act everywhere: one or another, as three bend to almost anything. A window of its own
+    speaks against it, and what changes the output alone bends to much.
+    """
+    more = all(m.window is None and set(model.names) < set(m.names) for m in likelier)
+    return (
+        more
+        and sum(len(m.numbers) == 2 for m in likelier) > 1
+        and not any(term.is_sensor for term in model.candidate.terms)
+        and explain.removed(search, model) >= SURELY
+    )
 
 
 def _leaves_little(search: Search, model: Model, mask: Tensor | None) -> bool:

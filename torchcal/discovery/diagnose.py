@@ -37,7 +37,7 @@ from torchcal.discovery.verdict import PLAINLY_WHITE, decide
 from torchcal.discovery.where import locate, missing_rate, needed_shifts
 from torchcal.display import NONE
 from torchcal.errors import ConvergenceWarning, DomainError, EmbeddingError, RecordingError, warn
-from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories
+from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories, is_value_of
 from torchcal.simulators.executor import check_executor
 from torchcal.terms import Term, extend
 
@@ -121,7 +121,7 @@ def diagnose(
             f"Expected more data than parameters to calibrate. Got {problem.n} data and {len(free)} free parameters."
         )
     for term in given:
-        if stuck := [name for name in term.frees if name in (fixed or {})]:
+        if stuck := [name for name in fixed or {} if any(is_value_of(name, freed) for freed in term.frees)]:
             raise DomainError(
                 f"Expected fixed= without the parameters that candidates free. Got {stuck[0]!r}, which the term "
                 f"{term.name!r} frees (leave one of the two out)."
@@ -401,14 +401,15 @@ def _solver(simulator: Simulator) -> str:
 
 
 def _improved(simulator: Simulator, best: Model) -> Simulator:
-    """The user's simulator with the accepted terms, begun at their estimates."""
+    """The user's simulator with the accepted terms, begun at their estimates, or at the mean of each run's."""
     improved = extend(simulator, best.candidate.terms)
     estimate = best.found.by_name
-    own = {best.found.problem.parameters[i].name for i in best.candidate.own}
+    own = [best.found.problem.parameters[i].name for i in best.candidate.own]
     parameters = []
     for q in improved.parameters:
-        value = estimate.get(q.name)
-        if q.name in own and value is not None and q.contains(value) and (q.transform != "log" or value > 0):
+        values = [estimate[name] for name in own if is_value_of(name, q.name)]
+        value = sum(values) / max(len(values), 1)
+        if values and q.contains(value) and (q.transform != "log" or value > 0):
             q = Parameter(q.name, q.unit, q.low, q.high, value, None, q.transform, q.per_run)
         parameters.append(q)
     improved.parameters = tuple(parameters)

@@ -14,7 +14,7 @@ from torchcal.discovery.own_noise import beside
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.search import Search
 
-__all__ = ["distinct", "doubt", "left_open"]
+__all__ = ["distinct", "doubt", "left_open", "unfit"]
 
 #: Correlation from sample to sample from which on noise of unknown size may be physics that a term has left.
 SLOWEST = 0.85
@@ -39,8 +39,13 @@ UNSEEN = 1e-7
 
 def doubt(search: Search, model: Model) -> str:
     """Why a model is no name, however probable, in a sentence; empty if it may be one."""
-    found = left_open(search, model) or _no_better(search, model) or unnatural(model) or no_instrument(search, model)
+    found = _no_better(search, model) or unfit(search, model)
     return found or ("" if search.exact else _noise_or_physics(search, model))
+
+
+def unfit(search: Search, model: Model) -> str:
+    """Why what a model adds is open, or nothing that its terms stand for, in a sentence; empty if it is neither."""
+    return left_open(search, model) or unnatural(model) or no_instrument(search, model)
 
 
 def left_open(search: Search, model: Model) -> str:

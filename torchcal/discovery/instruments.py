@@ -3,6 +3,8 @@
 import dataclasses
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -34,8 +36,60 @@ FAR, STRAIGHT = 3.0, 1e-9
 #: Joint sd of an estimate and of what it is in nature, from which on it is not that.
 APART = 2.0
 
-Reading = Callable[..., Tensor]
-"""What is shown of true values."""
+
+@dataclass(frozen=True, eq=False)
+class _Reading:
+    """What an instrument shows of true values ``(m,)``.
+
+    Attributes:
+        problem: Says how functions are called.
+        term: The instrument.
+        function: Of one of its outputs.
+        drivers: At the data, ``(m,)`` each.
+        p: Parameters there.
+    """
+
+    problem: Problem
+    term: Term
+    function: Callable[..., Tensor]
+    drivers: dict[str, Tensor]
+    p: Values
+
+    def __call__(self, y: Tensor) -> Tensor:
+        return self.moved(y, 0)
+
+    def moved(self, y: Tensor, by: int, *, timely: bool = False) -> Tensor:
+        """The same, so many places further on in the data; at the same time even so, where that is to be timely."""
+        order = torch.arange(len(y)).roll(by)
+        at, p = {name: each[order] for name, each in self.drivers.items()}, self.p.at(order)
+        if timely:
+            at["t"], p.start = self.drivers["t"], self.p.start
+        own = self.term.own(p)
+        x = at if isinstance(self.problem.recording.x, dict) else next(iter(at.values()))
+        given = (at["t"], at, own, at, y) if self.problem.in_time else (x, own, y)
+        shown: Tensor = self.term.call(self.function, *given) + 0 * y
+        return shown
+
+    @cached_property
+    def _values(self) -> Tensor:
+        """Some true values."""
+        return torch.linspace(1.0, 2.0, len(next(iter(self.drivers.values()))), dtype=torch.float64)
+
+    @property
+    def works(self) -> bool:
+        """Whether the function can be asked like this."""
+        try:
+            self(self._values)
+        except Exception:  # the simulator calls it otherwise, and tells what is wrong
+            return False
+        return True
+
+    def is_of_value(self, *, and_time: bool = False) -> bool:
+        """Whether what is shown follows from the true value alone, or with the time, wherever in the data that is."""
+        y = self._values
+        shown = self(y)
+        moved = [self.moved(y, by, timely=and_time) for by in (1, len(y) // 2)]
+        return all(torch.allclose(shown, one, rtol=0, atol=0, equal_nan=True) for one in moved)
 
 
 def unnatural(model: Model) -> str:
@@ -46,7 +100,7 @@ def unnatural(model: Model) -> str:
             full = term.full(name)
             if abs(values[full] - expected) > APART * math.hypot(spread, sd[full]):
                 return (
-                    f"In nature its {name} is {expected:g} within {spread:g}, and not {values[full]:.2g} ± "
+                    f"In nature {full} is {expected:g} within {spread:g}, and not {values[full]:.2g} ± "
                     f"{sd[full]:.1g}: something else may have left as much."
                 )
     return ""
@@ -64,8 +118,8 @@ def only_instruments(model: Model) -> bool:
         if term.states or term.elapsed:
             continue
         for function in term.outputs.values():
-            reading = _reading(problem, term, function, drivers, p)
-            if reading is None or not _of_true_value(reading, problem.n):
+            reading = _Reading(problem, term, function, drivers, p)
+            if not (reading.works and reading.is_of_value()):
                 return False
     return True
 
@@ -92,17 +146,17 @@ def no_instrument(search: Search, model: Model) -> str:
             number = problem.recording.outputs.index(name) if name in problem.recording.outputs else 0
             here = (problem.output_of == number).nonzero()[:, 0]
             along = {d: each[here] for d, each in drivers.items()}
-            reading = _reading(problem, term, function, along, p.at(here))
-            if reading is None:
+            reading = _Reading(problem, term, function, along, p.at(here))
+            if not reading.works:
                 continue
-            curve = _of_true_value(reading, len(here))
+            curve = reading.is_of_value()
             if curve and _falls(reading, true[here]) > FALL * float(sd[here].median()):
                 return (
                     f"By it the reading of {name} falls where the true value rises, at the recorded values or just "
                     "beyond them, as that of no instrument does."
                 )
             shown = reading(true[here])
-            drifts = curve or (problem.in_time and _of_true_value(reading, len(here), and_time=True))
+            drifts = curve or (problem.in_time and reading.is_of_value(and_time=True))
             if drifts and float((shown - true[here]).std()) > ADDED * float(true[here].std()):
                 return f"By it the reading of {name} varies more by the instrument's error than by the true value."
             shaped = curve and any(term.brings(names[i]) and not is_window(names[i]) for i in shapes)
@@ -115,7 +169,7 @@ def no_instrument(search: Search, model: Model) -> str:
     return ""
 
 
-def _bends(reading: Reading, true: Tensor) -> bool:
+def _bends(reading: _Reading, true: Tensor) -> bool:
     """Whether a reading is no straight line of the true value near the recorded ones, as with an offset or a gain
     error."""
     middle = true.mean()
@@ -129,7 +183,7 @@ def _bends(reading: Reading, true: Tensor) -> bool:
     return False
 
 
-def _straight(reading: Reading, true: Tensor, sd: Tensor) -> bool:
+def _straight(reading: _Reading, true: Tensor, sd: Tensor) -> bool:
     """Whether a reading follows a straight line at the recorded values, but for a few, as far as noise shows."""
     kept, shown = torch.ones_like(true, dtype=torch.bool), reading(true)
     if not bool(shown.isfinite().all()):
@@ -159,37 +213,6 @@ def _noise_at_data(search: Search, model: Model) -> Tensor:
     return torch.maximum(left, ROUNDING * problem.recording.spread[problem.index])
 
 
-def _reading(
-    problem: Problem, term: Term, function: Callable[..., Tensor], drivers: dict[str, Tensor], p: Values
-) -> Reading | None:
-    """What an instrument shows of true values ``(m,)`` at the data, or at those so many places further on (at the same
-    time even so, where it is to be timely); None where its function cannot be asked."""
-
-    def reading(y: Tensor, by: int = 0, timely: bool = False) -> Tensor:
-        order = torch.arange(len(y)).roll(by)
-        at, own = {name: each[order] for name, each in drivers.items()}, term.own(p.at(order))
-        if timely:
-            at["t"] = drivers["t"]
-        x = at if isinstance(problem.recording.x, dict) else next(iter(at.values()))
-        given = (at["t"], at, own, at, y) if problem.in_time else (x, own, y)
-        shown: Tensor = term.call(function, *given) + 0 * y
-        return shown
-
-    try:
-        reading(torch.linspace(1.0, 2.0, len(next(iter(drivers.values()))), dtype=torch.float64))
-    except Exception:  # the simulator calls it otherwise, and tells what is wrong
-        return None
-    return reading
-
-
-def _of_true_value(reading: Reading, count: int, *, and_time: bool = False) -> bool:
-    """Whether what is shown depends on the true value alone, or on the time too, and not on where in the data that is.
-    """
-    y = torch.linspace(1.0, 2.0, count, dtype=torch.float64)
-    moved = [reading(y, by, and_time) for by in (1, count // 2)]
-    return all(torch.allclose(reading(y), one, rtol=0, atol=0, equal_nan=True) for one in moved)
-
-
 def _range(true: Tensor) -> Tensor:
     """As many values from somewhat below the true ones ``(m,)`` to somewhat above, but not beyond 0 if all are on one
     side of it: a fit likes the turning point of a response, where it bends most, and stops just short of it."""
@@ -203,14 +226,14 @@ def _range(true: Tensor) -> Tensor:
     )
 
 
-def _falls(reading: Reading, true: Tensor) -> float:
+def _falls(reading: _Reading, true: Tensor) -> float:
     """By how much a reading falls while the true value rises, at the recorded values or just beyond them."""
     y = _range(true)
     slope = _slope(reading, y)
     return -float((y.diff() * 0.5 * (slope[:-1] + slope[1:]).clamp_max(0)).nansum())
 
 
-def _slope(reading: Reading, y: Tensor) -> Tensor:
+def _slope(reading: _Reading, y: Tensor) -> Tensor:
     """Of what is shown by what is true, ``(m,)``; 0 where the one does not follow from the other."""
     with torch.enable_grad():
         leaf = y.detach().clone().requires_grad_(True)

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from torchcal.discovery.by_share import decide_exact, nearly
 from torchcal.discovery.decision import Decision, certain, groups_of, other_names, tie_other_names, weigh
-from torchcal.discovery.doubts import doubt, left_open
-from torchcal.discovery.instruments import no_instrument, only_instruments, unnatural
+from torchcal.discovery.doubts import doubt, unfit
+from torchcal.discovery.instruments import only_instruments
 from torchcal.discovery.model import PRIOR, Model
 from torchcal.discovery.own_noise import weigh_alone
 from torchcal.discovery.places import Place
@@ -64,8 +64,8 @@ def _unknown(search: Search, structure: Structure, *, calibrated: bool) -> float
 
 
 def _counting(search: Search, structure: Structure) -> list[Place]:
-    """The places that speak for something unknown: in time a parameter's smooth change is one of the equation's, but
-    its swings are not."""
+    """The places that speak for something unknown in the base: in time a parameter's smooth change is one of the
+    equation's, but its swings are not. (Beside a model they are not looked for.)"""
     return [p for p in structure.places if p.channel.kind in search.problem.kinds or p.period is not None]
 
 
@@ -169,7 +169,7 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     # One alone is not sure enough, or it had been named; and where several do what something unknown there would do.
     rival = any(m.weight > best.weight - BEHIND for m in search.nameless)
     local = rival and all(model.window is not None for model in decision.tied_models)
-    decision.doubt = left_open(search, best) or unnatural(best) or no_instrument(search, best)
+    decision.doubt = unfit(search, decision.tied_models[0] if decision.tied_models else best)
     # Windows, instruments and several terms, of which they share none, bend to what no term of the list explains.
     shared = set(best.names).intersection(*(m.names for m in decision.tied_models))
     several = [not shared and len(m.names) > 1 for m in decision.tied_models]

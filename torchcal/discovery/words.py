@@ -69,9 +69,9 @@ def _headline(d: Any) -> str:
     if d.settings.get("interrupted") and d.verdict != "ambiguous":
         return f"Verdict: {d.verdict}, as far as the search went before it was interrupted"
     if d.verdict == "consistent":
-        if _yet(d):
-            return "Verdict: consistent (nothing is surely missing)"
-        return "Verdict: consistent (nothing is missing that these data could show)"
+        sign = _yet(d) or d.settings.get("unlike") or d.p_detect < 1 - d.confidence
+        told = "nothing is surely missing" if sign else "nothing is missing that these data could show"
+        return f"Verdict: consistent ({told})"
     if d.verdict == "named":
         return f"Verdict: named: {_and([_with_region(d, name) for name in d.terms])}"
     if d.verdict == "ambiguous":
@@ -79,10 +79,10 @@ def _headline(d: Any) -> str:
         if len(known) == 1 and _unknown(d) < LISTED:
             return f"Verdict: ambiguous: {_hypothesis(d, known[0])}, which is not sure enough for a name"
         first = known if len(known) <= HEADLINE + 1 else known[:HEADLINE]
-        told = [_hypothesis(d, tied) for tied in first]
-        told += [f"one of {len(known) - HEADLINE} others"] if len(first) < len(known) else []
-        told += [_hypothesis(d, NONE)] if len(known) < len(d.tied) else []
-        return "Verdict: ambiguous: " + ", or ".join(told)
+        choices = [_hypothesis(d, tied) for tied in first]
+        choices += [f"one of {len(known) - HEADLINE} others"] if len(first) < len(known) else []
+        choices += [_hypothesis(d, NONE)] if len(known) < len(d.tied) else []
+        return "Verdict: ambiguous: " + ", or ".join(choices)
     return "Verdict: unexplained (something is missing that is not in this library)"
 
 
@@ -170,13 +170,19 @@ def _consistent(d: Any) -> list[str]:
             )
     if not limits:
         return [nothing]
-    shown = ", ".join(with_unit(f"{limit.term} {limit.smallest:.3g}", limit.unit) for limit in limits[:LIMITS])
+    shown = ", ".join(with_unit(f"{_told(limit)} {limit.smallest:.3g}", limit.unit) for limit in limits[:LIMITS])
     more = len(limits) - LIMITS
     others = f", and {more} other{'s' if more > 1 else ''}" if more > 0 else ""
     return [
         f"{nothing} The smallest effects that these data could have shown "
         f"(with probability {limits[0].power:.0%}): {shown}{others}."
     ]
+
+
+def _told(limit: Any) -> str:
+    """What has a detection limit: a term, in one run where each has a value of its own."""
+    run = re.search(r"\[(\d+)\]$", limit.parameter)
+    return limit.term if run is None else f"{limit.term} in run {run[1]}"
 
 
 def _yet(d: Any) -> str:
@@ -279,14 +285,17 @@ def _holds(d: Any, row: Any) -> bool:
 
 
 def _beside(d: Any) -> list[str]:
-    """What would be likelier together with what is named, though too much of it is left to be a name."""
-    rows = [row for row in d.ranking if row.refitted and row.physical and set(row.terms) >= set(d.terms)]
-    best = max(rows, key=lambda row: row.probability)
-    more = [name for name in best.terms if name not in d.terms]
-    if not more:
-        return []
-    share = share_in_words(best.misfit_removed)
-    return [f"Likelier still is that {_and(more)} {'acts' if len(more) == 1 else 'act'} beside it ({share} removed)."]
+    """What would be likelier together with what is named, though it is no name."""
+    best = max((row for row in d.ranking if _holds(d, row)), key=lambda row: row.probability, default=None)
+    more = [] if best is None else [name for name in best.terms if name not in d.terms]
+    parts = []
+    if best is not None and more:
+        act = "acts" if len(more) == 1 else "act"
+        share = share_in_words(best.misfit_removed)
+        parts.append(f"Likelier still is that {_and(more)} {act} beside it ({share} removed).")
+    if (unknown := _unknown(d)) >= LISTED:
+        parts.append(f"That something which is not in this library acts too has a probability of {unknown:.2f}.")
+    return parts
 
 
 def _larger(d: Any) -> list[str]:

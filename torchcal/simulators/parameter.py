@@ -1,6 +1,7 @@
 """What a simulator's parameter is, and the coordinates in which it is inferred."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -24,10 +25,10 @@ def in_run(parameter: str, run: int) -> str:
 def is_value_of(name: str, parameter: str) -> bool:
     """Whether a name is that of a parameter, or of its value in one run.
 
-    >>> [is_value_of(name, "k") for name in ("k", "k[2]", "kappa")]
-    [True, True, False]
+    >>> [is_value_of(name, "k") for name in ("k", "k[2]", "kappa", "k[hot]")]
+    [True, True, False, False]
     """
-    return name == parameter or name.startswith(f"{parameter}[")
+    return name == parameter or re.fullmatch(rf"{re.escape(parameter)}\[\d+\]", name) is not None
 
 
 def spans(values: Mapping[str, Tensor]) -> str:
