@@ -246,3 +246,33 @@ def test_what_swings_a_parameter_speaks_for_something_unknown():
     search = SimpleNamespace(problem=SimpleNamespace(kinds=("equation", "output")))
     found = verdict._unknown(search, SimpleNamespace(places=places), calibrated=False)
     assert found == pytest.approx(204.0 - np.log(2))
+
+
+def emptied(seed, begins, noise=0.01):
+    """A tank that empties and is filled again, over a weir from a level on."""
+    t = np.linspace(0.0, 60.0, 120)
+
+    def rates(t, h):
+        return [0.5 * (1 + np.sin(0.3 * t)) - 0.4 * np.sqrt(max(h[0], 0)) - 0.05 * max(h[0] - begins, 0.0) ** 1.5]
+
+    h = solve_ivp(rates, (0, 60), [4.0], t_eval=t, rtol=1e-8, atol=1e-10, max_step=0.5).y[0]
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"h": p["b"] * u["q"] - p["a"] * torch.sqrt(torch.relu(s["h"]) + 1e-12)},
+        {"h": "m"},
+        [tc.Parameter("a", low=0.0, initial=0.3), tc.Parameter("b", low=0.0, initial=0.4)],
+    )
+    h = h + noise * np.random.default_rng(seed).standard_normal(120)
+    run = tc.Run(time=t, outputs={"h": h}, inputs={"q": 1 + np.sin(0.3 * t)}, initial={"h": 4.0})
+    return base, tc.Recording(runs=[run], noise=noise)
+
+
+@pytest.mark.parametrize("begins", [0.0, 2.2])
+def test_a_threshold_below_all_data_is_none(begins):
+    terms = [term for term in tc.terms.hydraulics("h", inflow="q") if term.name in ("overflow", "evaporation")]
+    d = diagnose(*emptied(0, begins), terms)
+    if begins:
+        assert d.terms == ["overflow"]
+        return
+    assert d.verdict == "ambiguous"
+    assert d.tied == [["overflow"], list(NONE)]
+    assert "nothing shows that overflow begins there" in " ".join(str(d).split())

@@ -1,7 +1,7 @@
 """Why the best explanation of a recording may be no name, however probable it is."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -13,6 +13,8 @@ from torchcal.discovery.model import Model
 from torchcal.discovery.own_noise import beside
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.search import Search
+from torchcal.errors import TorchcalError
+from torchcal.terms import Term
 
 __all__ = ["distinct", "doubt", "left_open", "unfit"]
 
@@ -31,6 +33,8 @@ CLEARLY_OPEN = 2.0
 #: Distinct values of its driver at which a window must be open, and at which closed: its height, end and slope can be
 #: drawn through fewer, whatever they are. And the share of a term that may be missing, or left.
 LEVELS, NEARLY = 3, 0.2
+#: Distinct values of its driver below a threshold up to which nothing shows that the effect begins there.
+FREE = 2
 #: Log odds against a nameless change from which on a term in a window is there for its own shape.
 CLEARLY = 3.0
 #: Share of the largest effect of the base's parameters below which a direction of them moves no datum.
@@ -45,7 +49,7 @@ def doubt(search: Search, model: Model) -> str:
 
 def unfit(search: Search, model: Model) -> str:
     """Why what a model adds is open, or nothing that its terms stand for, in a sentence; empty if it is neither."""
-    return left_open(search, model) or unnatural(model) or no_instrument(search, model)
+    return left_open(search, model) or unnatural(model) or no_instrument(search, model) or _no_threshold(model)
 
 
 def left_open(search: Search, model: Model) -> str:
@@ -82,6 +86,38 @@ def _no_better(search: Search, model: Model) -> str:
         return ""
     what = f"{rival.candidate.name[0].upper()}{rival.candidate.name[1:]} in a range of {rival.window.driver}"
     return f"{what} would do nearly as well: the term's own shape is not seen yet."
+
+
+def _no_threshold(model: Model) -> str:
+    """Why a threshold of what a model adds is none: it would end the effect below all data but a few."""
+    found, problem = model.found, model.found.problem
+    drivers = problem.drivers_at_data(found.values[None], found.warm)
+    values = found.by_name
+    for term in model.candidate.terms:
+        for own, driver in term.scales.items():
+            value = values[term.full(own)]
+            if driver not in drivers or driver == "t" or value <= 0:
+                continue
+            below = drivers[driver].abs() <= value
+            if len(drivers[driver][below].unique()) <= FREE and _ends(model, term, drivers, driver, value):
+                return (
+                    f"By it {driver} is beyond {own} = {value:.3g} at all data but a few: nothing shows that "
+                    f"{term.name} begins there, and what has no such threshold does as well."
+                )
+    return ""
+
+
+def _ends(model: Model, term: Term, drivers: Mapping[str, Tensor], driver: str, value: float) -> bool:
+    """Whether a term does nothing where a driver is below a value."""
+    problem = model.found.problem
+    below = {**drivers, driver: 0.5 * value * drivers[driver].sign()}
+    p = term.own(problem.parameters_at_data(model.found.values))
+    given = (below["t"], below, p, below) if problem.in_time else (below, p)
+    functions = [*(rate for state, rate in term.rates.items() if state not in term.states), *term.shifts.values()]
+    try:
+        return bool(functions) and all(not bool(torch.as_tensor(term.call(f, *given)).any()) for f in functions)
+    except TorchcalError:  # not every function works on a row of data
+        return False
 
 
 def _levels(model: Model) -> int:
