@@ -11,6 +11,7 @@ from torchcal.discovery.candidates import Candidate, base_columns
 from torchcal.discovery.fitting import Fitted, fit, follow_slopes, starts
 from torchcal.discovery.residual import Residual
 from torchcal.discovery.screen import Screening
+from torchcal.errors import SimulatorError
 
 __all__ = [
     "BENT",
@@ -138,7 +139,10 @@ def _off_bounds(base: Fitted, candidate: Candidate, rows: Tensor, within: Tensor
     row = begin[0].clone()
     row[candidate.own] = candidate.neutral
     columns = _columns(base, candidate)
-    slopes = base.whitening(candidate.problem.evaluate(row[None], [*columns, *candidate.amplitudes])[1][0])
+    try:
+        slopes = base.whitening(candidate.problem.evaluate(row[None], [*columns, *candidate.amplitudes])[1][0])
+    except SimulatorError:  # a function may raise there
+        return None
     if not bool(slopes.isfinite().all()):
         return None
     theirs, own = slopes.split([len(columns), len(candidate.amplitudes)], dim=1)

@@ -147,7 +147,7 @@ def no_instrument(search: Search, model: Model) -> str:
             here = (problem.output_of == number).nonzero()[:, 0]
             along = {d: each[here] for d, each in drivers.items()}
             reading = _Reading(problem, term, function, along, p.at(here))
-            if not reading.works:
+            if not (len(here) and reading.works):
                 continue
             curve = reading.is_of_value()
             if curve and _falls(reading, true[here]) > FALL * float(sd[here].median()):
