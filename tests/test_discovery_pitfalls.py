@@ -782,14 +782,14 @@ def test_a_parameter_on_its_bound_takes_up_what_moves_it_inwards():
 
 
 def test_a_term_may_read_what_differs_from_run_to_run():
-    # Three cups in three rooms: the vapour pressure is that of each room.
+    # Two cups in two rooms: the vapour pressure is that of each room.
     library = tc.terms.thermal("T", ambient="Ta", loss="k")
     terms = [term for term in library if term.name in ("evaporation", "radiation")]
     vapour = lambda T: 0.61094 * np.exp(17.625 * T / (T + 243.04))  # noqa: E731
-    t, rng, runs = np.linspace(0, 60, 61), np.random.default_rng(0), []
-    for room, begin in ((20.0, 80.0), (23.0, 60.0), (17.0, 90.0)):
+    t, rng, runs = np.linspace(0, 60, 41), np.random.default_rng(0), []
+    for room, begin in ((20.0, 80.0), (17.0, 90.0)):
         rate = lambda t, T, room=room: -0.02 * (T - room) - 0.15 * (vapour(T) - 0.5 * vapour(room))  # noqa: E731
-        runs.append(tc.Run(time=t, outputs={"T": solve(rate, [begin], t)[0] + 0.1 * rng.standard_normal(61)}))
+        runs.append(tc.Run(time=t, outputs={"T": solve(rate, [begin], t)[0] + 0.1 * rng.standard_normal(41)}))
     base = tc.ODESimulator(
         lambda t, s, p, u: {"T": -p["k"] * (s["T"] - p["Ta"])},
         {"T": "degC"},
@@ -798,7 +798,7 @@ def test_a_term_may_read_what_differs_from_run_to_run():
     d = diagnose(base, tc.Recording(runs=runs), terms)
     assert d.terms == ["evaporation"]
     assert d.where[0].driver == "T"
-    assert [float(e.value) for e in d.final.estimates if e.name.startswith("Ta")] == pytest.approx([20, 23, 17], abs=3)
+    assert [float(e.value) for e in d.final.estimates if e.name.startswith("Ta")] == pytest.approx([20, 17], abs=3)
 
 
 def test_a_term_may_free_what_differs_from_run_to_run():
