@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy.integrate import solve_ivp
 
 import torchcal as tc
 from torchcal.discovery import candidates, doubts, outliers
@@ -409,3 +410,23 @@ def test_an_instrument_that_all_likelier_hypotheses_hold_is_no_name():
 )
 def test_three_terms_together_and_windows_make_no_name_of_one(bend):
     assert powers(bend, wave=0.0).verdict == "unexplained"
+
+
+@pytest.mark.parametrize("seed", [5, 8])
+def test_a_name_that_has_another_is_none_though_it_may_act_in_a_window(seed):
+    # A source of heat in a body that cools is an offset of its thermometer; in a window it is nearly as likely.
+    t = np.linspace(0, 105, 90)
+    rate = lambda t, T: -0.02 * (T - 15 - 3 * np.sin(0.1 * t))  # noqa: E731
+    body = solve_ivp(rate, (0, 105), [40.0], t_eval=t, rtol=1e-9).y[0]
+    seen = body + 0.9 + 0.18 * np.random.default_rng(seed).standard_normal(90)
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"T": -p["k"] * (s["T"] - u["Ta"])},
+        {"T": "degC"},
+        [tc.Parameter("k", low=0.0, initial=0.05)],
+    )
+    room = 15 + 3 * np.sin(0.1 * t)
+    library = [*tc.terms.thermal("T", ambient="Ta", loss="k"), *tc.terms.sensor("T", dynamic=False)]
+    terms = [term for term in library if term.name in ("internal heat source", "offset of T")]
+    d = diagnose(base, tc.Recording(runs=[tc.Run(time=t, outputs={"T": seen}, inputs={"Ta": room})]), terms)
+    assert d.verdict == "ambiguous"
+    assert d.tied[:2] == [["internal heat source"], ["offset of T"]]

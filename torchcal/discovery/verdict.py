@@ -138,12 +138,14 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         decision.verdict = "unexplained"
         nearly(search, ranked, mask, decision)
         return decision
+    otherwise: set[str] = set()  # terms of what is as likely that could as well be called something else
     for best in white:
+        otherwise |= {own for _, _, own in other_names(search, best)}
         if (
             best.weight > white[0].weight - BEHIND  # what all likely models share is a name, but not of a bad fit
             and set(best.names) <= set(white[0].names)
             and certain(groups, best)
-            and not other_names(search, best)
+            and not otherwise & set(best.names)
         ):
             _name(search, decision, best, mask)
             return decision
