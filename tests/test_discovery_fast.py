@@ -53,7 +53,7 @@ def recorded(tau: float, *, sd: float = 0.02, seed: int = 0) -> tc.Recording:
     return tc.Recording(runs=[run], noise=sd)
 
 
-@pytest.mark.parametrize("share", [0.25, 0.6])
+@pytest.mark.parametrize("share", [pytest.param(0.25, marks=pytest.mark.slow), 0.6])
 def test_a_lag_shorter_than_the_gaps_between_samples_is_found_and_not_biased(share):
     """With the base's steps, one in a gap, its time would be off by several of its sd."""
     tau = share * END / (COUNT - 1)
