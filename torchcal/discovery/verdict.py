@@ -175,10 +175,8 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     decision.doubt = unfit(search, decision.tied_models[0] if decision.tied_models else best)
     # Windows, instruments and several terms, of which they share none, bend to what no term of the list explains.
     shared = set(best.names).intersection(*(m.names for m in decision.tied_models))
-    several = [not shared and len(m.names) > 1 for m in decision.tied_models]
     pliant = all(
-        m.window is not None or many or only_instruments(m)
-        for m, many in zip(decision.tied_models, several, strict=True)
+        m.window is not None or (len(m.names) > 1 and not shared) or only_instruments(m) for m in decision.tied_models
     )
     likely = decision.none > min(1 - UNKNOWN, _second(decision, ranked))
     if len(decision.tied) < 2 or likely or local or pliant or decision.doubt:
