@@ -92,7 +92,8 @@ def test_zero_spread_has_a_finite_gradient(device, floor):
 
 def cubic_draws(**options):
     options = {"num_samples": 60, "num_chains": 48, "num_warmup": 60, **options}
-    return quietly(cubic.estimate, "linear", 11, epsilon=0.1, **options)
+    # Germs of either sign are the same density: which of them is the maximum found is a matter of rounding.
+    return quietly(cubic.estimate, "linear", 11, epsilon=0.1, **options).relabelled()
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ from scipy import integrate, stats
 from torchcal import NISP, Parameter, Simulator, polychaos
 from torchcal.embeddings import Gaussian, IndependentGaussian, PolynomialChaos, Uniform
 from torchcal.errors import DomainError, EmbeddingError, PropagationWarning, ShapeError, SimulatorError
+from torchcal.propagation.pieces import MANY, MOST
 
 X = torch.linspace(-1.0, 1.0, 5, dtype=torch.float64)
 AB = [Parameter("a"), Parameter("b")]
@@ -268,6 +269,28 @@ def test_work_is_bounded_by_max_elements():
     seen.clear()
     found(draw(5))
     assert max(seen) <= 400
+
+
+def test_much_work_on_a_cpu_is_done_in_pieces_that_its_caches_hold():
+    seen = []
+
+    def watched(x, p):
+        result = smooth(x, p)
+        seen.append(result.numel())
+        return result
+
+    x = torch.linspace(0, 1, 1000, dtype=torch.float64)
+    found = NISP(Simulator(watched, [Parameter("a"), Parameter("b")]), Gaussian(), x, rule=6)
+    for chains, cut in ((50, False), (80, True)):  # 1.8 and 2.9 million numbers
+        alpha = draw(chains, 5).requires_grad_()
+        seen.clear()
+        mean, sd = found(alpha)
+        assert (max(seen) < MANY / 2) == cut
+        whole_mean, whole_sd = found.copy(max_elements=MOST)(alpha)
+        torch.testing.assert_close((mean, sd), (whole_mean, whole_sd), rtol=1e-11, atol=1e-11)
+        (slope,) = torch.autograd.grad((mean.sin() + sd).sum(), alpha)
+        (whole_slope,) = torch.autograd.grad((whole_mean.sin() + whole_sd).sum(), alpha)
+        torch.testing.assert_close(slope, whole_slope, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.parametrize("embedding", [Gaussian(), Uniform(), PolynomialChaos(order=2), Gaussian(("b",))])

@@ -33,7 +33,7 @@ def by_hand(problem: Problem, otherwise: Slopes) -> Slopes:
     if problem.y.device.type != "cpu" or problem.propagate.sd_floor is None or problem.likelihood.epsilon is None:
         return otherwise
     found = ByHand(problem, problem.likelihood.epsilon, problem.likelihood.gamma, problem.propagate.sd_floor)
-    most = min(MOST_BY_HAND, problem.propagate.max_elements)
+    most = min(MOST_BY_HAND, problem.propagate.max_elements or MOST_BY_HAND)
     return lambda u: (found if len(u) * found.elements <= most else otherwise)(u)
 
 

@@ -17,9 +17,9 @@ from torchcal.embeddings import Embedding, Pattern
 from torchcal.errors import DomainError, EmbeddingError, ShapeError
 from torchcal.propagation import choice, convergence, parameters, polynomials
 from torchcal.propagation.convergence import PropagationCheck
-from torchcal.propagation.pieces import forgetful, over_batch
+from torchcal.propagation.pieces import MANY, MOST, cached, forgetful, over_batch
 from torchcal.propagation.rules import RuleChoice
-from torchcal.simulators import Conditions, Scaling, Simulator, free_parameters
+from torchcal.simulators import Conditions, ExternalSimulator, Scaling, Simulator, Trajectories, free_parameters
 
 __all__ = ["NISP"]
 
@@ -50,7 +50,8 @@ class NISP(nn.Module):
         sd_floor: δ in :math:`\sqrt{\sigma^2 + \delta^2}`, which keeps the gradient finite at zero spread; in
             the outputs' unit. By default 1e-8 of the largest mean of an output, below any figure a user reads.
         max_elements: Batch × nodes × outputs evaluated at once. Larger work is cut into pieces, whose
-            intermediate values are recomputed in the backward pass: 2**24 numbers are 128 MiB.
+            intermediate values are recomputed in the backward pass. By default 2**24 numbers, 128 MiB; and on a CPU
+            pieces that its caches hold, where a simulator that is no polynomial has more than 2**21 to do.
 
     Raises:
         EmbeddingError: If the embedding does not fit the simulator's free parameters.
@@ -90,7 +91,7 @@ class NISP(nn.Module):
         max_nodes: int = 4096,
         trial_spread: float = 1.0,
         sd_floor: float | None = None,
-        max_elements: int = 2**24,
+        max_elements: int | None = None,
     ) -> None:
         super().__init__()
         if not isinstance(simulator, Simulator):
@@ -112,10 +113,10 @@ class NISP(nn.Module):
         self.max_nodes = max_nodes
         self.trial_spread = trial_spread
         self.sd_floor = None if sd_floor is None else float(sd_floor)
-        self.max_elements = int(max_elements)
+        self.max_elements = max_elements
         self._x_names = tuple(x) if isinstance(x, Mapping) else None
         for i, value in enumerate(x.values() if isinstance(x, Mapping) else [x]):
-            self.register_buffer(f"_x{i}", torch.as_tensor(value).detach().to(torch.float64))
+            self.register_buffer(f"_x{i}", torch.as_tensor(value).detach().to("cpu", torch.float64))
         position = {name: i for i, name in enumerate(self.pattern.names)}
         self.register_buffer(
             "_template",
@@ -460,7 +461,7 @@ class NISP(nn.Module):
 
     def _node_pieces(self, alpha: Tensor, count: int) -> list[slice]:
         rows = alpha.numel() // self.num_alpha * self._width
-        size = max(1, self.max_elements // max(1, rows))
+        size = max(1, self._at_once(rows * count) // max(1, rows))
         return [slice(i, i + size) for i in range(0, count, size)]
 
     @property
@@ -476,8 +477,18 @@ class NISP(nn.Module):
         self, alpha: Tensor, function: Callable[[Tensor], tuple[Tensor, ...]]
     ) -> tuple[Tensor, ...]:
         """Apply a function of a batch of α in pieces of bounded size."""
-        size = max(1, self.max_elements // max(1, self.num_nodes * self._width))
-        return over_batch(function, alpha, size, whole=self.num_nodes * self._width <= self.max_elements)
+        single = max(1, self.num_nodes * self._width)
+        most = self._at_once(alpha.numel() // self.num_alpha * single)
+        return over_batch(function, alpha, max(1, most // single), whole=single <= most)
+
+    def _at_once(self, numbers: int) -> int:
+        """How many of so many numbers are evaluated at once."""
+        if self.max_elements is not None:
+            return self.max_elements
+        calls = isinstance(self.simulator, (ExternalSimulator, Trajectories))  # dear ones, each for all that it gets
+        if numbers <= MANY or calls or self._polynomial is not None or self.nodes.device.type != "cpu":
+            return MOST
+        return cached()
 
     # --- rules -------------------------------------------------------------------------------------------
 

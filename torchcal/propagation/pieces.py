@@ -7,9 +7,23 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-__all__ = ["forgetful", "over_batch"]
+__all__ = ["MANY", "MOST", "cached", "forgetful", "over_batch"]
+
+MOST = 2**24
+"""Numbers at once, 128 MiB."""
+
+_CACHED, _SHARED = 2**17, 2**20
+"""Numbers of outputs at once that one core's caches hold, and those that all share."""
+
+MANY = 2**21
+"""Numbers of outputs from which on such pieces are faster than all at once, though they are computed twice."""
 
 Moments = Callable[[Tensor], tuple[Tensor, ...]]
+
+
+def cached() -> int:
+    """Numbers of outputs at once that a CPU's caches hold: larger pieces take several times longer each."""
+    return min(_CACHED * torch.get_num_threads(), _SHARED)
 
 
 def forgetful(function: Moments, alpha: Tensor) -> tuple[Tensor, ...]:
