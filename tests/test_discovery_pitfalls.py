@@ -522,7 +522,7 @@ def test_a_share_of_a_value_that_spans_decades_is_no_physics_among_several_condi
     assert alarms <= 1
 
 
-@pytest.mark.parametrize("bent", [0.0, 0.02])
+@pytest.mark.parametrize("bent", [0.0, pytest.param(0.02, marks=pytest.mark.slow)])
 def test_an_effect_that_is_large_in_noise_that_grows_is_named_and_its_absence_is_not(bent):
     """A turnover over five decades, read to 3 %: what the base misses of the largest values looked like their noise, so
     that the larger the effect was the less it had a name."""
@@ -765,6 +765,7 @@ def swinging(extra, end, count):
     return base, tc.Recording(runs=[tc.Run(time=t, outputs={"x": y}, initial={"x": 1.0, "v": 0.0})])
 
 
+@pytest.mark.slow
 def test_what_the_base_has_stays_in_it_when_the_noise_changes():
     """A gust that nothing explains: the noise found beside it moves the base, away from where tangents were taken."""
     swing = swinging(lambda t, v: -0.05 * v + 0.25 * np.exp(-(((t - 19) / 1.5) ** 2)), 40, 160)

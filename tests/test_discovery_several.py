@@ -140,6 +140,7 @@ def test_a_term_that_a_far_bent_base_hides_is_found_from_the_base_of_another():
     assert abs(stiffness.value - 1.0) < 4 * stiffness.sd < 0.4
 
 
+@pytest.mark.slow
 def test_a_pair_is_tried_beside_three_different_terms():
     """A rocket that burns its propellant, with drag: one drag in three windows had left no place for the other."""
     t = np.linspace(0, 20, 81)

@@ -276,3 +276,36 @@ def test_a_threshold_below_all_data_is_none(begins):
     assert d.verdict == "ambiguous"
     assert d.tied == [["overflow"], list(NONE)]
     assert "nothing shows that overflow begins there" in " ".join(str(d).split())
+
+
+def pumped(seed, dead=0.0, lag=1e-3):
+    """The level of a tank, and its pump's command, which it follows late."""
+    t = np.linspace(0.0, 30.0, 240)
+    rng = np.random.default_rng(seed)
+    waves = [(rng.uniform(0.2, 0.6), rng.uniform(0.3, 2.0), rng.uniform(0.0, 6.3)) for _ in range(4)]
+
+    def command(time):
+        return np.where(time < 0, 0.0, 1.5 + sum(size * np.sin(f * time + phase) for size, f, phase in waves))
+
+    def rates(time, s):
+        return [0.5 * s[1] - 0.4 * s[0], (command(time - dead) - s[1]) / lag]
+
+    y = solve_ivp(rates, (0, 30), [1.0, 0.0], t_eval=t, rtol=1e-9, atol=1e-11, max_step=0.05, method="LSODA").y[0]
+    model = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"h": p["b"] * u["q"] - p["k"] * s["h"]},
+        states={"h": "m"},
+        parameters=[tc.Parameter("b", low=0.0, initial=0.4), tc.Parameter("k", low=0.0, initial=0.3)],
+    )
+    run = tc.Run(time=t, outputs={"h": y + 0.01 * rng.standard_normal(len(t))}, inputs={"q": command(t)})
+    return model, tc.Recording(runs=[run], noise=0.01)
+
+
+def test_a_pump_takes_no_more_of_its_effect_away_than_there_is():
+    terms = [term for term in tc.terms.hydraulics("h", inflow="q") if term.name in ("leak", "pump lag")]
+    d = diagnose(*pumped(0, dead=0.4), terms)  # a dead time is in no list
+    assert d.verdict == "ambiguous"
+    assert d.tied == [["pump lag"], list(NONE)]
+    assert "wrong way" in str(d)
+    d = diagnose(*pumped(0, lag=0.4), terms)
+    assert d.verdict == "named"
+    assert d.terms == ["pump lag"]

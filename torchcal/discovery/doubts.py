@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from torchcal.discovery.explain import misfit_size
+from torchcal.discovery.explain import misfit_size, stated_sd
 from torchcal.discovery.instruments import no_instrument, unnatural
 from torchcal.discovery.local import force, is_window
 from torchcal.discovery.model import Model
@@ -14,6 +14,7 @@ from torchcal.discovery.own_noise import beside
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.search import Search
 from torchcal.errors import TorchcalError
+from torchcal.simulators import ODESimulator, Trajectories
 from torchcal.terms import Term
 
 __all__ = ["distinct", "doubt", "left_open", "unfit"]
@@ -35,6 +36,8 @@ CLEARLY_OPEN = 2.0
 LEVELS, NEARLY = 3, 0.2
 #: Distinct values of its driver below a threshold up to which nothing shows that the effect begins there.
 FREE = 2
+#: Sd of a drive's gain, and share of it, by which it must be more than the base's own.
+WRONG_WAY, MORE = 2.0, 0.1
 #: Log odds against a nameless change from which on a term in a window is there for its own shape.
 CLEARLY = 3.0
 #: Share of the largest effect of the base's parameters below which a direction of them moves no datum.
@@ -49,7 +52,13 @@ def doubt(search: Search, model: Model) -> str:
 
 def unfit(search: Search, model: Model) -> str:
     """Why what a model adds is open, or nothing that its terms stand for, in a sentence; empty if it is neither."""
-    return left_open(search, model) or unnatural(model) or no_instrument(search, model) or _no_threshold(model)
+    return (
+        left_open(search, model)
+        or unnatural(model)
+        or no_instrument(search, model)
+        or _no_threshold(model)
+        or _no_drive(model)
+    )
 
 
 def left_open(search: Search, model: Model) -> str:
@@ -118,6 +127,51 @@ def _ends(model: Model, term: Term, drivers: Mapping[str, Tensor], driver: str, 
         return bool(functions) and all(not bool(torch.as_tensor(term.call(f, *given)).any()) for f in functions)
     except TorchcalError:  # not every function works on a row of data
         return False
+
+
+def _no_drive(model: Model) -> str:
+    """Why a drive with a memory is none: with it an equation would at first follow its input the wrong way.
+
+    A drive that lags takes its input's effect away, and gives it back later. It has no more to take than the base has.
+    """
+    found, problem = model.found, model.found.problem
+    bound = problem.simulator
+    if not isinstance(bound, Trajectories):
+        return ""
+    drivers = problem.drivers_at_data(found.values[None], found.warm)
+    sd = stated_sd(found)
+    for term in model.candidate.terms:
+        if not term.states:
+            continue
+        size = [float(sd[i] / found.values[i].abs()) for i in model.candidate.amplitudes
+                if term.brings(problem.parameters[i].name)]  # fmt: skip
+        least = max([MORE, *(WRONG_WAY * one for one in size)])
+        for name, given in bound.runs[0].inputs.items():
+            moved = {**drivers, name: drivers[name] + float(given.max() - given.min())}
+            for state in set(term.rates) - set(term.states):
+                try:
+                    (total, own), (before, own_before) = (
+                        _rates(model, bound.ode, term, state, at) for at in (moved, drivers)
+                    )
+                except (TorchcalError, RuntimeError):  # not every function works on a row of data
+                    continue
+                total, own = total - before, own - own_before
+                if bool(((own * (total - own) < 0) & (total * own > least * own.square())).all()):
+                    return (
+                        f"By it the rate of {state} would at first follow {name} the wrong way: it takes more of its "
+                        "effect away than there is."
+                    )
+    return ""
+
+
+def _rates(
+    model: Model, ode: ODESimulator, term: Term, state: str, drivers: dict[str, Tensor]
+) -> tuple[Tensor, Tensor]:
+    """The whole rate of a state at the data, and a term's share of it."""
+    p = model.found.problem.parameters_at_data(model.found.values)
+    total = ode.rates(drivers["t"], drivers, p, drivers)[state]
+    own = term.call(term.rates[state], drivers["t"], drivers, term.own(p), drivers)
+    return torch.as_tensor(total), torch.as_tensor(own)
 
 
 def _levels(model: Model) -> int:
