@@ -1,6 +1,7 @@
 """What a diagnosis says of its numbers: the place of a name, its rivals, spans, bounds, limits and distances."""
 
 import dataclasses
+import functools
 import math
 import sys
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ from torchcal.discovery import doubts, explain, local, symptoms, where, words
 from torchcal.discovery import where_in_words as where_text
 from torchcal.discovery.channels import Channel
 from torchcal.discovery.places import Place
+from torchcal.discovery.problem import Problem
 from torchcal.discovery.records import Estimate, Experiment, Hypothesis, Limit, Location, Table
 from torchcal.discovery.where_in_words import where_in_words
 from torchcal.report import diagnosis_page
@@ -161,6 +163,7 @@ def test_what_a_term_in_time_is_a_function_of():
         in_time=True, drivers_at_data=lambda values, warm: dict(drivers), recording=SimpleNamespace(x={"time": T}),
         parameters_at_data=lambda values: {"k": T[0], "one.q": T[1]},
     )  # fmt: skip
+    problem.arguments = functools.partial(Problem.arguments, problem)
     found = SimpleNamespace(problem=problem, values=T, warm=None, y=T)
     for term, read in (
         (tc.Term("one", rates={"v": lambda t, s, p, u: p["q"] * s["v"] * u["F"]}, **Q), {"v", "F"}),

@@ -278,6 +278,27 @@ def test_a_threshold_below_all_data_is_none(begins):
     assert "nothing shows that overflow begins there" in " ".join(str(d).split())
 
 
+@pytest.mark.parametrize("begins", [0.0, 2.5])
+@pytest.mark.parametrize("named", [False, True])
+def test_a_threshold_below_all_conditions_is_none(begins, named):
+    x = torch.linspace(1, 5, 40, dtype=F64)
+    noise = 0.02 * torch.randn(40, generator=torch.Generator().manual_seed(0), dtype=F64)
+    strain = (lambda x: x["x"]) if named else (lambda x: x)
+    base = tc.Simulator(lambda x, p: p["a"] * strain(x), [tc.Parameter("a", low=0.0, initial=1.0)])
+    term = tc.Term(
+        "stiffening",
+        shifts={"a": lambda x, p: p["g"] * (strain(x) - p["x0"]).clamp_min(0)},
+        parameters=[tc.Parameter("g", low=0.0), tc.Parameter("x0", low=0.0, high=5.0, initial=2.0)],
+        scales={"x0": "x"},
+    )
+    y = 2 * x + 0.3 * x * (x - begins).clamp_min(0) + noise
+    d = diagnose(base, tc.Recording(x={"x": x} if named else x, y=y, noise=0.02), [term])
+    if begins:
+        assert d.terms == ["stiffening"]
+    else:
+        assert d.tied == [["stiffening"], list(NONE)]
+
+
 def pumped(seed, dead=0.0, lag=1e-3):
     """The level of a tank, and its pump's command, which it follows late."""
     t = np.linspace(0.0, 30.0, 240)

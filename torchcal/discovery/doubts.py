@@ -120,8 +120,7 @@ def _ends(model: Model, term: Term, drivers: Mapping[str, Tensor], driver: str, 
     """Whether a term does nothing where a driver is below a value."""
     problem = model.found.problem
     below = {**drivers, driver: 0.5 * value * drivers[driver].sign()}
-    p = term.own(problem.parameters_at_data(model.found.values))
-    given = (below["t"], below, p, below) if problem.in_time else (below, p)
+    given = problem.arguments(below, term.own(problem.parameters_at_data(model.found.values)))
     functions = [*(rate for state, rate in term.rates.items() if state not in term.states), *term.shifts.values()]
     try:
         return bool(functions) and all(not bool(torch.as_tensor(term.call(f, *given)).any()) for f in functions)
@@ -168,9 +167,10 @@ def _rates(
     model: Model, ode: ODESimulator, term: Term, state: str, drivers: dict[str, Tensor]
 ) -> tuple[Tensor, Tensor]:
     """The whole rate of a state at the data, and a term's share of it."""
-    p = model.found.problem.parameters_at_data(model.found.values)
-    total = ode.rates(drivers["t"], drivers, p, drivers)[state]
-    own = term.call(term.rates[state], drivers["t"], drivers, term.own(p), drivers)
+    problem = model.found.problem
+    p = problem.parameters_at_data(model.found.values)
+    total = ode.rates(*problem.arguments(drivers, p))[state]
+    own = term.call(term.rates[state], *problem.arguments(drivers, term.own(p)))
     return torch.as_tensor(total), torch.as_tensor(own)
 
 

@@ -64,10 +64,7 @@ class _Reading:
         at, p = {name: each[order] for name, each in self.drivers.items()}, self.p.at(order)
         if timely:
             at["t"], p.start = self.drivers["t"], self.p.start
-        own = self.term.own(p)
-        x = at if isinstance(self.problem.recording.x, dict) else next(iter(at.values()))
-        given = (at["t"], at, own, at, y) if self.problem.in_time else (x, own, y)
-        shown: Tensor = self.term.call(self.function, *given) + 0 * y
+        shown: Tensor = self.term.call(self.function, *self.problem.arguments(at, self.term.own(p), y)) + 0 * y
         return shown
 
     @cached_property

@@ -2,8 +2,10 @@
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -262,6 +264,13 @@ class Problem:
             return Values({q.name: value for q, value in zip(self.parameters, values, strict=True)}, 0.0, 0.0)
         found = bound.layout.by_name(values[None], bound.grid.run_of[self.condition_of])
         return found | {name: each[0] if each.shape[-1] > 1 else each[0, 0] for name, each in found.items()}
+
+    def arguments(self, drivers: Mapping[str, Tensor], own: Mapping[str, Any], *shown: Tensor) -> tuple[Any, ...]:
+        """What a function of a term is asked with on rows of data: drivers by name, the parameters that it gets, and
+        for that of an output what is shown without it."""
+        if self.in_time:
+            return drivers["t"], drivers, own, drivers, *shown
+        return drivers if isinstance(self.recording.x, dict) else next(iter(drivers.values())), own, *shown
 
     @property
     def kinds(self) -> tuple[str, str]:

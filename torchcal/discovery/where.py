@@ -145,19 +145,22 @@ def _reads(model: Model) -> set[str]:
     problem = found.problem
     if not isinstance(problem.recording.x, dict):
         return set()
-    drivers = _Noting(problem.drivers_at_data(found.values[None], found.warm))
+    drivers = problem.drivers_at_data(found.values[None], found.warm)
     p = problem.parameters_at_data(found.values)
+    read: set[str] = set()
     for term in model.candidate.terms:
-        own = term.own(p)
-        given = (dict(drivers)["t"], drivers, own, drivers) if problem.in_time else (drivers, own)
+        noting = _Noting(drivers)
+        given = problem.arguments(noting, term.own(p))
+        noting.noted.clear()
         try:
             for function in (*term.rates.values(), *term.shifts.values()):
                 term.call(function, *given)
             for function in term.outputs.values():
                 term.call(function, *given, found.y)
         except TorchcalError:  # not every function works on a row of data, and this is but for words
-            continue
-    return drivers.noted
+            pass
+        read |= noting.noted
+    return read
 
 
 def _contributed(search: Search, model: Model, drivers: Sequence[str]) -> Location:

@@ -113,7 +113,7 @@ class NISP(nn.Module):
         self.max_nodes = max_nodes
         self.trial_spread = trial_spread
         self.sd_floor = None if sd_floor is None else float(sd_floor)
-        self.max_elements = max_elements
+        self.max_elements = None if max_elements is None else whole("max_elements", max_elements, 1)
         self._x_names = tuple(x) if isinstance(x, Mapping) else None
         for i, value in enumerate(x.values() if isinstance(x, Mapping) else [x]):
             self.register_buffer(f"_x{i}", torch.as_tensor(value).detach().to("cpu", torch.float64))
