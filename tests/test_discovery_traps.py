@@ -327,6 +327,18 @@ def test_a_pump_takes_no_more_of_its_effect_away_than_there_is():
     assert d.verdict == "ambiguous"
     assert d.tied == [["pump lag"], list(NONE)]
     assert "wrong way" in str(d)
-    d = diagnose(*pumped(0, lag=0.4), terms)
+    d = diagnose(*pumped(1, lag=0.5, dead=0.0625), terms)  # half a gap between samples late, beside
     assert d.verdict == "named"
     assert d.terms == ["pump lag"]
+
+
+def test_a_term_that_is_no_drive_may_act_the_wrong_way_at_first():
+    swell = tc.Term(
+        "shrink and swell",
+        rates={"h": lambda t, s, p, u: p["g"] * (s["z"] - u["q"]), "z": lambda t, s, p, u: (u["q"] - s["z"]) / p["T"]},
+        states={"z": None},
+        parameters=[tc.Parameter("g", low=0.0), tc.Parameter("T", low=0.05, high=10.0, initial=0.5)],
+    )
+    d = diagnose(*pumped(0, dead=0.4), [swell])
+    assert d.ranking[0].terms == ("shrink and swell",)
+    assert "wrong way" not in str(d)

@@ -14,7 +14,8 @@ from scipy import integrate, stats
 from torchcal import NISP, Parameter, Simulator, polychaos
 from torchcal.embeddings import Gaussian, IndependentGaussian, PolynomialChaos, Uniform
 from torchcal.errors import DomainError, EmbeddingError, PropagationWarning, ShapeError, SimulatorError
-from torchcal.propagation.pieces import MANY, MOST
+from torchcal.propagation.pieces import CACHED, MOST
+from torchcal.terms import Term, extend
 
 X = torch.linspace(-1.0, 1.0, 5, dtype=torch.float64)
 AB = [Parameter("a"), Parameter("b")]
@@ -285,12 +286,44 @@ def test_much_work_on_a_cpu_is_done_in_pieces_that_its_caches_hold():
         alpha = draw(chains, 5).requires_grad_()
         seen.clear()
         mean, sd = found(alpha)
-        assert (max(seen) < MANY / 2) == cut
+        assert (max(seen) <= CACHED) == cut
         whole_mean, whole_sd = found.copy(max_elements=MOST)(alpha)
         torch.testing.assert_close((mean, sd), (whole_mean, whole_sd), rtol=1e-11, atol=1e-11)
         (slope,) = torch.autograd.grad((mean.sin() + sd).sum(), alpha)
         (whole_slope,) = torch.autograd.grad((whole_mean.sin() + whole_sd).sum(), alpha)
         torch.testing.assert_close(slope, whole_slope, rtol=1e-10, atol=1e-10)
+
+
+def test_a_dear_simulator_is_asked_for_all_at_once():
+    calls = []
+
+    class Dear(Simulator):
+        dear = True
+
+    def watched(x, p):
+        calls.append(1)
+        return smooth(x, p)
+
+    x = torch.linspace(0, 1, 1000, dtype=torch.float64)
+    found = NISP(Dear(watched, [Parameter("a"), Parameter("b")]), Gaussian(), x, rule=6)
+    calls.clear()
+    found(draw(80, 5))
+    assert len(calls) == 1
+    blank = Term("blank", outputs={"y": lambda x, p, y: y + p["f"]}, parameters=[Parameter("f")])
+    assert extend(found.simulator, [blank]).dear
+
+
+def test_transforms_of_torch_func_may_be_cut_in_pieces():
+    found = module(rule=6, max_elements=400)
+
+    def total(alpha):
+        mean, sd = found(alpha.expand(50, -1))
+        return mean.sum() + sd.sum()
+
+    alpha = draw(5)
+    slope = torch.func.grad(total)(alpha)
+    leaf = alpha.clone().requires_grad_()
+    torch.testing.assert_close(slope, torch.autograd.grad(total(leaf), leaf)[0], rtol=1e-11, atol=1e-11)
 
 
 @pytest.mark.parametrize("embedding", [Gaussian(), Uniform(), PolynomialChaos(order=2), Gaussian(("b",))])

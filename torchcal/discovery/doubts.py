@@ -14,7 +14,7 @@ from torchcal.discovery.own_noise import beside
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.search import Search
 from torchcal.errors import TorchcalError
-from torchcal.simulators import ODESimulator, Trajectories
+from torchcal.simulators import Trajectories
 from torchcal.terms import Term
 
 __all__ = ["distinct", "doubt", "left_open", "unfit"]
@@ -36,8 +36,9 @@ CLEARLY_OPEN = 2.0
 LEVELS, NEARLY = 3, 0.2
 #: Distinct values of its driver below a threshold up to which nothing shows that the effect begins there.
 FREE = 2
-#: Sd of a drive's gain, and share of it, by which it must be more than the base's own.
-WRONG_WAY, MORE = 2.0, 0.1
+#: Sd of a slow drive's gain, and share of it, by which it must be more than the base's own: a pure dead time takes
+#: twice as much, a lag with half a gap between samples beside it a fifth more.
+WRONG_WAY, MORE = 2.0, 1 / 3
 #: Log odds against a nameless change from which on a term in a window is there for its own shape.
 CLEARLY = 3.0
 #: Share of the largest effect of the base's parameters below which a direction of them moves no datum.
@@ -129,49 +130,48 @@ def _ends(model: Model, term: Term, drivers: Mapping[str, Tensor], driver: str, 
 
 
 def _no_drive(model: Model) -> str:
-    """Why a drive with a memory is none: with it an equation would at first follow its input the wrong way.
+    """Why a slow drive is none: an equation would at first follow its input the wrong way.
 
-    A drive that lags takes its input's effect away, and gives it back later. It has no more to take than the base has.
+    A drive that lags takes its input's effect away, and gives it back later. It has no more to take than there is.
     """
-    found, problem = model.found, model.found.problem
-    bound = problem.simulator
-    if not isinstance(bound, Trajectories):
-        return ""
-    drivers = problem.drivers_at_data(found.values[None], found.warm)
-    sd = stated_sd(found)
+    bound, sd = model.found.problem.simulator, stated_sd(model.found)
     for term in model.candidate.terms:
-        if not term.states:
+        if term.takes is None or not term.states or not isinstance(bound, Trajectories):
             continue
-        size = [float(sd[i] / found.values[i].abs()) for i in model.candidate.amplitudes
-                if term.brings(problem.parameters[i].name)]  # fmt: skip
-        least = max([MORE, *(WRONG_WAY * one for one in size)])
-        for name, given in bound.runs[0].inputs.items():
-            moved = {**drivers, name: drivers[name] + float(given.max() - given.min())}
-            for state in set(term.rates) - set(term.states):
-                try:
-                    (total, own), (before, own_before) = (
-                        _rates(model, bound.ode, term, state, at) for at in (moved, drivers)
-                    )
-                except (TorchcalError, RuntimeError):  # not every function works on a row of data
-                    continue
-                total, own = total - before, own - own_before
-                if bool(((own * (total - own) < 0) & (total * own > least * own.square())).all()):
-                    return (
-                        f"By it the rate of {state} would at first follow {name} the wrong way: it takes more of its "
-                        "effect away than there is."
-                    )
+        unsure = [float(sd[i] / model.found.values[i].abs()) for i in model.candidate.amplitudes
+                  if term.brings(model.found.problem.parameters[i].name)]  # fmt: skip
+        least = max([MORE, *(WRONG_WAY * one for one in unsure)])
+        for state in term.rates:
+            if state in term.states:
+                continue
+            try:
+                total, own = _response(model, bound, term, state, term.takes)
+            except TorchcalError:  # not every function works on a row of data
+                continue
+            if bool(((own * (total - own) < 0) & (total * own > least * own.square())).all()):
+                return (
+                    f"By it the rate of {state} would at first follow {term.takes} the wrong way: it takes more of "
+                    "its effect away than there is."
+                )
     return ""
 
 
-def _rates(
-    model: Model, ode: ODESimulator, term: Term, state: str, drivers: dict[str, Tensor]
-) -> tuple[Tensor, Tensor]:
-    """The whole rate of a state at the data, and a term's share of it."""
+def _response(model: Model, bound: Trajectories, term: Term, state: str, name: str) -> tuple[Tensor, Tensor]:
+    """How a state's whole rate, and a term's share of it, change at the data with an input, by its range."""
     problem = model.found.problem
-    p = problem.parameters_at_data(model.found.values)
-    total = ode.rates(*problem.arguments(drivers, p))[state]
-    own = term.call(term.rates[state], *problem.arguments(drivers, term.own(p)))
-    return torch.as_tensor(total), torch.as_tensor(own)
+    drivers = problem.drivers_at_data(model.found.values[None], model.found.warm)
+    p = bound.layout.by_name(model.found.values[None], bound.grid.run_of[problem.condition_of])
+    states = list(bound.ode.states)
+    s = torch.stack([drivers[one] for one in states], dim=-1)[None]
+    named = dict(zip(states, s.unbind(-1), strict=True))
+    t, inputs = drivers["t"], {one: drivers[one] for one in bound.runs[0].inputs}
+    given = torch.cat([run.inputs[name] for run in bound.runs])
+    found = []
+    for u in ({**inputs, name: inputs[name] + given.max() - given.min()}, inputs):
+        total = bound.steps.rates(t, s, p, u)[..., states.index(state)]
+        found.append((total, torch.as_tensor(term.call(term.rates[state], t, named, term.own(p), u))))
+    (total, own), (total_before, own_before) = found
+    return total - total_before, own - own_before
 
 
 def _levels(model: Model) -> int:

@@ -7,8 +7,7 @@ from torch import Tensor
 
 from torchcal.inference.newton import Minima, directions, finite_values, gradient, hessian, join, minimise
 from torchcal.propagation import NISP
-from torchcal.propagation.pieces import cached
-from torchcal.simulators import Conditions, ExternalSimulator, Simulator, Trajectories
+from torchcal.simulators import Conditions, Simulator
 
 __all__ = ["few_nodes", "minimise_by_tangents", "pieces", "search", "search_with_few_nodes"]
 
@@ -34,6 +33,9 @@ _SHARES = (1.0, 0.5, 0.2, 0.05, 0.01)
 
 _ELEMENTS = 2**23
 """Numbers of outputs on tangents at once, 64 MiB."""
+
+_PIECE = 2**17
+"""Numbers of outputs at once on a CPU, whose caches hold them: larger pieces take several times longer each."""
 
 _FEWER = 4
 """How many times fewer nodes make a search with them worth its while."""
@@ -161,9 +163,9 @@ def few_nodes(propagate: NISP) -> NISP | None:
 
 def pieces(propagate: NISP, outputs: int) -> int | None:
     """Points whose objective is taken at once; None for all, as for simulators with much to do for each call."""
-    if propagate.nodes.device.type != "cpu" or isinstance(propagate.simulator, (ExternalSimulator, Trajectories)):
+    if propagate.nodes.device.type != "cpu" or propagate.simulator.dear:
         return None
-    return max(1, cached() // (propagate.num_evaluations * outputs))
+    return max(1, _PIECE // (propagate.num_evaluations * outputs))
 
 
 def search_with_few_nodes(

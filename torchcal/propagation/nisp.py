@@ -17,9 +17,9 @@ from torchcal.embeddings import Embedding, Pattern
 from torchcal.errors import DomainError, EmbeddingError, ShapeError
 from torchcal.propagation import choice, convergence, parameters, polynomials
 from torchcal.propagation.convergence import PropagationCheck
-from torchcal.propagation.pieces import MANY, MOST, cached, forgetful, over_batch
+from torchcal.propagation.pieces import CACHED, MANY, MOST, forgetful, over_batch
 from torchcal.propagation.rules import RuleChoice
-from torchcal.simulators import Conditions, ExternalSimulator, Scaling, Simulator, Trajectories, free_parameters
+from torchcal.simulators import Conditions, Scaling, Simulator, free_parameters
 
 __all__ = ["NISP"]
 
@@ -461,7 +461,7 @@ class NISP(nn.Module):
 
     def _node_pieces(self, alpha: Tensor, count: int) -> list[slice]:
         rows = alpha.numel() // self.num_alpha * self._width
-        size = max(1, self._at_once(rows * count) // max(1, rows))
+        size = max(1, (self.max_elements or MOST) // max(1, rows))
         return [slice(i, i + size) for i in range(0, count, size)]
 
     @property
@@ -478,17 +478,18 @@ class NISP(nn.Module):
     ) -> tuple[Tensor, ...]:
         """Apply a function of a batch of α in pieces of bounded size."""
         single = max(1, self.num_nodes * self._width)
-        most = self._at_once(alpha.numel() // self.num_alpha * single)
-        return over_batch(function, alpha, max(1, most // single), whole=single <= most)
+        most = self.max_elements or MOST
+        size = self._cached(alpha) or max(1, most // single)
+        return over_batch(function, alpha, size, whole=single <= most)
 
-    def _at_once(self, numbers: int) -> int:
-        """How many of so many numbers are evaluated at once."""
-        if self.max_elements is not None:
-            return self.max_elements
-        calls = isinstance(self.simulator, (ExternalSimulator, Trajectories))  # dear ones, each for all that it gets
-        if numbers <= MANY or calls or self._polynomial is not None or self.nodes.device.type != "cpu":
-            return MOST
-        return cached()
+    def _cached(self, alpha: Tensor) -> int | None:
+        """How many α are evaluated at once where that is a matter of a CPU's caches."""
+        if self.max_elements is not None or self.simulator.dear or self._polynomial is not None:
+            return None
+        single = max(1, self.num_evaluations * self._width)
+        if self.nodes.device.type != "cpu" or alpha.numel() // self.num_alpha * single <= MANY:
+            return None
+        return max(1, CACHED // single)
 
     # --- rules -------------------------------------------------------------------------------------------
 

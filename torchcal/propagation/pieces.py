@@ -7,13 +7,13 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-__all__ = ["MANY", "MOST", "cached", "forgetful", "over_batch"]
+__all__ = ["CACHED", "MANY", "MOST", "forgetful", "over_batch"]
 
 MOST = 2**24
 """Numbers at once, 128 MiB."""
 
-_CACHED, _SHARED = 2**17, 2**20
-"""Numbers of outputs at once that one core's caches hold, and those that all share."""
+CACHED = 2**20
+"""Numbers of outputs at once that a CPU's caches hold."""
 
 MANY = 2**21
 """Numbers of outputs from which on such pieces are faster than all at once, though they are computed twice."""
@@ -21,14 +21,10 @@ MANY = 2**21
 Moments = Callable[[Tensor], tuple[Tensor, ...]]
 
 
-def cached() -> int:
-    """Numbers of outputs at once that a CPU's caches hold: larger pieces take several times longer each."""
-    return min(_CACHED * torch.get_num_threads(), _SHARED)
-
-
 def forgetful(function: Moments, alpha: Tensor) -> tuple[Tensor, ...]:
     """``function(alpha)``, whose intermediate values are computed again in the backward pass instead of kept."""
-    if torch.is_grad_enabled() and alpha.requires_grad:
+    # The transforms of torch.func know of no checkpoints.
+    if torch.is_grad_enabled() and alpha.requires_grad and not torch._C._functorch.is_functorch_wrapped_tensor(alpha):
         return checkpoint(function, alpha, use_reentrant=False)
     return function(alpha)
 

@@ -44,6 +44,8 @@ def check_nodes_in_time(propagate: NISP, alpha: Tensor) -> PropagationCheck:
 class _Elsewhere(Simulator):
     """Trajectories of other runs as a function of the calibrated parameters, at some of their samples."""
 
+    dear = True
+
     def __init__(self, bound: Trajectories, other: Trajectories, columns: list[int], picks: Tensor) -> None:
         self.parameters = bound.parameters
         self.degree = None

@@ -64,6 +64,8 @@ class ExternalSimulator(Simulator):
     tensor([ 2., 18.])
     """
 
+    dear = True
+
     def __init__(
         self,
         function: Callable[[Any, dict[str, float]], Any],

@@ -91,6 +91,9 @@ class Simulator:
     tensor([2., 5.])
     """
 
+    dear: bool = False
+    """Whether there is much to do for each call, whatever it is given: then all is asked for at once."""
+
     extended: tuple[Any, tuple[Any, ...]] | None = None
     """Of a simulator that terms were added to: the one without them, and the terms (`torchcal.terms.extend`)."""
 

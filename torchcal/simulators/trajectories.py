@@ -43,6 +43,8 @@ class Trajectories(Simulator):
         steps: The steps, and how trajectories are found.
     """
 
+    dear = True
+
     def __init__(
         self,
         ode: "ODESimulator",

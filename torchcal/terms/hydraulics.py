@@ -118,7 +118,7 @@ def _inflow(inflow: str, h: str, downstream: str | None, label: str | None, unit
              rates={h: lambda t, s, p, u: p["g"] * (s[hidden] - u[inflow]),
                     hidden: lambda t, s, p, u: (u[inflow] - s[hidden]) / p["tau"]},
              states={hidden: f"[{inflow}]"}, initial={hidden: 0.0},
-             parameters=[amplitude("g", unit, low=0.0), shape("tau", units.time)], scales={"tau": "t"},
+             parameters=[amplitude("g", unit, low=0.0), shape("tau", units.time)], scales={"tau": "t"}, takes=inflow,
              formula=f"d{h}/dt ∋ g (z - {inflow}), dz/dt = ({inflow} - z)/tau, z(0) = 0",
              description="The pump follows its command only after a time tau."),
     ]  # fmt: skip

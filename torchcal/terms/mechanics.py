@@ -165,7 +165,7 @@ def _actuator(force: str, v: str, label: str | None, units: Units) -> list[Term]
              rates={v: lambda t, s, p, u: p["g"] * (s[hidden] - u[force]),
                     hidden: lambda t, s, p, u: (u[force] - s[hidden]) / p["tau"]},
              states={hidden: f"[{force}]"}, initial={hidden: 0.0},
-             parameters=[amplitude("g", unit, low=0.0), shape("tau", units(0, -1))], scales={"tau": "t"},
+             parameters=[amplitude("g", unit, low=0.0), shape("tau", units(0, -1))], scales={"tau": "t"}, takes=force,
              formula=f"d{v}/dt ∋ g (z - {force}), dz/dt = ({force} - z)/tau, z(0) = 0",
              description="The drive's force follows its command only after a time tau."),
     ]  # fmt: skip

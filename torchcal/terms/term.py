@@ -78,6 +78,8 @@ class Term:
             from that, for its own sd too, is the less likely, by a normal density.
         elapsed: For what begins at nothing and goes on, whatever the clock says: t in its functions counts from the
             first sample of the ``"recording"``, or of each ``"run"``. By default t is the recording's own.
+        takes: The input whose effect it takes away at first, as a slow drive does: an estimate that takes more than
+            the equation has of it is no name.
 
     Raises:
         DomainError: If it does nothing, or its parts do not fit together.
@@ -98,6 +100,7 @@ class Term:
     description: str
     scales: dict[str, str] = field(default_factory=dict)
     elapsed: str | None = None
+    takes: str | None = None
     expected: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     def __init__(
@@ -117,6 +120,7 @@ class Term:
         description: str = "",
         scales: Mapping[str, str] | None = None,
         elapsed: str | None = None,
+        takes: str | None = None,
         expected: Mapping[str, tuple[float, float]] | None = None,
     ) -> None:
         if not isinstance(name, str) or not name:
@@ -196,6 +200,7 @@ class Term:
         put(self, "description", description)
         put(self, "scales", dict(scales or {}))
         put(self, "elapsed", elapsed)
+        put(self, "takes", takes)
         put(self, "expected", {key: (float(value), float(sd)) for key, (value, sd) in (expected or {}).items()})
 
     def __repr__(self) -> str:
@@ -435,6 +440,7 @@ def _extend_static(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
         return found if isinstance(result, Mapping) else found["y"]
 
     extended = Simulator(function, parameters)
+    extended.dear = plain.dear
     extended.extended = plain, tuple(every)
     return extended
 

@@ -194,7 +194,7 @@ def _heater(heater: str, T: str, label: str | None, time: str) -> list[Term]:
              rates={T: lambda t, s, p, u: p["g"] * (s[hidden] - u[heater]),
                     hidden: lambda t, s, p, u: (u[heater] - s[hidden]) / p["tau"]},
              states={hidden: f"[{heater}]"}, initial={hidden: 0.0},
-             parameters=[amplitude("g", unit, low=0.0), shape("tau", time)], scales={"tau": "t"},
+             parameters=[amplitude("g", unit, low=0.0), shape("tau", time)], scales={"tau": "t"}, takes=heater,
              formula=f"d{T}/dt ∋ g (z - {heater}), dz/dt = ({heater} - z)/tau, z(0) = 0",
              description="The heater's own heat capacity delays its effect by a time tau."),
     ]  # fmt: skip
