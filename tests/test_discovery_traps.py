@@ -332,6 +332,12 @@ def test_a_pump_takes_no_more_of_its_effect_away_than_there_is():
     assert d.terms == ["pump lag"]
 
 
+def test_what_a_term_takes_is_an_input():
+    lag = tc.Term("lag", rates={"h": lambda t, s, p, u: p["g"] * s["h"]}, parameters=[tc.Parameter("g")], takes="Q")
+    with pytest.raises(tc.errors.DomainError, match=r"one of the inputs \['q'\]. Got 'Q'"):
+        diagnose(*pumped(0), [lag])
+
+
 def test_a_term_that_is_no_drive_may_act_the_wrong_way_at_first():
     swell = tc.Term(
         "shrink and swell",

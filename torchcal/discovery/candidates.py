@@ -150,7 +150,16 @@ def drivers_scale(problem: Problem, found: Fitted) -> dict[str, float]:
 
 
 def sized(term: Term, scale: Mapping[str, float], recording: Recording) -> Term:
-    """The term with bounds for the shape parameters that it measures on a driver's scale."""
+    """The term with bounds for the shape parameters that it measures on a driver's scale.
+
+    Raises:
+        DomainError: If it names a driver or an input that there is not.
+    """
+    inputs = list(recording.runs[0].inputs) if recording.runs else []
+    if term.takes is not None and term.takes not in inputs:
+        raise DomainError(
+            f"Expected the term {term.name!r} to take the effect of one of the inputs {inputs}. Got {term.takes!r}."
+        )
     if not term.scales:
         return term
     if "t" in scale and term.elapsed == "recording":

@@ -78,8 +78,8 @@ class Term:
             from that, for its own sd too, is the less likely, by a normal density.
         elapsed: For what begins at nothing and goes on, whatever the clock says: t in its functions counts from the
             first sample of the ``"recording"``, or of each ``"run"``. By default t is the recording's own.
-        takes: The input whose effect it takes away at first, as a slow drive does: an estimate that takes more than
-            the equation has of it is no name.
+        takes: The input whose effect it takes away at first, as a slow drive does: an estimate that takes half as
+            much again as the equation has of it, or more, is no name.
 
     Raises:
         DomainError: If it does nothing, or its parts do not fit together.
