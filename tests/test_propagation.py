@@ -37,6 +37,18 @@ def smooth(x, p):
     return torch.exp(0.3 * p["a"] + 0.2 * p["b"] * x) + p["b"]
 
 
+def noting_sizes():
+    """A smooth function, and a list of how many numbers each of its calls returned."""
+    seen = []
+
+    def watched(x, p):
+        result = smooth(x, p)
+        seen.append(result.numel())
+        return result
+
+    return watched, seen
+
+
 def module(embedding=None, function=smooth, **options):
     return NISP(Simulator(function, AB), embedding or Gaussian(), X, **options)
 
@@ -256,13 +268,7 @@ def test_pieces_do_not_cancel_a_small_spread_on_a_large_mean():
 
 
 def test_work_is_bounded_by_max_elements():
-    seen = []
-
-    def watched(x, p):
-        result = smooth(x, p)
-        seen.append(result.numel())
-        return result
-
+    watched, seen = noting_sizes()
     found = module(function=watched, rule=6, max_elements=400)
     seen.clear()
     found(draw(50, 5))
@@ -273,13 +279,7 @@ def test_work_is_bounded_by_max_elements():
 
 
 def test_much_work_on_a_cpu_is_done_in_pieces_that_its_caches_hold():
-    seen = []
-
-    def watched(x, p):
-        result = smooth(x, p)
-        seen.append(result.numel())
-        return result
-
+    watched, seen = noting_sizes()
     x = torch.linspace(0, 1, 1000, dtype=torch.float64)
     found = NISP(Simulator(watched, [Parameter("a"), Parameter("b")]), Gaussian(), x, rule=6)
     for chains, cut in ((50, False), (80, True)):  # 1.8 and 2.9 million numbers
@@ -295,20 +295,15 @@ def test_much_work_on_a_cpu_is_done_in_pieces_that_its_caches_hold():
 
 
 def test_a_dear_simulator_is_asked_for_all_at_once():
-    calls = []
-
     class Dear(Simulator):
         dear = True
 
-    def watched(x, p):
-        calls.append(1)
-        return smooth(x, p)
-
+    watched, seen = noting_sizes()
     x = torch.linspace(0, 1, 1000, dtype=torch.float64)
     found = NISP(Dear(watched, [Parameter("a"), Parameter("b")]), Gaussian(), x, rule=6)
-    calls.clear()
+    seen.clear()
     found(draw(80, 5))
-    assert len(calls) == 1
+    assert len(seen) == 1
     blank = Term("blank", outputs={"y": lambda x, p, y: y + p["f"]}, parameters=[Parameter("f")])
     assert extend(found.simulator, [blank]).dear
 

@@ -151,7 +151,7 @@ def _reads(model: Model) -> set[str]:
     for term in model.candidate.terms:
         noting = _Noting(drivers)
         given = problem.arguments(noting, term.own(p))
-        noting.noted.clear()
+        noting.noted.clear()  # the time that every function is given is read by none yet
         try:
             for function in (*term.rates.values(), *term.shifts.values()):
                 term.call(function, *given)

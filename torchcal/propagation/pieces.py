@@ -7,6 +7,8 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
+from torchcal.simulators.dual import transformed
+
 __all__ = ["CACHED", "MANY", "MOST", "forgetful", "over_batch"]
 
 MOST = 2**24
@@ -23,8 +25,7 @@ Moments = Callable[[Tensor], tuple[Tensor, ...]]
 
 def forgetful(function: Moments, alpha: Tensor) -> tuple[Tensor, ...]:
     """``function(alpha)``, whose intermediate values are computed again in the backward pass instead of kept."""
-    # The transforms of torch.func know of no checkpoints.
-    if torch.is_grad_enabled() and alpha.requires_grad and not torch._C._functorch.is_functorch_wrapped_tensor(alpha):
+    if torch.is_grad_enabled() and alpha.requires_grad and not transformed(alpha):
         return checkpoint(function, alpha, use_reentrant=False)
     return function(alpha)
 

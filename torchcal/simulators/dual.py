@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.overrides import TorchFunctionMode
 
-__all__ = ["Still", "still"]
+__all__ = ["Still", "still", "transformed"]
 
 _BINARY = {
     "add", "sub", "mul", "div", "true_divide", "__add__", "__radd__", "__sub__", "__mul__", "__rmul__", "__truediv__"
@@ -47,7 +47,7 @@ class Still(TorchFunctionMode):
 
 def _beside(value: Any, other: Any) -> Any:
     """A constant beside a dual tensor, with a tangent; anything else as it is."""
-    if not isinstance(other, Tensor) or not other.dtype.is_floating_point or _wrapped(other) or _wrapped(value):
+    if not isinstance(other, Tensor) or not other.dtype.is_floating_point or transformed(other) or transformed(value):
         return value
     if isinstance(value, Tensor):
         if not value.dtype.is_floating_point or _moves(value) or not _moves(other):
@@ -58,8 +58,9 @@ def _beside(value: Any, other: Any) -> Any:
     return still(torch.tensor(value, dtype=other.dtype, device=other.device))
 
 
-def _wrapped(value: Any) -> bool:
-    """Whether a transform of `torch.func`, as `torch.vmap`, is at work, which knows of no dual level."""
+def transformed(value: Any) -> bool:
+    """Whether a transform of `torch.func`, as `torch.vmap`, is at work, which knows of no dual level and of no
+    checkpoints."""
     return isinstance(value, Tensor) and torch._C._functorch.is_functorch_wrapped_tensor(value)
 
 
