@@ -385,18 +385,22 @@ def test_choices_survive_a_round_trip(likelihood, embedding, tmp_path):
     torch.testing.assert_close(loaded.predict([3.0]).sd, result.predict([3.0]).sd, rtol=1e-12, atol=0)
 
 
-def test_a_rule_of_ones_own_survives_a_round_trip(tmp_path):
+@pytest.mark.parametrize(
+    ("rule", "nodes"), [(tc.polychaos.qmc_rule(tc.polychaos.HERMITE, 1, 64, seed=1), 64), (2, 2)]
+)
+def test_a_rule_of_ones_own_is_kept_to_and_survives_a_round_trip(tmp_path, rule, nodes):
     simulator = tc.Simulator(lambda x, p: torch.exp(p["a"] * x), [tc.Parameter("a", low=0.0, high=2.0)])
     data = tc.Recording(x=T + 1, y=1 + (T + 1) ** 2)
-    rule = tc.polychaos.qmc_rule(tc.polychaos.HERMITE, 1, 64, seed=1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", tc.errors.TorchcalWarning)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
         result = tc.calibrate(simulator, data, rule=rule, num_samples=0, num_starts=4)
+    assert any(f"{nodes} quadrature nodes" in str(each.message) for each in told)
+    assert result.propagate.num_nodes == nodes
     result.save(tmp_path / "result.nc")
     loaded = Calibration.load(tmp_path / "result.nc", simulator=simulator)
-    with pytest.warns(tc.errors.PropagationWarning, match="64 quadrature nodes"):
+    with pytest.warns(tc.errors.PropagationWarning, match=f"{nodes} quadrature nodes"):
         expected = result.predict([1.5]).sd
-    with pytest.warns(tc.errors.PropagationWarning, match="64 quadrature nodes"):
+    with pytest.warns(tc.errors.PropagationWarning, match=f"{nodes} quadrature nodes"):
         torch.testing.assert_close(loaded.predict([1.5]).sd, expected, rtol=1e-10, atol=0)
 
 

@@ -184,7 +184,7 @@ def _searched(problem: Problem, starts: Tensor, leading: Tensor, show: Callable[
 def _refined(problem: Problem, found: Minima, show: Callable[[int, Tensor], None]) -> Minima:
     """The minima with as many quadrature nodes as the best one needs: with more of them it may move."""
     propagate, transform = problem.propagate, problem.prior.transform
-    if not propagate.pattern.num_germs:
+    if not propagate.pattern.num_germs or propagate.rule_choice.asked:
         return found
     objective, total = _objective(problem), len(found.values)
     in_time = isinstance(propagate.simulator, Trajectories)

@@ -13,7 +13,7 @@ from torchcal.errors import DomainError, EmbeddingError, ImproperPosteriorError,
 from torchcal.inference.fitting import allowed_solver_error
 from torchcal.models import Problem
 from torchcal.priors import CoefficientPrior
-from torchcal.propagation import NISP
+from torchcal.propagation import NISP, RuleChoice
 from torchcal.simulators import Parameter, Scaling, Simulator, Trajectories, free_parameters, workable
 
 __all__ = ["PriorMaker", "check_inputs", "check_run", "embedded_problem"]
@@ -113,7 +113,7 @@ def embedded_problem(
         free, _ = free_parameters(simulator.parameters, fixed)
         uncertain = embedding.bind([parameter.name for parameter in free]).num_germs
         if uncertain and NODES_IN_TIME**uncertain <= 4096:
-            rule = NODES_IN_TIME
+            rule = RuleChoice("tensor", NODES_IN_TIME)
     propagate = NISP(
         simulator,
         embedding,

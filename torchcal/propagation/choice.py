@@ -36,7 +36,7 @@ def choose(propagate: "NISP", rule: polychaos.Rule | RuleChoice | int | None) ->
     if germs == 0:
         return RuleChoice("tensor", 1)
     if rule is not None:
-        return RuleChoice("tensor", whole("rule", rule, 1, also="a torchcal.polychaos.Rule or None"))
+        return RuleChoice("tensor", whole("rule", rule, 1, also="a torchcal.polychaos.Rule or None"), asked=True)
     exact = exact_count(propagate)
     if exact is not None and exact**germs <= propagate.max_nodes:
         return RuleChoice("tensor", exact)

@@ -21,12 +21,14 @@ class RuleChoice:
         size: The size.
         seed: Of the scrambling of quasi-Monte Carlo points.
         given: The user's own rule.
+        asked: Whether a user asked for this size, so that a calibration keeps to it.
     """
 
     kind: str
     size: int
     seed: int = 0
     given: polychaos.Rule | None = None
+    asked: bool = False
 
     def build(self, basis: polychaos.Basis, germs: int) -> polychaos.Rule:
         """Nodes and weights."""

@@ -19,6 +19,7 @@ from torchcal.prediction import (
     parameter_density,
 )
 from torchcal.propagation import NISP
+from torchcal.propagation.convergence import SETTLED
 from torchcal.results import reading, storage
 from torchcal.results.base import Result, conditions, indent, thin
 from torchcal.results.diagnostics import Diagnostics, table
@@ -104,12 +105,12 @@ class Calibration(Result):
             other = self.propagate.at(where, simulator=simulator)
         if other.pattern.num_germs:  # nodes that were enough at the data may not be elsewhere
             alpha = self.map.alpha.to(other.nodes)
-            if in_time:
-                other.refine(alpha, tolerance=NODE_TOLERANCE)
-                check_nodes_in_time(other, alpha)
-            else:
-                with warned_once():
-                    other.refine(alpha)
+            with warned_once():
+                if not other.rule_choice.asked:
+                    other.refine(alpha, tolerance=NODE_TOLERANCE if in_time else SETTLED)
+                if in_time:
+                    check_nodes_in_time(other, alpha)
+                else:
                     other.check(alpha)
         return other
 

@@ -213,7 +213,7 @@ def _propagation(
         scaling=scaling_of(settings),
         order=settings["order"],
         sd_floor=settings["sd_floor"],
-        rule=_rule(settings["rule"]) if "rule" in settings else settings["gauss_nodes"],
+        rule=_rule(settings["rule"]) if "rule" in settings else RuleChoice("tensor", settings["gauss_nodes"]),
     )
     if propagate.pattern.names != tuple(meta["parameter_names"]):
         raise EmbeddingError(
@@ -248,7 +248,7 @@ def _rule(spec: Mapping[str, Any]) -> RuleChoice:
     if "nodes" in spec:
         nodes, weights = (torch.tensor(spec[key], dtype=torch.float64) for key in ("nodes", "weights"))
         given = polychaos.Rule(nodes, weights, bool((weights > 0).all()))
-    return RuleChoice(spec["kind"], spec["size"], spec["seed"], given)
+    return RuleChoice(spec["kind"], spec["size"], spec["seed"], given, asked=spec.get("asked", False))
 
 
 def _map(groups: Mapping[str, Any], meta: Mapping[str, Any]) -> MapEstimate:

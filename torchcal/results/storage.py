@@ -159,8 +159,9 @@ def _tree(groups: dict[str, Any], result: Any, extra: Mapping[str, Any]) -> Any:
     del diagnostics["null_directions"]
     recording = result.recording
     settings = dict(result.settings)
-    if result.propagate is not None and result.propagate.rule_choice.kind != "tensor":
-        settings["rule"] = _rule_fields(result.propagate.rule_choice)
+    choice = None if result.propagate is None else result.propagate.rule_choice
+    if choice is not None and (choice.kind != "tensor" or choice.asked):
+        settings["rule"] = _rule_fields(choice)
     meta = {
         **extra,
         "format": FORMAT,
@@ -192,7 +193,7 @@ def _run_fields(run: Run) -> dict[str, Any]:
 
 
 def _rule_fields(choice: RuleChoice) -> dict[str, Any]:
-    spec: dict[str, Any] = {"kind": choice.kind, "size": choice.size, "seed": choice.seed}
+    spec: dict[str, Any] = {"kind": choice.kind, "size": choice.size, "seed": choice.seed, "asked": choice.asked}
     if choice.given is not None:
         spec |= {"nodes": choice.given.nodes.tolist(), "weights": choice.given.weights.tolist()}
     return spec
