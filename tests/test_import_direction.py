@@ -19,6 +19,7 @@ ROOMS = (
     "errors",
     "checks",
     "files",
+    "threads",
     "display",
     "data",
     "polychaos",

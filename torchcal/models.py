@@ -41,6 +41,11 @@ class Problem:
     germ: Tensor | None = None
     unit: Tensor | None = None
 
+    @property
+    def cost(self) -> int:
+        """How many outputs are computed for one α."""
+        return self.propagate.num_evaluations * len(self.y)
+
     def cast(self, dtype: torch.dtype) -> "Problem":
         """The same problem in another dtype."""
         if dtype == self.y.dtype:

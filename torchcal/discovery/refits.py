@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from torchcal.discovery.fitting import Fitted, fit
@@ -14,6 +13,7 @@ from torchcal.discovery.problem import Problem, Whitening
 from torchcal.errors import DomainError, MissingDependencyError, SimulatorError, TorchcalError
 from torchcal.simulators import Solution
 from torchcal.simulators.executor import TaskError, check_executor, run_tasks
+from torchcal.threads import few_threads
 
 __all__ = ["Refit", "refit_all"]
 
@@ -91,12 +91,8 @@ def refit_all(
 
 
 def _run_packed(packed: bytes) -> bytes:
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # workers share the cores
-    try:
+    with few_threads():  # workers share the cores
         found = pickle.loads(packed).run()
-    finally:
-        torch.set_num_threads(threads)
     if found is not None:  # both are large, and known where the job came from
         found = dataclasses.replace(found, problem=None, whitening=None)
     return pickle.dumps(found)

@@ -19,10 +19,12 @@ from torchcal.priors import CoefficientPrior, Flat
 from torchcal.propagation import NISP
 from torchcal.results import AdditiveCalibration, MapEstimate, sigma_unit
 from torchcal.simulators import Simulator
+from torchcal.threads import few_threads
 
 __all__ = ["calibrate_additive"]
 
 
+@few_threads()
 def calibrate_additive(
     simulator: Simulator,
     recording: Recording,
@@ -125,10 +127,12 @@ def calibrate_additive(
         observed=None if bool(observed.all()) else observed.to(device=device),
         unit=None if len(recording.outputs) == 1 else sigma_unit(recording).to(device=device),
     )
-    estimate = maximise(problem, fit.scaled, starts=None, num_starts=num_starts, seed=seed, progress=progress)
+    with few_threads(problem.cost * num_starts):
+        estimate = maximise(problem, fit.scaled, starts=None, num_starts=num_starts, seed=seed, progress=progress)
     draws = None
     if plan.samples:
-        draws = draw(problem, estimate, models.additive, plan)
+        with few_threads(problem.cost * plan.chains(problem.cost)):
+            draws = draw(problem, estimate, models.additive, plan)
     names = (*propagate.pattern.names, "ln sigma")
     samples = None if draws is None else draws.alpha
     quality = diagnose(estimate, draws, samples, None, names, None)

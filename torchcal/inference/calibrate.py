@@ -36,10 +36,12 @@ from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results import Calibration, MapEstimate
 from torchcal.results.in_time import check_nodes_in_time
 from torchcal.simulators import Scaling, Simulator, Trajectories, settled
+from torchcal.threads import few_threads
 
 __all__ = ["calibrate"]
 
 
+@few_threads()
 def calibrate(
     simulator: Simulator,
     recording: Recording,
@@ -154,9 +156,10 @@ def calibrate(
     fit = least_squares(simulator, recording, fixed, seed=seed)
     simulator = fit.simulator
     problem = build(fit.scaling, rule)
-    estimate = maximise(
-        problem, fit.scaled, starts=starts, num_starts=num_starts, seed=seed, progress=progress
-    )
+    with few_threads(problem.cost * (num_starts if starts is None else len(starts))):
+        estimate = maximise(
+            problem, fit.scaled, starts=starts, num_starts=num_starts, seed=seed, progress=progress
+        )
     for _ in range(2):  # steps that were short enough at one point may not be at all nodes
         finer = _settled(problem.propagate, estimate.alpha, recording)
         if finer is simulator:
@@ -173,7 +176,8 @@ def calibrate(
     draws: Draws | None = None
     samples: Tensor | None = None
     if plan.samples:
-        draws = draw(problem, estimate, models.embedded, plan)
+        with few_threads(problem.cost * plan.chains(problem.cost)):
+            draws = draw(problem, estimate, models.embedded, plan)
         samples = draws.alpha
     check = _check_propagation(propagate, estimate.alpha, samples)
     prediction = embedded_prediction(propagate, estimate.alpha, None if samples is None else samples.flatten(0, 1))

@@ -122,10 +122,9 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
     modes = modes_of(problem, estimate)
     _warn_of_rounding(estimate, plan.dtype)
     cast = problem.cast(plan.dtype)
-    cost = cast.propagate.num_evaluations * len(cast.y)
     worth = [k for k, mode in enumerate(modes) if k == 0 or (mode.weight >= WORTH_CHAINS and plan.sampler != "pyro")]
     starts = [modes[k].to(plan.dtype) for k in worth]
-    begun = {worth[k] for k in dealt_out([mode.weight for mode in starts], plan.chains(cost))}
+    begun = {worth[k] for k in dealt_out([mode.weight for mode in starts], plan.chains(cast.cost))}
     pattern = problem.propagate.pattern
 
     def folded(alpha: Tensor) -> Tensor:
@@ -152,11 +151,11 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
             modes=starts,
             slopes=by_hand(cast, slopes_of(log_density)),
             num_samples=plan.samples,
-            num_chains=plan.chains(cost),
+            num_chains=plan.chains(cast.cost),
             num_warmup=plan.warmup,
             seed=plan.seed,
             kernel=plan.sampler,
-            cost=cost,
+            cost=cast.cost,
             target_accept=plan.target_accept,
             enough=enough if plan.target_ess is not None else None,
             progress=plan.progress,
