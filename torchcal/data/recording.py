@@ -2,7 +2,7 @@
 
 import copy
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -282,11 +282,24 @@ class Recording:
         if self.runs is None or len(states) != len(self.runs):
             have = "none" if self.runs is None else len(self.runs)
             raise RecordingError(f"Expected states for each run. Got {len(states)} for {have} (give one list a run).")
-        twin = copy.copy(self)
         pairs = zip(self.runs, states, strict=True)
         known = [{state: v for state, v in run.initial.items() if state not in mine} for run, mine in pairs]
-        runs = tuple(change(run, initial=left) for run, left in zip(self.runs, known, strict=True))
-        object.__setattr__(twin, "runs", runs)
+        return self._with_runs(change(run, initial=left) for run, left in zip(self.runs, known, strict=True))
+
+    def with_hold(self, holds: Sequence[str]) -> "Recording":
+        """The same recording with inputs that go on otherwise between samples, in each run in turn: see `Run`.
+
+        Raises:
+            RecordingError: If it is no recording of as many runs.
+        """
+        if self.runs is None or len(holds) != len(self.runs):
+            have = "none" if self.runs is None else len(self.runs)
+            raise RecordingError(f"Expected a hold for each run. Got {len(holds)} for {have}.")
+        return self._with_runs(change(run, hold=hold) for run, hold in zip(self.runs, holds, strict=True))
+
+    def _with_runs(self, runs: Iterable[Run]) -> "Recording":
+        twin = copy.copy(self)
+        object.__setattr__(twin, "runs", tuple(runs))
         return twin
 
     @classmethod

@@ -19,6 +19,7 @@ from torchcal.discovery.decision import Decision
 from torchcal.discovery.embedded import embed_each, model_error_sd
 from torchcal.discovery.experiment import propose
 from torchcal.discovery.fitting import Fitted, starts
+from torchcal.discovery.given import from_samples, held_otherwise
 from torchcal.discovery.likeliest import settled
 from torchcal.discovery.limits import limits
 from torchcal.discovery.model import Model
@@ -32,7 +33,7 @@ from torchcal.discovery.result import Diagnosis
 from torchcal.discovery.rounds import settle, with_all, with_explained, without_others
 from torchcal.discovery.search import Search
 from torchcal.discovery.several import refit_several
-from torchcal.discovery.symptoms import from_samples, more_than_replicates, symptoms, unlike
+from torchcal.discovery.symptoms import more_than_replicates, symptoms, unlike
 from torchcal.discovery.verdict import PLAINLY_WHITE, decide
 from torchcal.discovery.where import locate, missing_rate, needed_shifts
 from torchcal.display import NONE
@@ -40,6 +41,7 @@ from torchcal.errors import ConvergenceWarning, DomainError, EmbeddingError, Rec
 from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories, is_value_of
 from torchcal.simulators.executor import check_executor
 from torchcal.terms import Term, extend
+from torchcal.threads import few_threads
 
 __all__ = ["diagnose"]
 
@@ -51,6 +53,7 @@ HALF = 0.5
 POWER = 0.95
 
 
+@few_threads()
 def diagnose(
     simulator: Simulator,
     recording: Recording,
@@ -308,7 +311,7 @@ def _result(
     apart = unlike(search, left) if decision.verdict in ("consistent", "named") else []
     any_unlike = bool(apart)
     if decision.verdict != "consistent":
-        apart = [*from_samples(search), *more_than_replicates(search, left), *apart]
+        apart = [*held_otherwise(search), *from_samples(search), *more_than_replicates(search, left), *apart]
     remaining, depends = 0.0 if decision.verdict == "consistent" else 1.0, ""
     if best is not None:
         white = best.structure is not None and best.structure.p_value >= PLAINLY_WHITE and not search.exact

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.explain import misfit_size, stated_sd
+from torchcal.discovery.given import other_hold
 from torchcal.discovery.instruments import no_instrument, unnatural
 from torchcal.discovery.local import force, is_window
 from torchcal.discovery.model import Model
@@ -47,7 +48,7 @@ UNSEEN = 1e-7
 
 def doubt(search: Search, model: Model) -> str:
     """Why a model is no name, however probable, in a sentence; empty if it may be one."""
-    found = _no_better(search, model) or unfit(search, model)
+    found = _no_better(search, model) or unfit(search, model) or _by_hold(search, model)
     return found or ("" if search.exact else _noise_or_physics(search, model))
 
 
@@ -96,6 +97,16 @@ def _no_better(search: Search, model: Model) -> str:
         return ""
     what = f"{rival.candidate.name[0].upper()}{rival.candidate.name[1:]} in a range of {rival.window.driver}"
     return f"{what} would do nearly as well: the term's own shape is not seen yet."
+
+
+def _by_hold(search: Search, model: Model) -> str:
+    """Why a model may stand for a wrong guess of what inputs do between samples; empty if that is clearly less."""
+    other = other_hold(search)
+    if other is None or search.gain(other.chi2) < model.log_evidence - CLEARLY:
+        return ""
+    return (
+        "Inputs that go on otherwise between samples (hold=) would do nearly as well, without anything that is missing."
+    )
 
 
 def _no_threshold(model: Model) -> str:

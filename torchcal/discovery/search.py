@@ -84,6 +84,7 @@ class Search:
     left: set[int] = field(init=False, default_factory=set)
     p_detect: float = field(init=False, default=1.0)
     least: Tensor = field(init=False)
+    otherwise: dict[int, tuple[Fitted, Fitted | None]] = field(init=False, default_factory=dict)
     _unknown: dict[int, tuple[Fitted, tuple[Noise, float]]] = field(init=False, default_factory=dict)
     _held_out: dict[tuple[int, bytes], tuple[Fitted, HeldOut | None]] = field(init=False, default_factory=dict)
 

@@ -1,25 +1,19 @@
 """What gives a mismatch away beside the residual's structure: bent values, and noise that is not as it should be."""
 
-import dataclasses
 import math
 
 import torch
 from torch import Tensor
 
 from torchcal.discovery.explain import estimates, stated_sd
-from torchcal.discovery.fitting import Fitted, fit
+from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.model import Model
 from torchcal.discovery.noise import GRID, decorrelated, estimate
 from torchcal.discovery.problem import Problem, breaks, remembered
-from torchcal.discovery.residual import Residual
 from torchcal.discovery.search import Search
-from torchcal.discovery.structure import analyse
 from torchcal.display import with_unit
-from torchcal.errors import SimulatorError
-from torchcal.simulators import Trajectories
-from torchcal.simulators.layout import initial_name
 
-__all__ = ["from_samples", "more_than_replicates", "symptoms", "unlike"]
+__all__ = ["more_than_replicates", "symptoms", "unlike"]
 
 #: A base parameter that moves by this many sd when a term is added was bent by it.
 BENT = 3.0
@@ -29,9 +23,6 @@ SMALLER, ENOUGH, WHITE = 0.5, 20, 0.4
 #: Data of a run or sweep from which on its noise is compared with that of others; the probability by chance below which
 #: and the ratio of sd from which on they are told to be unlike.
 COMPARED, UNLIKE, RATIO = 12, 0.01, 2.0
-#: Probability by chance of what is left when given initial values are free, from which on it is noise; and noise sd up
-#: to which one that is found so is the one that was given.
-NOISE, CONFIRMED = 0.05, 0.2
 #: Times what replicates tell of the noise that means of conditions scatter by, from which on that is told where these
 #: are in no order; and levels of a condition that it takes.
 SCATTER, MEANS = 1.5, 8
@@ -143,52 +134,6 @@ def _by_memory(problem: Problem, places: Tensor, residual: Tensor) -> tuple[Tens
     datum, for each coefficient in `GRID`, ``(grid,)`` each."""
     rho = remembered(GRID, problem.gaps(places))
     return 0.5 * torch.log1p(-rho.square()).sum(0), decorrelated(residual[:, None], rho).square().sum(0)
-
-
-def from_samples(search: Search) -> list[str]:
-    """Initial values that were given as the first sample recorded, in words, where noise alone is left without them."""
-    problem, base = search.problem, search.base
-    bound, recording = base.problem.simulator, problem.recording
-    if search.exact or search.stop.is_set() or recording.runs is None or not isinstance(bound, Trajectories):
-        return []
-    shown = [
-        [name for name, value in run.initial.items()
-         if name in run.outputs and name not in bound.ode.initial and value == float(run.outputs[name][0])]
-        for run in recording.runs
-    ]  # fmt: skip
-    taken = {
-        initial_name(name, r, len(recording.runs)): (name, r, run.initial[name])
-        for r, (run, names) in enumerate(zip(recording.runs, shown, strict=True)) for name in names
-    }  # fmt: skip
-    if not taken:
-        return []
-    twin = recording.without_initial(shown)
-    known = base.by_name | {name: value for name, (_, _, value) in taken.items()}
-    names = {base.problem.parameters[i].name for i in base.free} | set(taken)
-    try:
-        again = Trajectories(
-            bound.ode, twin, subdivide=bound.subdivide, denser=bound.denser, implicit=bound.implicit
-        )  # fmt: skip
-        open_ = dataclasses.replace(base.problem, recording=twin, simulator=again)
-        begin = torch.tensor([[known[q.name] for q in open_.parameters]], dtype=torch.float64)
-        free = [i for i, q in enumerate(open_.parameters) if q.name in names]
-        found = fit(open_, search.noise.whitening(open_), begin, free)
-    except SimulatorError:
-        return []
-    if found is None or analyse(Residual(found, search.noise, seed=search.seed)).p_value < NOISE:
-        return []
-    sd = recording.split(search.noise.sd)
-    moved = [
-        full for full, (name, r, value) in taken.items()
-        if abs(found.by_name[full] - value) > CONFIRMED * float(sd[name][recording.x["run"] == r].median())  # type: ignore[index]
-    ]  # fmt: skip
-    if not moved:
-        return []
-    it, was = ("it", "was") if len(moved) == 1 else ("them", "were")
-    return [
-        f"{', '.join(moved)} {was} given as the first value recorded, noise and all: with {it} unknown (left out of "
-        "initial=) the base leaves no more than noise"
-    ]
 
 
 def more_than_replicates(search: Search, found: Fitted) -> list[str]:

@@ -1,0 +1,100 @@
+"""Inputs that were recorded at samples and held from one to the next, or not: what they do between is a guess."""
+
+import math
+
+import pytest
+import torch
+
+import torchcal as tc
+
+N, STEP = 150, 0.1
+A, GAIN = 1.5, 2.0
+
+
+def motor() -> tc.ODESimulator:
+    return tc.ODESimulator(
+        rates=lambda t, s, p, u: {"w": p["a"] * (p["g"] * u["c"] - s["w"])},
+        states={"w": "rad/s"},
+        parameters=[tc.Parameter("a", unit="1/s", low=0.0, initial=1.0), tc.Parameter("g", low=0.0, initial=1.0)],
+    )
+
+
+def candidates() -> list[tc.Term]:
+    return [
+        tc.Term(
+            "dead time",
+            outputs={"w": lambda t, s, p, u, y: y - p["tau"] * p["a"] * (p["g"] * u["c"] - s["w"])},
+            parameters=[tc.Parameter("tau", unit="s", low=0.0)],
+        ),
+        tc.Term(
+            "friction",
+            equation="w",
+            rate=lambda t, s, p, u: -p["f"] * torch.tanh(s["w"] / 0.02),
+            parameters=[tc.Parameter("f", unit="rad/s^2", low=0.0)],
+        ),
+        tc.Term("drift", equation="w", rate=lambda t, s, p, u: p["b"] * t, parameters=[tc.Parameter("b")]),
+    ]
+
+
+def command(generator: torch.Generator) -> torch.Tensor:
+    levels = 2 * torch.rand(N // 15, generator=generator, dtype=torch.float64) - 1
+    return levels.repeat_interleave(15)
+
+
+def recording(seed: int, hold: str, friction: float = 0.0) -> tc.Recording:
+    """The answer to a command that is held from sample to sample, solved with short steps between."""
+    generator = torch.Generator().manual_seed(seed)
+    c = command(generator)
+    w, short = [torch.tensor(0.3, dtype=torch.float64)], 50
+    decay = math.exp(-A * STEP / short)
+    for now in c[:-1]:
+        speed = w[-1]
+        for _ in range(short):
+            drive = GAIN * now - friction / A * torch.tanh(speed / 0.02)
+            speed = speed * decay + (1 - decay) * drive
+        w.append(speed)
+    y = torch.stack(w)
+    sd = 0.02 * float(y.std())
+    y = y + sd * torch.randn(N, generator=generator, dtype=torch.float64)
+    time = STEP * torch.arange(N, dtype=torch.float64)
+    return tc.Recording(runs=[tc.Run(time=time, outputs={"w": y}, inputs={"c": c}, hold=hold)], noise=sd)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_wrong_guess_between_samples_is_no_dead_time(seed):
+    d = tc.diagnose(motor(), recording(seed, "linear"), candidates(), seed=0, progress=False)
+    assert d.verdict == "ambiguous"
+    assert ["none of these"] in d.tied
+    assert "(hold=) would do nearly as well" in str(d).replace("\n", " ")
+    assert any("with hold='zero' between them the base leaves no more than noise" in row for row in d.symptoms)
+
+
+def test_the_right_guess_leaves_nothing():
+    d = tc.diagnose(motor(), recording(0, "zero"), candidates(), seed=0, progress=False)
+    assert d.verdict == "consistent"
+    assert d.symptoms == []
+
+
+def test_what_no_other_guess_explains_is_named():
+    d = tc.diagnose(motor(), recording(0, "zero", friction=0.3), candidates(), seed=0, progress=False)
+    assert d.terms == ["friction"]
+    assert not any("inputs change far" in row for row in d.symptoms)
+
+
+def test_smooth_inputs_are_taken_as_they_are(monkeypatch):
+    from torchcal.discovery import given
+
+    smooth = recording(0, "linear")
+    run = smooth.runs[0]
+    inputs = {"c": torch.sin(0.5 * run.time)}
+    smooth = tc.Recording(runs=[tc.Run(time=run.time, outputs=run.outputs, inputs=inputs)], noise=smooth.noise)
+    monkeypatch.setattr(given, "_refitted", lambda *_: pytest.fail("no other hold is to be tried"))
+    assert tc.diagnose(motor(), smooth, [], seed=0, progress=False).verdict != "consistent"
+
+
+def test_another_hold_for_each_run():
+    twin = recording(0, "linear").with_hold(["zero"])
+    assert twin.runs[0].hold == "zero"
+    assert float(twin.runs[0].inputs_at(0.05)["c"]) == float(twin.runs[0].inputs["c"][0])
+    with pytest.raises(tc.errors.RecordingError, match="hold for each run. Got 2 for 1"):
+        twin.with_hold(["zero", "zero"])
