@@ -96,5 +96,5 @@ def test_another_hold_for_each_run():
     twin = recording(0, "linear").with_hold(["zero"])
     assert twin.runs[0].hold == "zero"
     assert float(twin.runs[0].inputs_at(0.05)["c"]) == float(twin.runs[0].inputs["c"][0])
-    with pytest.raises(tc.errors.RecordingError, match="hold for each run. Got 2 for 1"):
+    with pytest.raises(tc.errors.RecordingError, match=r"hold for each run. Got 2 for 1"):
         twin.with_hold(["zero", "zero"])

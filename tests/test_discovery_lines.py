@@ -1,12 +1,17 @@
 """Oscillations that smooth functions do not follow, and terms whose tangents are the base's: neither goes unseen."""
 
+import itertools
 import math
 
+import numpy as np
 import pytest
 import torch
 
 import torchcal as tc
+from torchcal.discovery.channels import Channel
+from torchcal.discovery.lines import Lines
 from torchcal.discovery.local import Span
+from torchcal.discovery.problem import Problem
 from torchcal.discovery.screen import _cuts
 
 F64 = torch.float64
@@ -163,3 +168,57 @@ def test_a_term_that_is_the_base_s_own_at_any_size_is_not():
     d = tc.diagnose(base, tc.Recording(x={"d": x}, y={"y": y}, noise=0.3), [faster], progress=False)
     assert d.verdict == "unexplained"
     assert d.detection_limit[0].note == "already in the base model"
+
+
+def bursts(m: int = 10) -> torch.Tensor:
+    starts = torch.tensor([0.0, 7.0, 15.0, 22.0, 29.5], dtype=F64)
+    return (starts[:, None] + torch.linspace(0, 0.5, m, dtype=F64)).flatten()
+
+
+@pytest.mark.parametrize("size", [0.5, 8.0])
+def test_the_evidence_of_a_wave_is_that_of_the_linear_model(size):
+    """Two amplitudes with a normal prior: the marginal likelihood of the whitened residual, at any sampling."""
+    t = bursts()
+    y = torch.randn(len(t), generator=torch.Generator().manual_seed(0), dtype=F64)
+    model = tc.Simulator(lambda x, p: p["a"] + 0 * x, [tc.Parameter("a")])
+    problem = Problem.of(model, tc.Recording(x=t, y=y, noise=1.0))
+    channel = Channel("output", "y", None, {"x": t}, t, torch.ones(len(t), dtype=F64))
+    lines = Lines.of(problem, channel, "x", 4)
+    assert lines is not None
+    assert len(lines.frequencies) > 50
+    found = lines._log(size, [lines._seen(y[:, None], *part) for part in lines.parts])[:, 0]
+    prior = 2 * size**2 / len(t)
+    for frequency, log in zip(lines.frequencies[::7].tolist(), found[::7].tolist(), strict=True):
+        angle = 2 * math.pi * frequency * t
+        waves = torch.stack([angle.cos(), angle.sin()], dim=-1)
+        cov = torch.eye(len(t), dtype=F64) + prior * waves @ waves.T
+        expected = 0.5 * float(y @ y - y @ torch.linalg.solve(cov, y) - torch.logdet(cov))
+        assert log == pytest.approx(expected, abs=1e-8)
+    profile, removed = lines.wave(y, y, found.argmax(), torch.tensor([size]))
+    assert removed == pytest.approx(float(y.square().sum() - (y - profile).square().sum()), rel=1e-8)
+
+
+@pytest.mark.parametrize("seed", [0, 6])
+def test_no_wave_stands_in_for_a_term_where_samples_come_in_bursts(seed):
+    g = torch.Generator().manual_seed(seed)
+    t = bursts()
+    inflow = 1 + torch.sin(t / 2 + 1e-9).sign()
+    fine = torch.linspace(0, 30, 30001, dtype=F64)
+    given = torch.as_tensor(np.interp(fine, t, inflow)).tolist()
+    y, h = [4.0], 0.001
+    for u, u_next in itertools.pairwise(given):  # midpoint rule
+        half = y[-1] + h / 2 * (u - 0.2 * y[-1] - 0.01 * y[-1] ** 2)
+        y.append(y[-1] + h * ((u + u_next) / 2 - 0.2 * half - 0.01 * half**2))
+    y = torch.as_tensor(np.interp(t, fine, y)) + 0.05 * torch.randn(len(t), generator=g, dtype=F64)
+    basin = tc.ODESimulator(
+        lambda t, s, p, u: {"x": u["L"] - p["k"] * s["x"]}, {"x": "m"}, [tc.Parameter("k", low=0.0, initial=0.3)]
+    )
+    second = tc.Term(
+        "second order",
+        equation="x",
+        rate=lambda t, s, p, u: -p["q"] * s["x"] ** 2,
+        parameters=[tc.Parameter("q", low=0.0)],
+    )
+    run = tc.Run(time=t, outputs={"x": y}, inputs={"L": inflow}, initial={"x": 4.0})
+    d = tc.diagnose(basin, tc.Recording(runs=[run], noise=0.05), [second], seed=0, progress=False)
+    assert d.terms == ["second order"]

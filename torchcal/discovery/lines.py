@@ -27,6 +27,8 @@ MOST_CELLS = 16
 FOLLOWED, FEWEST, FASTEST = 0.25, 1.5, 0.98
 #: Quantisation step, in noise sd, from which on rounding makes lines of its own.
 COARSE = 1.7
+#: Squared norm of a wave that no datum shows.
+SMALL = 1e-9
 #: Simulated residuals that are transformed at a time, times cells.
 NUMBERS = 2**22
 
@@ -106,9 +108,9 @@ class Lines:
         found: list[Tensor] = []
         for block in residuals.split(max(1, NUMBERS // self.size), dim=1):
             logs = torch.full((), -math.inf, dtype=torch.float64)
-            energies = [self._energy(block, *part) for part in self.parts]
+            seen = [self._seen(block, *part) for part in self.parts]
             for size in sizes.tolist():
-                logs = torch.logaddexp(logs, self._log(size, energies))
+                logs = torch.logaddexp(logs, self._log(size, seen))
             if not found:
                 best = logs[:, 0].argmax()
             found.append(logs.logsumexp(0))
@@ -124,17 +126,18 @@ class Lines:
             sizes: That are tried.
         """
         frequency = self.frequencies[number]
-        energies = [self._energy(whitened[:, None], *part)[number, 0] for part in self.parts]
-        logs = torch.stack([self._log(size, energies) for size in sizes.tolist()])
+        seen = [tuple(each[:, number] for each in self._seen(whitened[:, None], *part)) for part in self.parts]
+        logs = torch.stack([self._log(size, seen) for size in sizes.tolist()])
         size = float(sizes[logs.argmax()])
         profile, removed = torch.zeros_like(values), 0.0
-        for (places, _), energy in zip(self.parts, energies, strict=True):
-            gain = self._gain(size, places)
+        for (places, _), (norms, squares) in zip(self.parts, seen, strict=True):
+            prior = self._variance(size)
             angle = 2 * math.pi * frequency * self.along[places]
             design = torch.stack([angle.cos(), angle.sin()], dim=-1)
-            weights = torch.linalg.lstsq(design, values[places, None]).solution
-            profile[places] = gain / (1 + gain) * (design @ weights)[:, 0]
-            removed += (1 - (1 / (1 + gain)) ** 2) * float(energy)
+            inverse = torch.linalg.inv(design.T @ design + torch.eye(2, dtype=torch.float64) / prior)
+            profile[places] = design @ (inverse @ (design.T @ values[places]))
+            left = 1 / (1 + prior * norms)
+            removed += float(((1 - left.square()) * squares / norms.clamp_min(SMALL)).sum())
         return profile, removed
 
     def sd(self, sd: Tensor) -> Tensor:
@@ -144,22 +147,31 @@ class Lines:
             found[places] = sd[places] * math.sqrt(2.0 / len(places))
         return found
 
-    def _log(self, size: float, energies: Sequence[Tensor]) -> Tensor:
-        """Log evidence of a wave of some size, by the χ² that it removes from every run."""
-        gains = [self._gain(size, places) for places, _ in self.parts]
-        terms = [0.5 * gain / (1 + gain) * energy - math.log1p(gain)
-                 for gain, energy in zip(gains, energies, strict=True)]  # fmt: skip
-        return torch.stack(terms).sum(0)
+    def _log(self, size: float, seen: Sequence[tuple[Tensor, ...]]) -> Tensor:
+        """Log evidence of a wave of some size, by what every run shows of it."""
+        prior = self._variance(size)
+        terms = [0.5 * (prior * squares / (1 + prior * norms) - torch.log1p(prior * norms)) for norms, squares in seen]
+        return torch.stack(terms).sum((0, 1))
 
-    def _gain(self, size: float, places: Tensor) -> float:
-        """Squared size of a run's part of a wave."""
-        return size**2 * len(places) / sum(len(p) for p, _ in self.parts)
+    def _variance(self, size: float) -> float:
+        """Prior variance of the amplitudes of a wave's cosine and sine."""
+        return 2 * size**2 / sum(len(places) for places, _ in self.parts)
 
-    def _energy(self, residuals: Tensor, places: Tensor, cells: Tensor) -> Tensor:
-        """χ² that a wave of each frequency removes from a run, ``(F, B)``."""
+    def _seen(self, residuals: Tensor, places: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
+        r"""Squared norms of a cosine and a sine at a run's data, ``(2, F, 1)``, and the squares of their products with
+        residuals, ``(2, F, B)``, for each frequency.
+
+        Uneven data weigh the two unlike: their phase is the one at which they are orthogonal,
+        :math:`2\psi = \arg \sum_j e^{2 i \theta_j}` (Lomb 1976, Astrophysics and Space Science 39, 447-462).
+        """
         grid = torch.zeros(self.size, residuals.shape[1], dtype=torch.float64).index_add_(0, cells, residuals[places])
         spectrum = torch.fft.rfft(grid, dim=0)[self.first : self.last]
-        return 2.0 / len(places) * (spectrum.real.square() + spectrum.imag.square())
+        twice = torch.zeros(self.size, 1, dtype=torch.float64)
+        twice.index_add_(0, 2 * cells % self.size, torch.ones(len(cells), 1, dtype=torch.float64))
+        double = torch.fft.rfft(twice, dim=0)[self.first : self.last]
+        turned = spectrum * torch.polar(torch.ones_like(double.real), -0.5 * double.angle())
+        norms = torch.stack([len(places) + double.abs(), (len(places) - double.abs()).clamp_min(0)]) / 2
+        return norms, torch.stack([turned.real.square(), turned.imag.square()])
 
 
 def lines_of(
