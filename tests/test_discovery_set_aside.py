@@ -8,6 +8,7 @@ from scipy.optimize import least_squares
 
 import torchcal as tc
 from torchcal.discovery.fitting import fit
+from torchcal.discovery.noise import _spread
 from torchcal.discovery.outliers import spikes
 from torchcal.discovery.problem import Problem
 
@@ -476,3 +477,51 @@ def test_an_outlier_at_the_end_of_an_uneven_run_is_one_beside_the_term_that_expl
     assert d.verdict == "named"
     assert d.terms == ["second order"]
     assert torch.where(d.set_aside)[0].tolist() == [40 if place == 0 else 79]
+
+
+def adsorbed(seed, datum):
+    """Langmuir's isotherm at three temperatures and pressures in a geometric row, with one wrong datum."""
+    g = torch.Generator().manual_seed(seed)
+    temperature, pressure = torch.meshgrid(
+        torch.tensor([273.0, 298.0, 323.0], dtype=F64), torch.logspace(2.3, 5.7, 16, dtype=F64), indexing="ij"
+    )
+    temperature, pressure = temperature.flatten(), pressure.flatten()
+
+    def isotherm(x, p):
+        z = p["b"] * torch.exp(p["H"] * 1e3 / 8.314 * (1 / x["T"] - 1 / 298)) * x["p"]
+        return p["qm"] * z / (1 + z)
+
+    x = {"T": temperature, "p": pressure}
+    q = isotherm(x, {"b": 2e-5, "H": 24.0, "qm": 2.4}) + 0.01 * torch.randn(48, generator=g, dtype=F64)
+    q[datum] += 0.2
+    model = tc.Simulator(
+        isotherm,
+        [
+            tc.Parameter("qm", low=0.0, initial=2.0),
+            tc.Parameter("b", low=1e-9, high=1e-2, initial=3e-5, transform="log"),
+            tc.Parameter("H", low=0.0, high=100.0, initial=20.0),
+        ],
+    )
+    henry = tc.Term(
+        "Henry part", outputs={"y": lambda x, p, y: y + p["k"] * x["p"]}, parameters=[tc.Parameter("k", low=0.0)]
+    )
+    return model, tc.Recording(x=x, y=q), [henry, *tc.terms.sensor(("y",), static=True)]
+
+
+@pytest.mark.parametrize(("seed", "datum"), [(0, 15), (0, 31), (2, 31)])
+def test_a_wrong_datum_at_the_end_of_a_geometric_row_is_no_physics(seed, datum):
+    d = tc.diagnose(*adsorbed(seed, datum), seed=0, progress=False)
+    assert d.verdict == "consistent"
+    assert d.set_aside.nonzero().flatten().tolist() == [datum]
+
+
+def test_curves_of_ranks_where_the_last_level_binds_them():
+    row = torch.logspace(0, 3, 12, dtype=F64).repeat(3)
+    assert torch.equal(_spread(row), torch.arange(12, dtype=F64).repeat(3))
+    even = torch.linspace(0, 1, 12, dtype=F64)
+    assert torch.equal(_spread(even), even)
+    measured = torch.tensor([1.0, 2.0, 3.0], dtype=F64).repeat(16)  # three settings, read with a little noise
+    measured += 1e-4 * torch.randn(48, generator=torch.Generator().manual_seed(0), dtype=F64)
+    assert torch.equal(_spread(measured), measured)
+    few = torch.tensor([1.0, 10.0, 1000.0], dtype=F64)
+    assert torch.equal(_spread(few), few)

@@ -25,8 +25,9 @@ HALVED = 7
 WRONG, EARLY = 0.1, 2
 #: Difference of χ² up to which an initial angle in another turn gives the same fit.
 SAME_FIT = 0.01
-#: Share of the data that may be outliers.
-MOST = 0.2
+#: Share of the data that may be outliers, and how often some are set aside before those that are left are looked at
+#: again.
+MOST, ROUNDS = 0.2, 5
 #: How often noise that grows is estimated from what it leaves when it is weighed.
 GROWTHS = 4
 #: Log odds from which on noise forgets with every sample and not with time.
@@ -76,7 +77,7 @@ def calibrate_base(
     found, units = _grown(found, unit)
     if not exact and not clean:
         whole = found, units
-        for _ in range(3):
+        for _ in range(ROUNDS):
             given = recording.noise if isinstance(recording.noise, Tensor) else None
             bad = spikes(found.problem, found.residual / units[found.problem.index], given)
             if not bool(bad.any()):

@@ -311,7 +311,9 @@ def _result(
     apart = unlike(search, left) if decision.verdict in ("consistent", "named") else []
     any_unlike = bool(apart)
     if decision.verdict != "consistent":
-        apart = [*held_otherwise(search), *from_samples(search), *more_than_replicates(search, left), *apart]
+        apart = [*from_samples(search), *more_than_replicates(search, left), *apart]
+    if decision.verdict in ("ambiguous", "unexplained"):
+        apart = [*held_otherwise(search), *apart]
     remaining, depends = 0.0 if decision.verdict == "consistent" else 1.0, ""
     if best is not None:
         white = best.structure is not None and best.structure.p_value >= PLAINLY_WHITE and not search.exact

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.explain import misfit_size, stated_sd
-from torchcal.discovery.given import other_hold
+from torchcal.discovery.given import evidence, other_hold
 from torchcal.discovery.instruments import no_instrument, unnatural
 from torchcal.discovery.local import force, is_window
 from torchcal.discovery.model import Model
@@ -102,7 +102,7 @@ def _no_better(search: Search, model: Model) -> str:
 def _by_hold(search: Search, model: Model) -> str:
     """Why a model may stand for a wrong guess of what inputs do between samples; empty if that is clearly less."""
     other = other_hold(search)
-    if other is None or search.gain(other.chi2) < model.log_evidence - CLEARLY:
+    if other is None or evidence(search, other) < evidence(search, model.found) + model.price - CLEARLY:
         return ""
     return (
         "Inputs that go on otherwise between samples (hold=) would do nearly as well, without anything that is missing."

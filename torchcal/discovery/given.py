@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchcal.data import Recording, Run
 from torchcal.discovery.fitting import Fitted, fit
+from torchcal.discovery.likeliest import settled
 from torchcal.discovery.residual import Residual
 from torchcal.discovery.search import Search
 from torchcal.discovery.structure import analyse
@@ -15,7 +16,7 @@ from torchcal.errors import SimulatorError
 from torchcal.simulators import Trajectories
 from torchcal.simulators.layout import initial_name
 
-__all__ = ["from_samples", "held_otherwise", "other_hold"]
+__all__ = ["evidence", "from_samples", "held_otherwise", "other_hold"]
 
 #: Probability by chance of what is left, from which on it is noise; and noise sd up to which an initial value that is
 #: found free is the one that was given.
@@ -81,9 +82,9 @@ def held_otherwise(search: Search) -> list[str]:
     found = other_hold(search)
     if found is None:
         return []
-    leader = search.physical_leader
-    gain = search.gain(found.chi2)
-    if gain < max(TOLD, AS_MUCH * leader.log_evidence if leader is not None else 0.0):
+    leader, begun = search.physical_leader, evidence(search, search.base)
+    best = 0.0 if leader is None else evidence(search, leader.found) + leader.price - begun
+    if evidence(search, found) - begun < max(TOLD, AS_MUCH * best):
         return []
     holds = {run.hold for run in found.problem.recording.runs or () if _far(run)}
     how = f"hold='{holds.pop()}'" if len(holds) == 1 else "the other hold= in each"
@@ -91,6 +92,11 @@ def held_otherwise(search: Search) -> list[str]:
     if not search.exact and _noise_alone(search, found):
         left = "the base leaves no more than noise"
     return [f"inputs change far from sample to sample: with {how} between them {left}"]
+
+
+def evidence(search: Search, found: Fitted) -> float:
+    """Log evidence of a fit, up to a constant and without its price; with its own noise where that is unknown."""
+    return settled(found, search.noise, search.tangents)[1] if search.noise.open else search.gain(found.chi2)
 
 
 def _far(run: Run) -> bool:

@@ -24,6 +24,9 @@ __all__ = [
 GRID = torch.linspace(0.0, 0.95, 39, dtype=torch.float64)
 #: Share of a sequence's degrees of freedom that smooth curves may take.
 SMOOTH_SHARE = 1.0 / 6.0
+#: Degree of the curves along one of several conditions, and how much more a level binds them than its rank would, from
+#: which on they are curves of the rank.
+CURVED, UNEVEN = 3, 1.2
 #: Weights against correlation, in log prior density: of φ, and of the share of a recording that it lasts.
 SHRINK, SLOW = 1.0, 20.0
 #: Fewest data of an output whose noise may be correlated.
@@ -125,7 +128,7 @@ def smooth_columns(problem: Problem, places: Tensor, *, ends: bool = False) -> T
         waves = torch.cos(math.pi * along[:, None] * torch.arange(count, dtype=torch.float64))
         return torch.cat([waves, along[:, None], along[:, None].square()], dim=1) if ends else waves
     x = problem.recording.x
-    columns = torch.stack([c[problem.condition_of[places]] for c in x.values()], dim=-1)  # type: ignore[union-attr]
+    columns = torch.stack([_spread(c[problem.condition_of[places]]) for c in x.values()], dim=-1)  # type: ignore[union-attr]
     columns = (columns - columns.mean(0)) / columns.std(0).clamp_min(1e-300)
     powers = [torch.ones(n, 1, dtype=torch.float64)]
     for _ in range(6):
@@ -136,6 +139,22 @@ def smooth_columns(problem: Problem, places: Tensor, *, ends: bool = False) -> T
     design = torch.cat(powers, dim=1)
     u, s, _ = torch.linalg.svd(design, full_matrices=False)
     return u[:, : min(count, int((s > 1e-9 * s[0]).sum()))]
+
+
+def _spread(column: Tensor) -> Tensor:
+    """A condition, or the ranks of its levels where a curve in these is less bound to the outermost one."""
+    levels, rank = column.unique(return_inverse=True)
+    ranks = torch.arange(len(levels), dtype=torch.float64)
+    if len(levels) <= CURVED + 1 or _bound(levels) < UNEVEN * _bound(ranks):
+        return column
+    return ranks[rank]
+
+
+def _bound(levels: Tensor) -> float:
+    """The largest leverage of a value on a curve through values at some levels."""
+    scaled = 2 * (levels - levels.min()) / (levels.max() - levels.min()) - 1
+    q, _ = torch.linalg.qr(scaled[:, None] ** torch.arange(CURVED + 1))
+    return float(q.square().sum(1).max())
 
 
 def orthonormal(columns: Tensor, *, most: int | None = None, cut: float = 1e-8) -> Tensor:

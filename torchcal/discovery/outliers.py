@@ -45,7 +45,7 @@ def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
             r = r / sd[problem.index[places]]
         if problem.order is None:
             left, scale = _robust_left(smooth_columns(problem, places), r)
-            high, far = (_high(values, sd is not None) for values in (left, left / scale))
+            high, far = (_first(_high(values, sd is not None), values) for values in (left, left / scale))
             found[places] = high & far if not _clustered(problem, places, high) else False
             continue
         at = problem.order[problem.condition_of[places]].double()
@@ -72,8 +72,7 @@ def lone(problem: Problem, residual: Tensor, sd: Tensor | None, ends: bool = Fal
             size = size.maximum(sd[problem.index[places]])
         far = (r.abs() > LONE * size) & (size > 0)
         if problem.order is None:
-            worst = far & (r.abs() >= 0.5 * r.abs().max())
-            far = worst if int(worst.sum()) == 1 else far  # it draws the fit off those around it
+            far = _first(far, r)
             found[places] = far & (not _clustered(problem, places, far))
             continue
         beside = torch.full_like(r, -math.inf)
@@ -83,6 +82,13 @@ def lone(problem: Problem, residual: Tensor, sd: Tensor | None, ends: bool = Fal
             far[[0, -1]] = False
         found[places] = far & (beside < 0.5 * r.abs())
     return found
+
+
+def _first(far: Tensor, r: Tensor) -> Tensor:
+    """Of data that are far off the one that is off twice as far as any other, as it draws the fit off those around it;
+    all of them where there is none."""
+    worst = far & (r.abs() >= 0.5 * r.abs().max())
+    return worst if int(worst.sum()) == 1 else far
 
 
 def _off_neighbours(r: Tensor) -> Tensor:
