@@ -506,6 +506,18 @@ def test_noise_that_is_given_too_large_is_a_symptom(given, told):
     assert [line.split(" is white")[0] for line in lines] == [f"the residual of {name}" for name in told]
 
 
+@pytest.mark.parametrize("given", [0.01, 0.5])
+def test_noise_that_is_given_too_large_for_a_plain_misfit_is_a_symptom(given):
+    x, generator = torch.linspace(-1, 1, 60, dtype=F64), torch.Generator().manual_seed(2)
+    base = tc.Simulator(lambda x, p: p["a"] * x, [tc.Parameter("a")])
+    y = x + 0.2 * x**2 + 0.01 * torch.randn(60, generator=generator, dtype=F64)
+    bend = tc.Term("bend", outputs={"y": lambda x, p, y: y - p["q"] * x**2}, parameters=[tc.Parameter("q")])
+    d = tc.diagnose(base, tc.Recording(x=x, y=y, noise=given), [bend], progress=False)
+    assert d.verdict == ("named" if given == 0.01 else "consistent")
+    told = [line for line in d.symptoms if "or the sd that was given is too large" in line]
+    assert [line.startswith("the fastest part of the residual is 0.0") for line in told] == [True] * (given > 0.01)
+
+
 @pytest.mark.parametrize("order", [np.arange(60), np.random.default_rng(0).permutation(60)])
 def test_slow_noise_that_a_fit_takes_up_is_not_given_too_large(order):
     rng, found = np.random.default_rng(3), 0

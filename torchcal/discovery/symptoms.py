@@ -20,6 +20,9 @@ BENT = 3.0
 #: Share of the noise sd that was given below which a white residual is told; its data, and the correlation of
 #: neighbours up to which it is white.
 SMALLER, ENOUGH, WHITE = 0.5, 20, 0.4
+#: The same of its fastest part, where it is not white: noise with the largest coefficient that is tried, 0.95, has as
+#: much of its sd there.
+FAR_SMALLER = 0.25
 #: Data of a run or sweep from which on its noise is compared with that of others; the probability by chance below which
 #: and the ratio of sd from which on they are told to be unlike.
 COMPARED, UNLIKE, RATIO = 12, 0.01, 2.0
@@ -58,7 +61,7 @@ def symptoms(search: Search, best: Model | None) -> list[str]:
 
 
 def _too_large(search: Search, found: Fitted) -> list[str]:
-    """Outputs whose noise was given much larger than what is left, where that is white: slow noise a fit takes up."""
+    """Outputs whose noise was given much larger than what is left, where that is white, or than its fastest part."""
     rows = []
     problem, outputs = found.problem, search.problem.recording.outputs
     standard = found.residual / search.noise.sd[problem.index]
@@ -70,11 +73,17 @@ def _too_large(search: Search, found: Fitted) -> list[str]:
             sum(float(standard[at[1:]] @ standard[at[:-1]]) for at in along if int(problem.output_of[at[0]]) == number)
             for along in (problem.sequences, problem.recorded)
         )
+        of = f" of {name}" if len(outputs) > 1 else ""
         if size < SMALLER and slow < WHITE * float(mine @ mine):
-            of = f" of {name}" if len(outputs) > 1 else ""
             rows.append(
                 f"the residual{of} is white and {size:.2g} times the noise sd that was given: with a smaller one, "
                 "these data would show smaller effects"
+            )
+        elif len(mine) >= ENOUGH and float(search.noise.sizes[number, 0]) < FAR_SMALLER:
+            rows.append(
+                f"the fastest part of the residual{of} is {float(search.noise.sizes[number, 0]):.2g} times the noise "
+                "sd that was given: either the noise is as slow as what may be missing, and hides it, or the sd that "
+                "was given is too large"
             )
     return rows
 

@@ -156,11 +156,12 @@ def _rmse_unit(d: Any) -> str:
 def _consistent(d: Any) -> list[str]:
     # Of what is seen with one sign alone the table tells.
     limits = [one for one in d.detection_limit if math.isfinite(one.smallest) and not one.sign]
-    nothing = "There is no sign of missing physics." + _yet(d)
+    yet = _yet(d)
+    nothing = f"There is no {'sure ' if yet else ''}sign of missing physics.{yet}"
     if d.settings.get("unlike"):
-        nothing = "There is no sign of missing physics, if the symptoms below are noise." + _yet(d)
+        nothing = "There is no sign of missing physics, if the symptoms below are noise." + yet
     elif d.p_detect < SELDOM:
-        nothing = "There is no sure sign of missing physics: by chance noise does as much now and then." + _yet(d)
+        nothing = "There is no sure sign of missing physics: by chance noise does as much now and then." + yet
     if d.p_detect < 1 - d.confidence:
         nothing = "Yet the base alone remains likelier than all that was tried beside it."
         if d.noise.source == "estimated" and max(d.noise.correlation.values(), default=0.0) >= SLOW:
@@ -368,7 +369,11 @@ def _ambiguous(d: Any) -> list[str]:
     if d.settings.get("doubt"):
         parts.append(re.sub(r"\bit ", "the best of them ", d.settings["doubt"], count=1))
     if len(known) < len(d.tied):
-        parts.append(f"Nor can they exclude something that is not in the library (probability {unknown:.2f}).")
+        if unknown >= LISTED:
+            told = f"Nor can these data exclude something that is not in the library (probability {unknown:.2f})."
+        else:
+            told = "As they have no term in common, something that is not in the library may stand behind them."
+        parts.append(told)
     elif unknown >= LISTED:
         parts.append(f"Something that is not in the library has a probability of {unknown:.2f}.")
     if d.experiment is not None:
