@@ -539,6 +539,21 @@ def test_what_acts_beside_one_of_the_tied_is_told_without_them():
     assert "beside one" not in said(finding("ambiguous", tied=tied, ranking=rows[:2]))
 
 
+@pytest.mark.parametrize(("share", "told"), [(0.2, "probability 0.20"), (0.0, "though its probability is < 0.001")])
+def test_something_unknown_that_tied_hypotheses_may_stand_for_is_told_with_its_probability(share, told):
+    tied = [["drag"], ["lag"], list(words.NONE)]
+    rows = [row(["drag"], 0.5), row(["lag"], 0.3), row(words.NONE, share)]
+    text = said(finding("ambiguous", tied=tied, ranking=rows))
+    assert f"Nor can these data exclude something that is not in the library ({told})." in text
+
+
+@pytest.mark.parametrize(("share", "sign"), [(0.5, "no sure sign"), (0.1, "no sign")])
+def test_there_is_no_sure_sign_where_a_term_is_likelier_than_the_base(share, sign):
+    text = said(finding("consistent", ranking=[row(["drag"], share), row([], 0.3)]))
+    assert f"There is {sign} of missing physics." in text
+    assert ("Yet drag is likelier" in text) == (share > 0.3)
+
+
 def test_a_term_that_frees_what_is_free_is_told():
     base = tc.Simulator(lambda x, p: p["a"] + p["k"] * x, [tc.Parameter("a"), tc.Parameter("k")])
     x = torch.linspace(0, 1, 20, dtype=F64)

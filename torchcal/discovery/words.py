@@ -369,11 +369,10 @@ def _ambiguous(d: Any) -> list[str]:
     if d.settings.get("doubt"):
         parts.append(re.sub(r"\bit ", "the best of them ", d.settings["doubt"], count=1))
     if len(known) < len(d.tied):
-        if unknown >= LISTED:
-            told = f"Nor can these data exclude something that is not in the library (probability {unknown:.2f})."
-        else:
-            told = "As they have no term in common, something that is not in the library may stand behind them."
-        parts.append(told)
+        share = f"probability {unknown:.2f}"
+        if unknown < LISTED:
+            share = f"though its probability is {_probability(unknown)}"
+        parts.append(f"Nor can these data exclude something that is not in the library ({share}).")
     elif unknown >= LISTED:
         parts.append(f"Something that is not in the library has a probability of {unknown:.2f}.")
     if d.experiment is not None:
