@@ -7,8 +7,8 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 import torchcal as tc
+from torchcal.discovery.curves import MOST_CURVES, smooth_columns, spread
 from torchcal.discovery.fitting import fit
-from torchcal.discovery.noise import _spread
 from torchcal.discovery.outliers import spikes
 from torchcal.discovery.problem import Problem
 
@@ -517,11 +517,18 @@ def test_a_wrong_datum_at_the_end_of_a_geometric_row_is_no_physics(seed, datum):
 
 def test_curves_of_ranks_where_the_last_level_binds_them():
     row = torch.logspace(0, 3, 12, dtype=F64).repeat(3)
-    assert torch.equal(_spread(row), torch.arange(12, dtype=F64).repeat(3))
+    assert torch.equal(spread(row), torch.arange(12, dtype=F64).repeat(3))
     even = torch.linspace(0, 1, 12, dtype=F64)
-    assert torch.equal(_spread(even), even)
+    assert torch.equal(spread(even), even)
     measured = torch.tensor([1.0, 2.0, 3.0], dtype=F64).repeat(16)  # three settings, read with a little noise
     measured += 1e-4 * torch.randn(48, generator=torch.Generator().manual_seed(0), dtype=F64)
-    assert torch.equal(_spread(measured), measured)
+    assert torch.equal(spread(measured), measured)
     few = torch.tensor([1.0, 10.0, 1000.0], dtype=F64)
-    assert torch.equal(_spread(few), few)
+    assert torch.equal(spread(few), few)
+
+
+def test_long_sequences_have_no_more_curves_than_can_be_taken_away():
+    x = torch.linspace(0, 1, 6000, dtype=F64)
+    problem = Problem.of(tc.Simulator(lambda x, p: p["a"] * x, [tc.Parameter("a")]), tc.Recording(x=x, y=x))
+    assert smooth_columns(problem, torch.arange(6000)).shape == (6000, MOST_CURVES)
+    assert smooth_columns(problem, torch.arange(600)).shape == (600, 100)

@@ -13,8 +13,9 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.channels import channels
+from torchcal.discovery.curves import orthonormal
 from torchcal.discovery.fitting import Fitted, refit, weighed
-from torchcal.discovery.noise import GRID, LEAST, Noise, estimate, least, log_prior, mine, orthonormal
+from torchcal.discovery.noise import GRID, LEAST, Noise, estimate, least, log_prior, mine
 from torchcal.discovery.problem import Problem, Whitening
 from torchcal.discovery.residual import Residual
 from torchcal.discovery.structure import evidences, responses_of

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchcal.discovery.noise import smooth_columns
+from torchcal.discovery.curves import smooth_columns
 from torchcal.discovery.problem import Problem
 
 __all__ = ["lone", "spikes"]

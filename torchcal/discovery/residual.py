@@ -6,8 +6,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from torchcal.discovery.curves import orthonormal
 from torchcal.discovery.fitting import Fitted
-from torchcal.discovery.noise import GRID, Noise, orthonormal
+from torchcal.discovery.noise import GRID, Noise
 from torchcal.discovery.problem import remembered
 
 __all__ = ["Residual"]
