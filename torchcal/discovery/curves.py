@@ -11,15 +11,16 @@ __all__ = ["beyond", "orthonormal", "smooth_columns", "spread"]
 
 #: Share of a sequence's degrees of freedom that smooth curves may take, and how many they are at most.
 SMOOTH_SHARE, MOST_CURVES = 1.0 / 6.0, 256
-#: Degree of the curves along one of several conditions, and how much more a level binds them than its rank would, from
-#: which on they are curves of the rank.
-CURVED, UNEVEN = 3, 1.2
+#: Levels of a condition up to which they are no row; the ratio of the last to the first from which on a geometric one is
+#: uneven; and how much unlike its steps may be in logarithms: those of 1, 2, 5, 10 are.
+CURVED, WIDE, EVENLY = 4, 10.0, 1.5
 
 
-def smooth_columns(problem: Problem, places: Tensor, *, ends: bool = False) -> Tensor:
+def smooth_columns(problem: Problem, places: Tensor, *, ends: bool = False, ranks: bool = False) -> Tensor:
     """Smooth curves over one sequence, ``(len(places), m)``, m about a sixth of its length and 256 at most.
 
-    Cosines are flat at both ends; with ``ends`` come two powers that are not.
+    Cosines are flat at both ends; with ``ends`` come two powers that are not. With ``ranks`` geometric rows of one of
+    several conditions count as even: no curve is bound to the last of them, but not all that is smooth is smooth then.
     """
     n = len(places)
     count = min(int(n * SMOOTH_SHARE), MOST_CURVES)
@@ -33,7 +34,8 @@ def smooth_columns(problem: Problem, places: Tensor, *, ends: bool = False) -> T
         waves = torch.cos(math.pi * along[:, None] * torch.arange(count, dtype=torch.float64))
         return torch.cat([waves, along[:, None], along[:, None].square()], dim=1) if ends else waves
     x = problem.recording.x
-    columns = torch.stack([spread(c[problem.condition_of[places]]) for c in x.values()], dim=-1)  # type: ignore[union-attr]
+    given = [column[problem.condition_of[places]] for column in x.values()]  # type: ignore[union-attr]
+    columns = torch.stack([spread(column) if ranks else column for column in given], dim=-1)
     columns = (columns - columns.mean(0)) / columns.std(0).clamp_min(1e-300)
     powers = [torch.ones(n, 1, dtype=torch.float64)]
     for _ in range(6):
@@ -47,19 +49,12 @@ def smooth_columns(problem: Problem, places: Tensor, *, ends: bool = False) -> T
 
 
 def spread(column: Tensor) -> Tensor:
-    """A condition, or the ranks of its levels where a curve in these is less bound to the outermost one."""
+    """A condition, or the ranks of its levels where these are in a geometric row, whose last ones bind any curve."""
     levels, rank = column.unique(return_inverse=True)
-    ranks = torch.arange(len(levels), dtype=torch.float64)
-    if len(levels) <= CURVED + 1 or _bound(levels) < UNEVEN * _bound(ranks):
+    if len(levels) <= CURVED or not float(levels[0]) > 0 or float(levels[-1]) < WIDE * float(levels[0]):
         return column
-    return ranks[rank]
-
-
-def _bound(levels: Tensor) -> float:
-    """The largest leverage of a value on a curve through values at some levels."""
-    scaled = 2 * (levels - levels.min()) / (levels.max() - levels.min()) - 1
-    q, _ = torch.linalg.qr(scaled[:, None] ** torch.arange(CURVED + 1))
-    return float(q.square().sum(1).max())
+    steps = levels.double().log().diff()
+    return rank.double() if float(steps.max()) < EVENLY * float(steps.min()) else column
 
 
 def beyond(problem: Problem, places: Tensor, design: Tensor, unit: Tensor, *, ends: bool = False) -> Tensor:

@@ -44,9 +44,9 @@ def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
         if sd is not None:
             r = r / sd[problem.index[places]]
         if problem.order is None:
-            left, scale = _robust_left(smooth_columns(problem, places), r)
-            high, far = (_first(_high(values, sd is not None), values) for values in (left, left / scale))
-            found[places] = high & far if not _clustered(problem, places, high) else False
+            left, scale = _robust_left(smooth_columns(problem, places, ranks=True), r)
+            high, far = (_high(values, sd is not None) for values in (left, left / scale))
+            found[places] = _first(high & far, left / scale) if not _clustered(problem, places, high) else False
             continue
         at = problem.order[problem.condition_of[places]].double()
         # A curve leaves its neighbours' range nowhere, but bends everywhere.
@@ -87,7 +87,7 @@ def lone(problem: Problem, residual: Tensor, sd: Tensor | None, ends: bool = Fal
 def _first(far: Tensor, r: Tensor) -> Tensor:
     """Of data that are far off the one that is off twice as far as any other, as it draws the fit off those around it;
     all of them where there is none."""
-    worst = far & (r.abs() >= 0.5 * r.abs().max())
+    worst = far & (r.abs() >= 0.5 * r[far].abs().max()) if bool(far.any()) else far
     return worst if int(worst.sum()) == 1 else far
 
 
