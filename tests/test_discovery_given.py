@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import torchcal as tc
+from torchcal.discovery import given
 
 N, STEP = 150, 0.1
 A, GAIN = 1.5, 2.0
@@ -66,7 +67,42 @@ def test_a_wrong_guess_between_samples_is_no_dead_time(seed):
     assert d.verdict == "ambiguous"
     assert ["none of these"] in d.tied
     assert "(hold=) would do nearly as well" in str(d).replace("\n", " ")
-    assert any("with hold='zero' between them the base leaves no more than noise" in row for row in d.symptoms)
+    assert any("with hold='zero' the base leaves no more than noise" in row for row in d.symptoms)
+
+
+def test_no_tie_of_names_alone_for_a_wrong_guess():
+    filtered = tc.Term(
+        "filter",
+        outputs={"w": lambda t, s, p, u, y: y - p["tau"] * (p["a"] * (p["g"] * u["c"] - s["w"]) + 0.001 * s["w"])},
+        parameters=[tc.Parameter("tau", unit="s", low=0.0)],
+    )
+    d = tc.diagnose(motor(), recording(0, "linear"), [candidates()[0], filtered], seed=0, progress=False)
+    assert d.verdict in ("ambiguous", "unexplained")
+    assert d.verdict == "unexplained" or ["none of these"] in d.tied
+
+
+def test_a_wrong_guess_adds_no_name_to_a_right_one():
+    d = tc.diagnose(motor(), recording(0, "linear", friction=0.3), candidates(), seed=0, progress=False)
+    assert "dead time" not in d.terms
+    assert any("inputs change far" in row and "hold='zero'" in row for row in d.symptoms) or "hold=" in str(d)
+
+
+def test_a_wrong_guess_in_one_of_two_runs_is_told_of_that_run():
+    right, wrong = recording(0, "zero"), recording(1, "linear")
+    both = tc.Recording(runs=[right.runs[0], wrong.runs[0]], noise=0.02)
+    d = tc.diagnose(motor(), both, candidates(), seed=0, progress=False)
+    assert d.verdict in ("ambiguous", "unexplained")
+    assert any("with hold='zero' in run 2 the base leaves no more than noise" in row for row in d.symptoms)
+
+
+def test_what_is_held_and_stays_is_no_ramp():
+    assert not given._far(recording(0, "zero").runs[0])
+    assert given._far(recording(0, "linear").runs[0])
+    run = recording(0, "zero").runs[0]
+    rough = torch.randn(N, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert given._far(tc.Run(time=run.time, outputs=run.outputs, inputs={"c": rough}, hold="zero"))
+    assert not given._far(tc.Run(time=run.time, outputs=run.outputs, inputs={"c": rough}, hold="cubic"))
+    assert not given._far(tc.Run(time=run.time, outputs=run.outputs, inputs={"c": 0 * rough + 1}))
 
 
 def test_the_right_guess_leaves_nothing():
@@ -82,8 +118,6 @@ def test_what_no_other_guess_explains_is_named():
 
 
 def test_smooth_inputs_are_taken_as_they_are(monkeypatch):
-    from torchcal.discovery import given
-
     smooth = recording(0, "linear")
     run = smooth.runs[0]
     inputs = {"c": torch.sin(0.5 * run.time)}

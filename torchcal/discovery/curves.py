@@ -11,8 +11,8 @@ __all__ = ["beyond", "orthonormal", "smooth_columns", "spread"]
 
 #: Share of a sequence's degrees of freedom that smooth curves may take, and how many they are at most.
 SMOOTH_SHARE, MOST_CURVES = 1.0 / 6.0, 256
-#: Levels of a condition up to which they are no row; the ratio of the last to the first from which on a geometric one is
-#: uneven; and how much unlike its steps may be in logarithms: those of 1, 2, 5, 10 are.
+#: Levels of a condition up to which they are no row; the ratio of the last to the first from which on a geometric one
+#: is uneven; and how much unlike its steps may be in logarithms, as those of 1, 2, 5, 10 are.
 CURVED, WIDE, EVENLY = 4, 10.0, 1.5
 
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.explain import misfit_size, stated_sd
-from torchcal.discovery.given import evidence, other_hold
+from torchcal.discovery.given import as_good
 from torchcal.discovery.instruments import no_instrument, unnatural
 from torchcal.discovery.local import force, is_window
 from torchcal.discovery.model import Model
@@ -18,7 +18,7 @@ from torchcal.errors import TorchcalError
 from torchcal.simulators import Trajectories
 from torchcal.terms import Term
 
-__all__ = ["distinct", "doubt", "left_open", "unfit"]
+__all__ = ["by_hold", "distinct", "doubt", "left_open", "unfit"]
 
 #: Correlation from sample to sample from which on noise of unknown size may be physics that a term has left.
 SLOWEST = 0.85
@@ -48,7 +48,7 @@ UNSEEN = 1e-7
 
 def doubt(search: Search, model: Model) -> str:
     """Why a model is no name, however probable, in a sentence; empty if it may be one."""
-    found = _no_better(search, model) or unfit(search, model) or _by_hold(search, model)
+    found = _no_better(search, model) or unfit(search, model) or by_hold(search, model)
     return found or ("" if search.exact else _noise_or_physics(search, model))
 
 
@@ -99,14 +99,12 @@ def _no_better(search: Search, model: Model) -> str:
     return f"{what} would do nearly as well: the term's own shape is not seen yet."
 
 
-def _by_hold(search: Search, model: Model) -> str:
+def by_hold(search: Search, model: Model) -> str:
     """Why a model may stand for a wrong guess of what inputs do between samples; empty if that is clearly less."""
-    other = other_hold(search)
-    if other is None or evidence(search, other) < evidence(search, model.found) + model.price - CLEARLY:
+    if not as_good(search, model):
         return ""
-    return (
-        "Inputs that go on otherwise between samples (hold=) would do nearly as well, without anything that is missing."
-    )
+    less = "without it" if len(model.names) == 1 else "without all or a part of it"
+    return f"Inputs that go on otherwise between samples (hold=) would do nearly as well {less}."
 
 
 def _no_threshold(model: Model) -> str:

@@ -1,7 +1,7 @@
 """What was given beside the outputs: initial values, and how inputs go on between samples."""
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -9,14 +9,15 @@ from torch import Tensor
 from torchcal.data import Recording, Run
 from torchcal.discovery.fitting import Fitted, fit
 from torchcal.discovery.likeliest import settled
+from torchcal.discovery.model import Model
 from torchcal.discovery.residual import Residual
 from torchcal.discovery.search import Search
 from torchcal.discovery.structure import analyse
-from torchcal.errors import SimulatorError
+from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators import Trajectories
 from torchcal.simulators.layout import initial_name
 
-__all__ = ["evidence", "from_samples", "held_otherwise", "other_hold"]
+__all__ = ["as_good", "from_samples", "held_otherwise"]
 
 #: Probability by chance of what is left, from which on it is noise; and noise sd up to which an initial value that is
 #: found free is the one that was given.
@@ -25,8 +26,11 @@ NOISE, CONFIRMED = 0.05, 0.2
 FAR = 0.5
 #: How inputs may go on that go on in a way that can be mistaken for it.
 MISTAKEN = {"linear": "zero", "zero": "linear"}
-#: Log evidence, and share of that of the best model, from which on another hold is told of.
-TOLD, AS_MUCH = 10.0, 0.5
+#: Share of its samples that repeat the one before, above which an input that is held stays at its values by nature.
+STAYS = 0.5
+#: Log evidence, and share of that of the best model, from which on another hold is told of; and log odds below which a
+#: model is not clearly better than it.
+TOLD, AS_MUCH, CLEARLY = 10.0, 0.5, 3.0
 
 
 def from_samples(search: Search) -> list[str]:
@@ -46,7 +50,9 @@ def from_samples(search: Search) -> list[str]:
     }  # fmt: skip
     if not taken:
         return []
-    found = _refitted(search, recording.without_initial(shown), {full: value for full, (_, _, value) in taken.items()})
+    found = _refitted(
+        search, base, recording.without_initial(shown), {full: value for full, (_, _, value) in taken.items()}
+    )
     if found is None or not _noise_alone(search, found):
         return []
     sd = recording.split(search.noise.sd)
@@ -63,35 +69,58 @@ def from_samples(search: Search) -> list[str]:
     ]
 
 
-def other_hold(search: Search) -> Fitted | None:
-    """The base with inputs that change far between samples held the other way there, refitted; None where none do.
+def other_hold(search: Search, part: Fitted) -> Fitted | None:
+    """A fit with inputs that change far between samples held the other way there; None where none do.
 
-    Its evidence is the base's own: it has no parameter more. Computed once for a base.
+    In all of such runs, or in those alone that it suits. It has no parameter more. Computed once for a fit.
     """
-    base, recording = search.base, search.problem.recording
-    if id(base) not in search.otherwise:  # the base is kept beside it, so that its id stays its own
-        changed = [MISTAKEN[run.hold] if _far(run) else run.hold for run in recording.runs or ()]
-        known = search.stop.is_set() or changed == [run.hold for run in recording.runs or ()]
-        found = None if known else _refitted(search, recording.with_hold(changed), {})
-        search.otherwise[id(base)] = base, found
-    return search.otherwise[id(base)][1]
+    recording = search.problem.recording
+    if id(part) not in search.otherwise:  # the fit is kept beside it, so that its id stays its own
+        runs = recording.runs or ()
+        far = [_far(run) for run in runs]
+        found = _held(search, part, far) if any(far) and not search.stop.is_set() else None
+        if found is not None and sum(far) > 1:
+            worse = _by_run(found) > _by_run(part)
+            suited = [wrong and not bool(worse[r]) for r, wrong in enumerate(far)]
+            some = _held(search, part, suited) if any(suited) and suited != far else None
+            found = min((one for one in (found, some) if one is not None), key=lambda one: one.chi2)
+        search.otherwise[id(part)] = part, found
+    return search.otherwise[id(part)][1]
+
+
+def as_good(search: Search, model: Model) -> bool:
+    """Whether the base, or one with fewer of a model's terms, does nearly as well with inputs held the other way."""
+    best = evidence(search, model.found) + model.price - CLEARLY
+    fewer = [m for m in search.models if m.window is None and set(m.numbers) < set(model.numbers)]
+    for part, price in ((search.base, 0.0), *((m.found, m.price) for m in fewer)):
+        other = other_hold(search, part)
+        if other is None:
+            continue
+        value = evidence(search, other)
+        if value + price > best and value > evidence(search, part) + CLEARLY:
+            return True
+    return False
 
 
 def held_otherwise(search: Search) -> list[str]:
     """How much better the base is with inputs held the other way between samples, in words."""
-    found = other_hold(search)
+    found = other_hold(search, search.base)
     if found is None:
         return []
     leader, begun = search.physical_leader, evidence(search, search.base)
     best = 0.0 if leader is None else evidence(search, leader.found) + leader.price - begun
     if evidence(search, found) - begun < max(TOLD, AS_MUCH * best):
         return []
-    holds = {run.hold for run in found.problem.recording.runs or () if _far(run)}
-    how = f"hold='{holds.pop()}'" if len(holds) == 1 else "the other hold= in each"
+    pairs = list(zip(search.problem.recording.runs or (), found.problem.recording.runs or (), strict=True))
+    changed = [(r, new.hold) for r, (old, new) in enumerate(pairs) if new.hold != old.hold]
+    holds = {hold for _, hold in changed}
+    how = f"hold='{holds.pop()}'" if len(holds) == 1 else "the other hold="
+    if len(changed) < len(pairs):
+        how += f" in run{'s' if len(changed) > 1 else ''} {', '.join(str(r + 1) for r, _ in changed)}"
     left = f"the base's RMSE is {_rmse(found):.4g} in place of {_rmse(search.base):.4g}"
     if not search.exact and _noise_alone(search, found):
         left = "the base leaves no more than noise"
-    return [f"inputs change far from sample to sample: with {how} between them {left}"]
+    return [f"inputs change far between some of their samples: with {how} {left}"]
 
 
 def evidence(search: Search, found: Fitted) -> float:
@@ -100,28 +129,42 @@ def evidence(search: Search, found: Fitted) -> float:
 
 
 def _far(run: Run) -> bool:
-    """Whether an input changes so far between samples that it matters how it goes on there."""
-    return run.hold in MISTAKEN and any(
-        float(values.diff().abs().max()) > FAR * float(values.std()) > 0 for values in run.inputs.values()
-    )
+    """Whether an input changes so far between samples that it matters how it goes on there; what is held and stays at
+    its values is."""
+    far = any(float(u.diff().abs().max()) > FAR * float(u.std()) > 0 for u in run.inputs.values())
+    steps = run.hold == "zero" and all(float((u.diff() == 0).double().mean()) > STAYS for u in run.inputs.values())
+    return run.hold in MISTAKEN and far and not steps
 
 
-def _refitted(search: Search, twin: Recording, freed: Mapping[str, float]) -> Fitted | None:
-    """The base fitted to another recording of the same data, with values free that were given; None if it cannot be."""
-    base, bound = search.base, search.base.problem.simulator
+def _by_run(found: Fitted) -> Tensor:
+    """What every run adds to χ²."""
+    problem = found.problem
+    square = found.whitening.vector(found.residual).square()
+    runs = problem.recording.x["run"][problem.condition_of].long()  # type: ignore[index]
+    return torch.zeros(len(problem.recording.runs or ()), dtype=torch.float64).index_add_(0, runs, square)
+
+
+def _held(search: Search, part: Fitted, which: Sequence[bool]) -> Fitted | None:
+    """A fit with the inputs of some runs held the other way."""
+    runs = search.problem.recording.runs or ()
+    holds = [MISTAKEN[run.hold] if other else run.hold for run, other in zip(runs, which, strict=True)]
+    return _refitted(search, part, search.problem.recording.with_hold(holds), {})
+
+
+def _refitted(search: Search, part: Fitted, twin: Recording, freed: Mapping[str, float]) -> Fitted | None:
+    """A fit to another recording of the same data, with values free that were given; None if there is none."""
+    bound = part.problem.simulator
     if not isinstance(bound, Trajectories):
         return None
-    known = base.by_name | dict(freed)
-    names = {base.problem.parameters[i].name for i in base.free} | set(freed)
+    known = part.by_name | dict(freed)
+    names = {part.problem.parameters[i].name for i in part.free} | set(freed)
     try:
-        again = Trajectories(
-            bound.ode, twin, subdivide=bound.subdivide, denser=bound.denser, implicit=bound.implicit
-        )  # fmt: skip
-        problem = dataclasses.replace(base.problem, recording=twin, simulator=again)
+        again = Trajectories(bound.ode, twin, subdivide=bound.subdivide, denser=bound.denser, implicit=bound.implicit)
+        problem = dataclasses.replace(part.problem, recording=twin, simulator=again)
         begin: Tensor = torch.tensor([[known[q.name] for q in problem.parameters]], dtype=torch.float64)
         free = [i for i, q in enumerate(problem.parameters) if q.name in names]
         return fit(problem, search.noise.whitening(problem), begin, free)
-    except SimulatorError:
+    except (SimulatorError, DomainError):
         return None
 
 

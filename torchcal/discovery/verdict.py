@@ -7,7 +7,7 @@ from torch import Tensor
 
 from torchcal.discovery.by_share import decide_exact, nearly
 from torchcal.discovery.decision import Decision, certain, groups_of, other_names, tie_other_names, weigh
-from torchcal.discovery.doubts import doubt, unfit
+from torchcal.discovery.doubts import by_hold, doubt, unfit
 from torchcal.discovery.instruments import only_instruments
 from torchcal.discovery.model import PRIOR, Model
 from torchcal.discovery.own_noise import weigh_alone
@@ -172,7 +172,8 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     # One alone is not sure enough, or it had been named; and where several do what something unknown there would do.
     rival = any(m.weight > best.weight - BEHIND for m in search.nameless)
     local = rival and all(model.window is not None for model in decision.tied_models)
-    decision.doubt = unfit(search, decision.tied_models[0] if decision.tied_models else best)
+    told = decision.tied_models[0] if decision.tied_models else best
+    decision.doubt = unfit(search, told) or by_hold(search, told)
     # Windows, instruments and several terms, of which they share none, bend to what no term of the list explains.
     shared = set(best.names).intersection(*(m.names for m in decision.tied_models))
     pliant = all(
