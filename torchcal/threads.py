@@ -20,16 +20,17 @@ def few_threads(numbers: int = 0) -> Iterator[None]:
 
     With less to do than `SHARED` threads wait longer for each other than they compute. On two cores, one of them busy
     with something else, a singular value decomposition of 200 x 4 numbers takes two threads a hundred times as long as
-    one, and a diagnosis thirty times. Also a decorator, and one within another, which may have more to do.
+    one, and a diagnosis thirty times. Also a decorator, and one within another, which may have more to do. A Python
+    thread that first uses torch meanwhile begins with the number it finds, as torch has it.
     """
     now = torch.get_num_threads()
     outermost = not hasattr(_GIVEN, "count")
-    if outermost:
-        _GIVEN.count = now
-    torch.set_num_threads(_GIVEN.count if numbers >= SHARED else 1)
     try:
+        if outermost:
+            _GIVEN.count = now
+        torch.set_num_threads(_GIVEN.count if numbers >= SHARED else 1)
         yield
     finally:
         torch.set_num_threads(now)
         if outermost:
-            del _GIVEN.count
+            _GIVEN.__dict__.pop("count", None)

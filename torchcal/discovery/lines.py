@@ -141,7 +141,8 @@ class Lines:
         return profile, removed
 
     def sd(self, sd: Tensor) -> Tensor:
-        """Of a wave at every datum ``(n,)``, for noise of some sd ``(n,)``; infinite where none is sought."""
+        """Of a wave at every datum ``(n,)``, r.m.s. over a run's data, for noise of some sd ``(n,)``; infinite where none
+        is sought."""
         found = torch.full_like(sd, math.inf)
         for places, _ in self.parts:
             found[places] = sd[places] * math.sqrt(2.0 / len(places))
@@ -164,14 +165,16 @@ class Lines:
         Uneven data weigh the two unlike: their phase is the one at which they are orthogonal,
         :math:`2\psi = \arg \sum_j e^{2 i \theta_j}` (Lomb 1976, Astrophysics and Space Science 39, 447-462).
         """
-        grid = torch.zeros(self.size, residuals.shape[1], dtype=torch.float64).index_add_(0, cells, residuals[places])
-        spectrum = torch.fft.rfft(grid, dim=0)[self.first : self.last]
-        twice = torch.zeros(self.size, 1, dtype=torch.float64)
-        twice.index_add_(0, 2 * cells % self.size, torch.ones(len(cells), 1, dtype=torch.float64))
-        double = torch.fft.rfft(twice, dim=0)[self.first : self.last]
+        spectrum = self._transformed(cells, residuals[places])
+        double = self._transformed(2 * cells, torch.ones(len(cells), 1, dtype=torch.float64))
         turned = spectrum * torch.polar(torch.ones_like(double.real), -0.5 * double.angle())
         norms = torch.stack([len(places) + double.abs(), (len(places) - double.abs()).clamp_min(0)]) / 2
         return norms, torch.stack([turned.real.square(), turned.imag.square()])
+
+    def _transformed(self, cells: Tensor, values: Tensor) -> Tensor:
+        r"""Sums of values times :math:`e^{-i \theta}` at their cells, ``(F, B)``."""
+        grid = torch.zeros(self.size, values.shape[1], dtype=torch.float64).index_add_(0, cells, values)
+        return torch.fft.rfft(grid, dim=0)[self.first : self.last]
 
 
 def lines_of(

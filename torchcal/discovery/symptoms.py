@@ -20,9 +20,9 @@ BENT = 3.0
 #: Share of the noise sd that was given below which a white residual is told; its data, and the correlation of
 #: neighbours up to which it is white.
 SMALLER, ENOUGH, WHITE = 0.5, 20, 0.4
-#: The same of its fastest part, where it is not white: noise with the largest coefficient that is tried, 0.95, has as
-#: much of its sd there.
-FAR_SMALLER = 0.25
+#: The same of its fastest part, where it is not white: noise with the largest coefficient that is tried, 0.95, has a
+#: quarter of its sd there, give or take a chance.
+FAR_SMALLER = 0.15
 #: Data of a run or sweep from which on its noise is compared with that of others; the probability by chance below which
 #: and the ratio of sd from which on they are told to be unlike.
 COMPARED, UNLIKE, RATIO = 12, 0.01, 2.0
@@ -61,7 +61,7 @@ def symptoms(search: Search, best: Model | None) -> list[str]:
 
 
 def _too_large(search: Search, found: Fitted) -> list[str]:
-    """Outputs whose noise was given much larger than what is left, where that is white, or than its fastest part."""
+    """Outputs whose noise was given much larger than what is left, if that is white, or else than its fastest part."""
     rows = []
     problem, outputs = found.problem, search.problem.recording.outputs
     standard = found.residual / search.noise.sd[problem.index]

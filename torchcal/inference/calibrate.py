@@ -90,8 +90,8 @@ def calibrate(
         target_ess: Draw until the effective sample size of every α, bulk and tail, is at least this and every R-hat
             below 1.01.
         order: Degree of the output expansion; None for the full variance, 1 as in the paper's case studies.
-        rule: Quadrature, see `torchcal.NISP`; by default found by itself. What is asked for is kept to: a
-            `PropagationWarning` says where it is not enough.
+        rule: Quadrature, see `torchcal.NISP`; by default found by itself. What is asked for is kept to, in predictions
+            too: a `PropagationWarning` says where it is not enough.
         starts: Starting points of the optimiser ``(S, P)`` in scaled coordinates; by default made.
         num_starts: How many are made.
         seed: Of every random number; the global state is left as it was.
