@@ -515,7 +515,7 @@ def test_a_wrong_datum_at_the_end_of_a_geometric_row_is_no_physics(seed, datum):
     assert d.set_aside.nonzero().flatten().tolist() == [datum]
 
 
-def test_curves_of_ranks_where_the_last_level_binds_them():
+def test_curves_of_ranks_where_the_last_level_of_a_geometric_row_binds_them():
     row = torch.logspace(0, 3, 12, dtype=F64).repeat(3)
     assert torch.equal(spread(row), torch.arange(12, dtype=F64).repeat(3))
     even = torch.linspace(0, 1, 12, dtype=F64)
@@ -525,6 +525,8 @@ def test_curves_of_ranks_where_the_last_level_binds_them():
     assert torch.equal(spread(measured), measured)
     few = torch.tensor([1.0, 10.0, 100.0], dtype=F64)
     assert torch.equal(spread(few), few)
+    for drawn in (torch.randn(45, generator=torch.Generator().manual_seed(1), dtype=F64).exp(), 1.05 ** row[:12].log()):
+        assert torch.equal(spread(drawn), drawn)
 
 
 def test_long_sequences_have_no_more_curves_than_can_be_taken_away():
