@@ -141,8 +141,7 @@ class Lines:
         return profile, removed
 
     def sd(self, sd: Tensor) -> Tensor:
-        """Of a wave at every datum ``(n,)``, r.m.s. over a run's data, for noise of some sd ``(n,)``; infinite where none
-        is sought."""
+        """Of a wave at every datum ``(n,)``, r.m.s. over its run, for noise of some sd ``(n,)``; infinite where none is."""
         found = torch.full_like(sd, math.inf)
         for places, _ in self.parts:
             found[places] = sd[places] * math.sqrt(2.0 / len(places))
