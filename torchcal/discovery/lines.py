@@ -141,7 +141,10 @@ class Lines:
         return profile, removed
 
     def sd(self, sd: Tensor) -> Tensor:
-        """Of a wave at every datum ``(n,)``, r.m.s. over its run, for noise of some sd ``(n,)``; infinite where none is."""
+        """Of a wave at every datum ``(n,)``, r.m.s. over its run, for noise of some sd ``(n,)``.
+
+        Infinite where none is sought.
+        """
         found = torch.full_like(sd, math.inf)
         for places, _ in self.parts:
             found[places] = sd[places] * math.sqrt(2.0 / len(places))
