@@ -13,7 +13,7 @@ __all__ = ["beyond", "orthonormal", "smooth_columns", "spread"]
 SMOOTH_SHARE, MOST_CURVES = 1.0 / 6.0, 256
 #: Levels of a condition up to which they are no row; the ratio of the last to the first from which on a geometric one
 #: is uneven; and how much unlike its steps may be in logarithms, as those of 1, 2, 5, 10 are.
-CURVED, WIDE, EVENLY = 4, 10.0, 1.5
+FEW, WIDE, EVENLY = 4, 10.0, 1.5
 
 
 def smooth_columns(problem: Problem, places: Tensor, *, ends: bool = False, ranks: bool = False) -> Tensor:
@@ -51,7 +51,7 @@ def smooth_columns(problem: Problem, places: Tensor, *, ends: bool = False, rank
 def spread(column: Tensor) -> Tensor:
     """A condition, or the ranks of its levels where these are in a geometric row, whose last ones bind any curve."""
     levels, rank = column.unique(return_inverse=True)
-    if len(levels) <= CURVED or not float(levels[0]) > 0 or float(levels[-1]) < WIDE * float(levels[0]):
+    if len(levels) <= FEW or not float(levels[0]) > 0 or float(levels[-1]) < WIDE * float(levels[0]):
         return column
     steps = levels.double().log().diff()
     return rank.double() if float(steps.max()) < EVENLY * float(steps.min()) else column
