@@ -344,6 +344,7 @@ def test_where_many_terms_do_the_same_in_a_window_none_of_them_may_be_there():
     assert not d.terms
 
 
+@pytest.mark.slow
 def test_a_local_term_whose_shape_shows_is_named_all_the_same():
     """Drag from a speed of 0.4 on: neither a constant force there nor more damping would do, nor one that grows."""
     recording = recorded(lambda t, x, v: -abs(v) * v / (1 + math.exp(-(v - 0.4) / 0.005)))
@@ -426,6 +427,7 @@ def test_a_bend_that_is_in_no_list_is_no_window_of_a_curved_term(seed):
     assert d.verdict == "unexplained" or ["none of these"] in d.tied
 
 
+@pytest.mark.slow
 def test_a_window_that_leaves_something_is_not_the_best_one():
     """A spring that stiffens between two ends: another term that begins in the middle was named in its place."""
     recording = recorded(lambda t, x, v: -2.0 * x**3 if -0.75 < x < 0.5 else 0.0, n=240)

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 import torchcal as tc
+from torchcal import threads
 from torchcal.threads import SHARED, few_threads
 
 X = torch.linspace(0, 1, 12, dtype=torch.float64)
@@ -71,7 +72,8 @@ def test_the_functions_that_compute_for_long_take_one(run):
     assert torch.get_num_threads() == 3
 
 
-def test_a_large_calibration_keeps_the_threads():
+def test_a_large_calibration_keeps_the_threads(monkeypatch):
+    monkeypatch.setattr(threads, "SHARED", 8 * 100)  # of as many outputs as starts, nodes and data make
     seen = set()
 
     def curve(x, p):
@@ -79,8 +81,8 @@ def test_a_large_calibration_keeps_the_threads():
         return torch.exp(p["a"] * x)
 
     simulator = tc.Simulator(curve, [tc.Parameter("a", low=0.0, high=2.0)])
-    x = torch.linspace(0, 1, 1000, dtype=torch.float64)
+    x = torch.linspace(0, 1, 100, dtype=torch.float64)
     recording = tc.Recording(x=x, y=torch.exp(x) + 0.1 * x**2)
-    starts = torch.tensor([[0.0, 0.1]]).double().repeat(SHARED // 2000 + 1, 1)
+    starts = torch.tensor([[0.0, 0.1]]).double().repeat(4, 1)
     tc.calibrate(simulator, recording, rule=2, num_samples=0, starts=starts, seed=0, progress=False)
     assert seen == {1, 3}

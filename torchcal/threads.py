@@ -1,17 +1,21 @@
 """How many threads torch computes with."""
 
 import contextlib
+import functools
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import ParamSpec, TypeVar
 
 import torch
 
-__all__ = ["SHARED", "few_threads"]
+__all__ = ["SHARED", "few_threads", "with_few_threads"]
 
 #: Numbers that are computed at once from which on several threads share the work.
 SHARED = 2**22
 
 _GIVEN = threading.local()
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
 
 
 @contextlib.contextmanager
@@ -20,8 +24,8 @@ def few_threads(numbers: int = 0) -> Iterator[None]:
 
     With less to do than `SHARED` threads wait longer for each other than they compute. On two cores, one of them busy
     with something else, a singular value decomposition of 200 x 4 numbers takes two threads a hundred times as long as
-    one, and a diagnosis thirty times. Also a decorator, and one within another, which may have more to do. A Python
-    thread that first uses torch meanwhile begins with the number it finds, as torch has it.
+    one, and a diagnosis thirty times. One within another may have more to do. A Python thread that first uses torch
+    meanwhile begins with the number it finds, as torch has it.
     """
     now = torch.get_num_threads()
     outermost = not hasattr(_GIVEN, "count")
@@ -34,3 +38,14 @@ def few_threads(numbers: int = 0) -> Iterator[None]:
         torch.set_num_threads(now)
         if outermost:
             _GIVEN.__dict__.pop("count", None)
+
+
+def with_few_threads(function: Callable[_P, _R]) -> Callable[_P, _R]:
+    """A function that has one thread, but where it asks for more. Warnings are told of the user's line, through it."""
+
+    @functools.wraps(function)
+    def inner(*args: _P.args, **options: _P.kwargs) -> _R:
+        with few_threads():
+            return function(*args, **options)
+
+    return inner

@@ -41,7 +41,7 @@ from torchcal.errors import ConvergenceWarning, DomainError, EmbeddingError, Rec
 from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories, is_value_of
 from torchcal.simulators.executor import check_executor
 from torchcal.terms import Term, extend
-from torchcal.threads import few_threads
+from torchcal.threads import with_few_threads
 
 __all__ = ["diagnose"]
 
@@ -53,7 +53,7 @@ HALF = 0.5
 POWER = 0.95
 
 
-@few_threads()
+@with_few_threads
 def diagnose(
     simulator: Simulator,
     recording: Recording,
