@@ -84,7 +84,7 @@ def test_no_tie_of_names_alone_for_a_wrong_guess():
 def test_a_wrong_guess_adds_no_name_to_a_right_one():
     d = tc.diagnose(motor(), recording(0, "linear", friction=0.3), candidates(), seed=0, progress=False)
     assert "dead time" not in d.terms
-    assert any("inputs change far" in row and "hold='zero'" in row for row in d.symptoms) or "hold=" in str(d)
+    assert "(hold=) would do nearly as well without all or a part of it" in " ".join(str(d).split())
 
 
 def test_a_wrong_guess_in_one_of_two_runs_is_told_of_that_run():

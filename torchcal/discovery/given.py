@@ -74,10 +74,8 @@ def other_hold(search: Search, part: Fitted) -> Fitted | None:
 
     In all of such runs, or in those alone that it suits. It has no parameter more. Computed once for a fit.
     """
-    recording = search.problem.recording
     if id(part) not in search.otherwise:  # the fit is kept beside it, so that its id stays its own
-        runs = recording.runs or ()
-        far = [_far(run) for run in runs]
+        far = _far_runs(search)
         found = _held(search, part, far) if any(far) and not search.stop.is_set() else None
         if found is not None and sum(far) > 1:
             worse = _by_run(found) > _by_run(part)
@@ -90,6 +88,8 @@ def other_hold(search: Search, part: Fitted) -> Fitted | None:
 
 def as_good(search: Search, model: Model) -> bool:
     """Whether the base, or one with fewer of a model's terms, does nearly as well with inputs held the other way."""
+    if not any(_far_runs(search)):
+        return False
     best = evidence(search, model.found) + model.price - CLEARLY
     fewer = [m for m in search.models if m.window is None and set(m.numbers) < set(model.numbers)]
     for part, price in ((search.base, 0.0), *((m.found, m.price) for m in fewer)):
@@ -128,9 +128,14 @@ def evidence(search: Search, found: Fitted) -> float:
     return settled(found, search.noise, search.tangents)[1] if search.noise.open else search.gain(found.chi2)
 
 
+def _far_runs(search: Search) -> list[bool]:
+    """In which runs an input changes far between samples."""
+    return [_far(run) for run in search.problem.recording.runs or ()]
+
+
 def _far(run: Run) -> bool:
-    """Whether an input changes so far between samples that it matters how it goes on there; what is held and stays at
-    its values is."""
+    """Whether an input changes so far between samples that it matters how it goes on there, and none of what is held
+    mostly stays at its values."""
     far = any(float(u.diff().abs().max()) > FAR * float(u.std()) > 0 for u in run.inputs.values())
     steps = run.hold == "zero" and all(float((u.diff() == 0).double().mean()) > STAYS for u in run.inputs.values())
     return run.hold in MISTAKEN and far and not steps
