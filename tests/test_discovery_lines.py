@@ -186,7 +186,7 @@ def test_the_evidence_of_a_wave_is_that_of_the_linear_model(size):
     lines = Lines.of(problem, channel, "x", 4)
     assert lines is not None
     assert len(lines.frequencies) > 50
-    found = lines._log(size, [lines._seen(y[:, None], *part) for part in lines.parts])[:, 0]
+    found = lines._log(size, lines._seen(y[:, None]))[:, 0]
     prior = 2 * size**2 / len(t)
     for frequency, log in zip(lines.frequencies[::7].tolist(), found[::7].tolist(), strict=True):
         angle = 2 * math.pi * frequency * t

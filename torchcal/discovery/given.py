@@ -134,8 +134,8 @@ def _far_runs(search: Search) -> list[bool]:
 
 
 def _far(run: Run) -> bool:
-    """Whether an input changes so far between samples that it matters how it goes on there, and none of what is held
-    mostly stays at its values."""
+    """Whether an input changes so far between samples that it matters how it goes on there; not where all are held and
+    mostly stay at their values."""
     far = any(float(u.diff().abs().max()) > FAR * float(u.std()) > 0 for u in run.inputs.values())
     steps = run.hold == "zero" and all(float((u.diff() == 0).double().mean()) > STAYS for u in run.inputs.values())
     return run.hold in MISTAKEN and far and not steps

@@ -4,6 +4,7 @@ A line in the spectrum is neither smooth nor correlated noise. What is left of a
 wave of unknown size and phase in every run, at each of the frequencies that the smooth functions are too few for.
 """
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -108,7 +109,7 @@ class Lines:
         found: list[Tensor] = []
         for block in residuals.split(max(1, NUMBERS // self.size), dim=1):
             logs = torch.full((), -math.inf, dtype=torch.float64)
-            seen = [self._seen(block, *part) for part in self.parts]
+            seen = self._seen(block)
             for size in sizes.tolist():
                 logs = torch.logaddexp(logs, self._log(size, seen))
             if not found:
@@ -126,7 +127,7 @@ class Lines:
             sizes: That are tried.
         """
         frequency = self.frequencies[number]
-        seen = [tuple(each[:, number] for each in self._seen(whitened[:, None], *part)) for part in self.parts]
+        seen = [(norms[:, number], squares[:, number]) for norms, squares in self._seen(whitened[:, None])]
         logs = torch.stack([self._log(size, seen) for size in sizes.tolist()])
         size = float(sizes[logs.argmax()])
         profile, removed = torch.zeros_like(values), 0.0
@@ -150,7 +151,7 @@ class Lines:
             found[places] = sd[places] * math.sqrt(2.0 / len(places))
         return found
 
-    def _log(self, size: float, seen: Sequence[tuple[Tensor, ...]]) -> Tensor:
+    def _log(self, size: float, seen: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
         """Log evidence of a wave of some size, by what every run shows of it."""
         prior = self._variance(size)
         terms = [0.5 * (prior * squares / (1 + prior * norms) - torch.log1p(prior * norms)) for norms, squares in seen]
@@ -160,18 +161,28 @@ class Lines:
         """Prior variance of the amplitudes of a wave's cosine and sine."""
         return 2 * size**2 / sum(len(places) for places, _ in self.parts)
 
-    def _seen(self, residuals: Tensor, places: Tensor, cells: Tensor) -> tuple[Tensor, Tensor]:
-        r"""Squared norms of a cosine and a sine at a run's data, ``(2, F, 1)``, and the squares of their products with
-        residuals, ``(2, F, B)``, for each frequency.
+    def _seen(self, residuals: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Of each run, squared norms of a cosine and a sine, ``(2, F, 1)``, and the squares of their products with
+        residuals, ``(2, F, B)``, for each frequency."""
+        found = []
+        for (places, cells), (norms, turn) in zip(self.parts, self._norms, strict=True):
+            turned = turn * self._transformed(cells, residuals[places])
+            found.append((norms, torch.stack([turned.real.square(), turned.imag.square()])))
+        return found
+
+    @functools.cached_property
+    def _norms(self) -> list[tuple[Tensor, Tensor]]:
+        r"""Of each run, squared norms of a cosine and a sine, ``(2, F, 1)``, and what turns to them, ``(F, 1)``.
 
         Uneven data weigh the two unlike: their phase is the one at which they are orthogonal,
         :math:`2\psi = \arg \sum_j e^{2 i \theta_j}` (Lomb 1976, Astrophysics and Space Science 39, 447-462).
         """
-        spectrum = self._transformed(cells, residuals[places])
-        double = self._transformed(2 * cells, torch.ones(len(cells), 1, dtype=torch.float64))
-        turned = spectrum * torch.polar(torch.ones_like(double.real), -0.5 * double.angle())
-        norms = torch.stack([len(places) + double.abs(), (len(places) - double.abs()).clamp_min(0)]) / 2
-        return norms, torch.stack([turned.real.square(), turned.imag.square()])
+        found = []
+        for places, cells in self.parts:
+            double = self._transformed(2 * cells, torch.ones(len(cells), 1, dtype=torch.float64))
+            norms = torch.stack([len(places) + double.abs(), (len(places) - double.abs()).clamp_min(0)]) / 2
+            found.append((norms, torch.polar(torch.ones_like(double.real), -0.5 * double.angle())))
+        return found
 
     def _transformed(self, cells: Tensor, values: Tensor) -> Tensor:
         r"""Sums of values times :math:`e^{-i \theta}` at their cells, ``(F, B)``."""
