@@ -23,10 +23,12 @@ def three():
 def test_one_thread_but_where_there_is_much_to_do():
     with few_threads():
         assert torch.get_num_threads() == 1
-        with few_threads(SHARED):
+        with few_threads(100 * SHARED):
             assert torch.get_num_threads() == 3
             with few_threads(SHARED - 1):
                 assert torch.get_num_threads() == 1
+            with few_threads(3 * SHARED - 1):  # each is to have its share
+                assert torch.get_num_threads() == 2
             assert torch.get_num_threads() == 3
         assert torch.get_num_threads() == 1
     assert torch.get_num_threads() == 3
@@ -37,7 +39,7 @@ def test_the_number_comes_back_after_an_error():
         raise KeyError
     assert torch.get_num_threads() == 3
     torch.set_num_threads(2)
-    with few_threads(SHARED):  # what was kept has gone
+    with few_threads(3 * SHARED):  # what was kept has gone
         assert torch.get_num_threads() == 2
 
 
@@ -46,7 +48,7 @@ def test_another_thread_has_its_own():
 
     def other() -> None:
         torch.set_num_threads(2)
-        with few_threads(SHARED):
+        with few_threads(3 * SHARED):
             seen.append(torch.get_num_threads())
 
     with few_threads():
@@ -73,7 +75,7 @@ def test_the_functions_that_compute_for_long_take_one(run):
 
 
 def test_a_large_calibration_keeps_the_threads(monkeypatch):
-    monkeypatch.setattr(threads, "SHARED", 8 * 100)  # of as many outputs as starts, nodes and data make
+    monkeypatch.setattr(threads, "SHARED", 8 * 100 // 3)  # a third of the outputs that starts, nodes and data make
     seen = set()
 
     def curve(x, p):

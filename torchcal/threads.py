@@ -10,8 +10,8 @@ import torch
 
 __all__ = ["SHARED", "few_threads", "with_few_threads"]
 
-#: Numbers that are computed at once from which on several threads share the work.
-SHARED = 2**22
+#: Numbers of which each thread has so many or more: with fewer it waits longer for the others than it computes.
+SHARED = 2**18
 
 _GIVEN = threading.local()
 _P = ParamSpec("_P")
@@ -20,19 +20,20 @@ _R = TypeVar("_R")
 
 @contextlib.contextmanager
 def few_threads(numbers: int = 0) -> Iterator[None]:
-    """One thread for torch, or as many as there were before where so many numbers are computed at once.
+    """One thread for torch, and one more for every `SHARED` numbers computed at once, up to as many as there were.
 
-    With less to do than `SHARED` threads wait longer for each other than they compute. On two cores, one of them busy
-    with something else, a singular value decomposition of 200 x 4 numbers takes two threads a hundred times as long as
-    one, and a diagnosis thirty times. One within another may have more to do. A Python thread that first uses torch
-    meanwhile begins with the number it finds, as torch has it.
+    On two cores, one of them busy with something else, a singular value decomposition of 200 x 4 numbers takes two
+    threads a hundred times as long as one, and a diagnosis thirty times. Gradients of 2**20 outputs at once take 16
+    idle cores a fifth of the time of one, and two, of which one is busy, a quarter longer than one. One within another
+    may have more to do. A Python thread that first uses torch meanwhile begins with the number it finds, as torch has
+    it.
     """
     now = torch.get_num_threads()
     outermost = not hasattr(_GIVEN, "count")
     try:
         if outermost:
             _GIVEN.count = now
-        torch.set_num_threads(_GIVEN.count if numbers >= SHARED else 1)
+        torch.set_num_threads(max(1, min(_GIVEN.count, numbers // SHARED)))
         yield
     finally:
         torch.set_num_threads(now)
