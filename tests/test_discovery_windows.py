@@ -16,7 +16,7 @@ from torchcal.discovery.doubts import CLEARLY, doubt
 from torchcal.discovery.local import Span, localised
 from torchcal.discovery.nameless import _elsewhere, _where_possible, refit_nameless
 from torchcal.discovery.problem import Problem
-from torchcal.discovery.screen import Window
+from torchcal.discovery.screen import Window, windows_of
 from torchcal.discovery.search import Search
 from torchcal.discovery.windows import _beyond_the_edge
 from torchcal.errors import SimulatorError
@@ -598,3 +598,47 @@ def test_a_base_that_blows_up_without_its_term_is_no_start_of_a_nameless_change(
     ]  # fmt: skip
     d = diagnose(base, tc.Recording(runs=[tc.Run(t, {"x": x}, initial={"x": 1.0})], noise=0.01), terms)
     assert ["loss of order 1"] in (d.tied or [d.terms])
+
+
+def projected(n, *, seed=0, draws=20):
+    """What `windows_of` asks of a residual, with a line projected off."""
+    generator = torch.Generator().manual_seed(seed)
+    basis = torch.linalg.qr(torch.stack([torch.ones(n), torch.linspace(-1, 1, n)], dim=-1).double())[0]
+
+    def tangent(values):
+        return values - basis @ (basis.T @ values)
+
+    noise = tangent(torch.randn(n, 1 + draws, generator=generator, dtype=F64))
+    return types.SimpleNamespace(e=noise[:, 0], null=noise[:, 1:], tangent=tangent)
+
+
+@pytest.mark.parametrize("sign", [-1, 0, 1])
+def test_parts_that_are_data_are_windowed_like_any(sign):
+    n = 60
+    generator = torch.Generator().manual_seed(1)
+    residual, diagonal = projected(n), torch.randn(n, generator=generator, dtype=F64)
+    drivers = {
+        "even": torch.rand(n, generator=generator, dtype=F64),
+        "levels": torch.randint(0, 5, (n,), generator=generator).double(),
+    }
+    windows, null = windows_of(3, residual, diagonal, drivers, sign)
+    dense, dense_null = windows_of(3, residual, torch.diag(diagonal), drivers, sign)
+    torch.testing.assert_close(null, dense_null)
+    for one, other in zip(windows, dense, strict=True):
+        assert (one.driver, one.low, one.high) == (other.driver, other.low, other.high)
+        assert (one.z, one.amplitude) == pytest.approx((other.z, other.amplitude))
+    best = max(windows, key=lambda w: w.z)  # and that is the score of what acts there alone
+    inside = (drivers[best.driver] > best.low) & (drivers[best.driver] < best.high)
+    acting = residual.tangent((diagonal * inside)[:, None])[:, 0]
+    assert best.z == pytest.approx(abs(float(acting @ residual.e / acting.norm())))
+
+
+def test_windows_of_many_data_take_no_square_of_their_number():
+    n = 200_000  # whose square is 320 GB
+    residual = projected(n, draws=4)
+    x = torch.linspace(0, 1, n, dtype=F64)
+    residual.e = residual.e + residual.tangent(0.1 * ((x > 0.25) & (x < 0.5)).double()[:, None])[:, 0]
+    windows, _ = windows_of(0, residual, torch.ones(n, dtype=F64), {"x": x}, 0)
+    best = max(windows, key=lambda w: w.z)
+    assert (best.low, best.high) == pytest.approx((0.25, 0.5), abs=1e-4)
+    assert best.amplitude == pytest.approx(0.1, abs=0.02)

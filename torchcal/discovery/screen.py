@@ -154,8 +154,8 @@ def contributions(
 ) -> tuple[dict[int, Tensor], dict[str, Tensor]]:
     """What a candidate's amplitude does to the data from each part of the trajectory (or each condition) alone.
 
-    Returns responses ``(n, K)`` by candidate and the drivers ``(K,)``. Terms with hidden states, which remember, and
-    terms that free a parameter are left out.
+    Returns responses ``(n, K)`` by candidate, or their diagonals ``(n,)`` where each part is a datum, and the drivers
+    ``(K,)``. Terms with hidden states, which remember, and terms that free a parameter are left out.
     """
     found = residual.found
     bound = found.problem.simulator
@@ -182,7 +182,7 @@ def contributions(
         response, drivers, _ = responses(found.problem, found, torch.cat(parts, dim=-1))
         return {i: response[:, :, k] for k, i in enumerate(chosen)}, drivers
     drivers = found.problem.drivers_at_data(found.values[None], None)
-    return {i: torch.diag(tangent) for i, tangent in zip(chosen, parts, strict=True)}, drivers
+    return dict(zip(chosen, parts, strict=True)), drivers
 
 
 def windows(residual: Residual, candidates: Sequence[Candidate], screening: Screening) -> tuple[list[Window], Tensor]:
@@ -210,7 +210,7 @@ def windows_of(
     Args:
         number: Of the candidate.
         residual: What is to be explained.
-        response: Of the data to the change at each point, ``(n, K)``.
+        response: Of the data to the change at each point, ``(n, K)``; or its diagonal ``(n,)`` where each is a datum.
         drivers: At the points, ``(K,)`` each.
         sign: Which the change must have; 0 for either.
 
@@ -219,25 +219,24 @@ def windows_of(
     """
     found: list[Window] = []
     null = torch.zeros(residual.null.shape[1], dtype=torch.float64)
-    response = residual.tangent(response)
-    total = float(response.sum(1).norm())
     for name, driver in drivers.items():
         order = driver.argsort(stable=True)
         if not float(driver[order[-1]]) > float(driver[order[0]]):
             continue
-        running = torch.cat([response.new_zeros(len(response), 1), response[:, order].cumsum(1)], dim=1)
         ordered, span = driver[order], Span.of(driver)
+        cuts = _cuts(ordered, span)
+        pieces = residual.tangent(_pieces(response, order, cuts))
+        running = torch.cat([pieces.new_zeros(len(pieces), 1), pieces.cumsum(1)], dim=1)
         ends = {
-            (a, b): _ends(ordered, a, b)
-            for a, b in itertools.combinations(_cuts(ordered, span), 2)
-            if (a, b) != (0, len(order))
+            (a, b): _ends(ordered, a, b) for a, b in itertools.combinations(cuts, 2) if (a, b) != (0, len(order))
         }
         edges = [one for one, (low, high) in ends.items() if span.share(low, high) >= SHORT]
         if not edges:
             continue
-        columns = torch.stack([running[:, b] - running[:, a] for a, b in edges], dim=-1)
+        at = {place: k for k, place in enumerate(cuts)}
+        columns = torch.stack([running[:, at[b]] - running[:, at[a]] for a, b in edges], dim=-1)
         norm = columns.norm(dim=0)
-        keep = norm > max(VANISHED * total, 1e-300)
+        keep = norm > max(VANISHED * float(running[:, -1].norm()), 1e-300)
         if not bool(keep.any()):
             continue
         unit = torch.where(keep, columns / norm.clamp_min(1e-300), torch.zeros_like(columns))
@@ -254,6 +253,17 @@ def windows_of(
             size = float((unit[:, k] @ residual.e) / norm[k].clamp_min(1e-300))
             found.append(Window(number, name, low, high, float(z[k].abs()), size))
     return found, null
+
+
+def _pieces(response: Tensor, order: Tensor, cuts: list[int]) -> Tensor:
+    """Of a response (see `windows_of`) to the points in their order, the sums from each cut to the next one."""
+    number = torch.empty_like(order)
+    number[order] = torch.arange(len(cuts) - 1).repeat_interleave(torch.tensor(cuts).diff())
+    pieces = response.new_zeros(len(response), len(cuts) - 1)
+    if response.ndim == 1:
+        pieces[torch.arange(len(response)), number] = response
+        return pieces
+    return pieces.index_add_(1, number, response)
 
 
 def _cuts(ordered: Tensor, span: Span) -> list[int]:

@@ -255,7 +255,7 @@ def _around(search: Search, model: Model) -> list[Window]:
         response, acting = response[:, :, 0], response[:, :, 1].sum(1)
     elif place in found.free:
         acting = found.jacobian[:, found.free.index(place)]
-        response = torch.diag(found.problem.evaluate(everywhere[None], [place])[1][0, :, 0])
+        response = found.problem.evaluate(everywhere[None], [place])[1][0, :, 0]
         drivers = found.problem.drivers_at_data(found.values[None], None)
     else:
         return []
