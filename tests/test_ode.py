@@ -274,6 +274,44 @@ def test_the_first_guess_of_an_initial_state_is_the_first_sample_that_is_not_mis
     assert [p.unit for p in bound.parameters[2:]] == ["m", "m/s"]
 
 
+def test_an_output_is_a_state_only_as_it_is() -> None:
+    model = tc.ODESimulator(
+        lambda t, s, p, u: {"angle": s["rate"], "rate": -p["k"] * s["angle"]},
+        {"angle": "rad", "rate": "rad/s"},
+        [tc.Parameter("k", low=0.0, initial=4.0)],
+        observe={
+            "angle": lambda t, s, p, u: 57.2958 * s["angle"],  # converted: no first guess in rad
+            "gyroscope": lambda t, s, p, u: s["rate"],  # the state under another name
+            "energy": lambda t, s, p, u: s["rate"] ** 2 + p["k"] * s["angle"] ** 2,
+        },
+    )
+    assert model.reads == {"gyroscope": "rate"}
+    assert tc.terms.extend(model, tc.terms.sensor(outputs=("gyroscope",))[:1]).reads == model.reads
+    t = np.linspace(0, 3, 20)
+    run = tc.Run(time=t, outputs={"angle": 28.6 * np.cos(t), "gyroscope": 0.1 - np.sin(t)})
+    bound = model.bind(tc.Recording(runs=[run]))
+    assert {p.name: p.initial for p in bound.parameters} == {"k": 4.0, "angle(0)": None, "rate(0)": 0.1}
+
+
+def test_a_state_observed_in_another_unit_is_calibrated_like_itself() -> None:
+    t = torch.linspace(0, 5, 50, dtype=torch.float64)
+    found = []
+    for scale in (1.0, 1000.0):
+        model = tc.ODESimulator(
+            lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"] - 8 * s["x"] ** 3},
+            {"x": "m", "v": "m/s"},
+            [tc.Parameter("k", initial=4.0)],
+            observe={"x": lambda t, s, p, u, scale=scale: scale * s["x"]},
+        )
+        known = model.bind(tc.Recording(runs=[tc.Run(time=t, outputs={"x": t}, initial={"x": 0.5, "v": 0.0})]))
+        x = known.at(known.x)(torch.tensor([4.2], dtype=torch.float64))
+        x = x + scale * 0.002 * torch.randn(50, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        recording = tc.Recording(runs=[tc.Run(time=t, outputs={"x": x})])
+        found.append(tc.diagnose(model, recording, [], seed=0, progress=False).base.estimates)
+    for one, other in zip(*found, strict=True):
+        assert other.value == pytest.approx(one.value, abs=1e-3 * one.sd)
+
+
 # --- parameters, runs and initial states -----------------------------------------------------------------
 
 

@@ -141,7 +141,8 @@ def follow_slopes(problem: Problem, begin: Tensor) -> Tensor:
     targets: list[tuple[int, int, Tensor, float]] = []
     for r, run in enumerate(bound.runs):
         for name, y in run.outputs.items():
-            if name not in names or name not in problem.recording.outputs:
+            state = bound.ode.reads.get(name)
+            if state is None or name not in problem.recording.outputs:
                 continue
             every = (~torch.isnan(y)).nonzero()[:, 0]
             if len(every) < 4:
@@ -156,7 +157,7 @@ def follow_slopes(problem: Problem, begin: Tensor) -> Tensor:
             length = float(run.time[seen[-1]] - run.time[seen[0]])
             scale = float((y[seen] - y[seen].mean()).abs().max()) / max(length, 1e-300)
             each = torch.stack(slopes)[torch.arange(len(begin)) % len(SLOPES)]
-            targets.append((r, names.index(name), each, max(scale, 1e-12)))
+            targets.append((r, names.index(state), each, max(scale, 1e-12)))
     if not targets:
         return begin
     places = [i for i, q in enumerate(problem.parameters) if q.name in bound.initial_names and q.initial is None]

@@ -40,19 +40,21 @@ def from_samples(search: Search) -> list[str]:
     if search.exact or search.stop.is_set() or recording.runs is None or not isinstance(bound, Trajectories):
         return []
     shown = [
-        [name for name, value in run.initial.items()
-         if name in run.outputs and name not in bound.ode.initial and value == float(run.outputs[name][0])]
+        {state: output for output, state in bound.ode.reads.items()
+         if state in run.initial and state not in bound.ode.initial and output in run.outputs
+         and run.initial[state] == float(run.outputs[output][0])}
         for run in recording.runs
     ]  # fmt: skip
     taken = {
-        initial_name(name, r, len(recording.runs)): (name, r, run.initial[name])
-        for r, (run, names) in enumerate(zip(recording.runs, shown, strict=True)) for name in names
+        initial_name(state, r, len(recording.runs)): (output, r, run.initial[state])
+        for r, (run, mine) in enumerate(zip(recording.runs, shown, strict=True)) for state, output in mine.items()
     }  # fmt: skip
     if not taken:
         return []
     found = _refitted(
-        search, base, recording.without_initial(shown), {full: value for full, (_, _, value) in taken.items()}
-    )
+        search, base, recording.without_initial([list(mine) for mine in shown]),
+        {full: value for full, (_, _, value) in taken.items()},
+    )  # fmt: skip
     if found is None or not _noise_alone(search, found):
         return []
     sd = recording.split(search.noise.sd)

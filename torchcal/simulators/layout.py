@@ -97,9 +97,8 @@ class Layout:
                     name = initial_name(state, r, len(runs))
                     known[state] = ("free", len(parameters))
                     self.initial_names.append(name)
-                    seen = state in recording.outputs and state in ode.outputs
-                    first_seen = _first_seen(run, state) if seen else None
-                    parameters.append(Parameter(name, unit=unit, initial=first_seen))
+                    seen = [one for one in recording.outputs if ode.reads.get(one) == state]
+                    parameters.append(Parameter(name, unit=unit, initial=_first_seen(run, seen)))
             self._initial.append(known)
         self.parameters = tuple(parameters)
 
@@ -236,10 +235,11 @@ def initial_name(state: str, run: int, runs: int) -> str:
     return f"{state}(0)" if runs == 1 else f"{state}(0)[{run}]"
 
 
-def _first_seen(run: Run, output: str) -> float | None:
-    """The first recorded value of an output."""
-    values = run.outputs.get(output)
-    if values is None:
-        return None
-    seen = values[~torch.isnan(values)]
-    return float(seen[0]) if len(seen) else None
+def _first_seen(run: Run, outputs: Sequence[str]) -> float | None:
+    """The first recorded value of the first of some outputs that the run has any of."""
+    for output in outputs:
+        values = run.outputs.get(output)
+        seen = values[~torch.isnan(values)] if values is not None else []
+        if len(seen):
+            return float(seen[0])
+    return None

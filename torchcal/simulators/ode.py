@@ -4,6 +4,7 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from torchcal.data import Recording, same_unit
@@ -109,6 +110,21 @@ class ODESimulator(Simulator):
         """Names of what can be observed."""
         return tuple(self.observe)
 
+    @functools.cached_property
+    def reads(self) -> dict[str, str]:
+        """Outputs that are a state as it is, neither converted nor mixed with another, and which one."""
+        s = {name: torch.full((1, 1), 1.0 + i, dtype=torch.float64) for i, name in enumerate(self.states)}
+        found = {}
+        for output, function in self.observe.items():
+            try:
+                value = function(None, dict(s), {}, {})  # what only reads a state asks for nothing else
+            except Exception:
+                continue
+            state = next((name for name, own in s.items() if value is own), None)
+            if state is not None:
+                found[output] = state
+        return found
+
     def bind(self, recording: Recording) -> "Trajectories":
         """The simulator of this recording's outputs: its runs, inputs, times and unknown initial states.
 
@@ -121,11 +137,11 @@ class ODESimulator(Simulator):
 
     def _compare_units(self, recording: Recording) -> None:
         for name, unit in recording.units.items():
-            seen = self.observe.get(name)
-            own = self.states[seen.args[0]] if isinstance(seen, functools.partial) and seen.func is _read else None
+            state = self.reads.get(name)
+            own = self.states[state] if state else None
             if own and unit and not same_unit(own, unit):
                 warn(
-                    f"The state {name!r} is in {own} and was recorded in {unit}. Numbers are not converted: correct "
+                    f"The state {state!r} is in {own} and was recorded in {unit}. Numbers are not converted: correct "
                     "one of them, or give observe={output: function(t, s, p, u)} that converts.",
                     UnitWarning,
                 )

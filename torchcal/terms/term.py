@@ -377,6 +377,7 @@ def _extend_ode(simulator: ODESimulator, terms: Sequence[Term]) -> ODESimulator:
         stiff=simulator.stiff,
     )
     extended.extended = plain, tuple(every)
+    extended.reads = plain.reads  # what instruments add is small
     return extended
 
 
