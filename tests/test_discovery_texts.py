@@ -60,7 +60,7 @@ def located(term, *, inside=(), named=True):
     """Places by falling evidence: a parameter before the equations and the output."""
     kinds = {("parameter", "kd"): 50.0, ("equation", "M"): 40.0, ("parameter", "kp"): 30.0, ("output", "y"): 20.0,
              ("equation", "R"): 10.0}  # fmt: skip
-    places = [Place(channel(*key), "t", evidence, 0.5, T, T, 1.0) for key, evidence in kinds.items()]
+    places = [Place(channel(*key), "t", evidence, 0.5, T, T) for key, evidence in kinds.items()]
     search = SimpleNamespace(
         structure=SimpleNamespace(places=places), unnamed=None,
         problem=SimpleNamespace(in_time=True, recording=SimpleNamespace(outputs=("y",))),
@@ -187,7 +187,7 @@ def test_slivers_are_no_spans():
 
 
 def test_the_missing_rate_is_told_where_the_change_without_a_name_acts():
-    places = [Place(channel(*key), driver, 9.0, 0.5, T, T, 1.0)
+    places = [Place(channel(*key), driver, 9.0, 0.5, T, T)
               for key in (("equation", "R"), ("equation", "M")) for driver in ("t", "R")]  # fmt: skip
     nameless = tc.Term("a constant", rates={"M": rate}, **Q)
     unnamed = SimpleNamespace(

@@ -146,6 +146,11 @@ class Recording:
         return tuple(self.x) if isinstance(self.x, dict) else ("x",)
 
     @property
+    def columns(self) -> Tensor:
+        """Conditions side by side, in the order of their names, shape ``(n, C)``."""
+        return torch.stack(list(self.x.values()) if isinstance(self.x, dict) else [self.x], dim=-1)
+
+    @property
     def time(self) -> Tensor:
         """Times of all samples, run after run, shape ``(n,)``; an error in a static recording."""
         return self._in_time()["time"]

@@ -63,8 +63,6 @@ def calibrate_base(
     rough = recording.noise if isinstance(recording.noise, Tensor) else 0.1 * recording.spread
     outputs = torch.zeros(len(recording.outputs), dtype=torch.float64)
     begin = starts(problem, num_starts, seed, held)
-    for i, value in held.items():
-        begin[:, i] = value
     problem = _steady(problem, begin[:1])
     found = _from_starts(problem, begin, free, rough, outputs)
     if found is None:

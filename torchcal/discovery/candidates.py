@@ -182,8 +182,21 @@ def sized(term: Term, scale: Mapping[str, float], recording: Recording) -> Term:
         low, high = (part * size for part in SCALE_RANGE)
         if driver == "t":
             low = min([low, *(OF_A_GAP * gap for gap in gaps)])
-        parameters.append(dataclasses.replace(parameter, low=low, high=high, initial=None, neutral=None))
+        low, high = _narrowed(low, high, parameter)
+        initial = parameter.initial if parameter.initial is not None and low <= parameter.initial <= high else None
+        parameters.append(dataclasses.replace(parameter, low=low, high=high, initial=initial, neutral=None))
     return dataclasses.replace(term, parameters=tuple(parameters))
+
+
+def _narrowed(low: float, high: float, parameter: Parameter) -> tuple[float, float]:
+    """A range of a driver's scale within the one bound that a parameter has, or else beside it."""
+    ratio = high / low
+    if parameter.low is not None and parameter.low > low:
+        return parameter.low, high if high > parameter.low else ratio * parameter.low
+    if parameter.high is not None and parameter.high < high:
+        below = parameter.high / ratio if parameter.high > 0 else parameter.high - high
+        return low if low < parameter.high else below, parameter.high
+    return low, high
 
 
 def spread_values(target: Problem, names: Sequence[str], values: Tensor) -> Tensor:
@@ -198,7 +211,12 @@ def _shape_points(parameter: Parameter, count: int) -> list[float]:
     low, high = parameter.low, parameter.high
     if low is None or high is None:
         middle = parameter.initial or parameter.neutral or 1.0
-        return [middle * 2.0**k for k in torch.linspace(-2, 2, count).tolist()] if count > 1 else [middle]
+        end = low if low is not None else high if high is not None else 0.0
+        away = middle - end
+        if (low is not None and away <= 0) or (high is not None and away >= 0):  # on the wrong side of its only bound
+            away = math.copysign(abs(end) or 1.0, 1.0 if low is not None else -1.0)
+        factors = torch.linspace(-2, 2, count).tolist() if count > 1 else [0.0]
+        return [end + away * 2.0**k for k in factors]
     at = torch.linspace(0, 1, count + 2, dtype=torch.float64)[1:-1]
     if parameter.transform == "log" or (low > 0 and high / low > 20):
         return [float(low * (high / low) ** a) for a in at]
@@ -313,7 +331,7 @@ def _driver_values(base: Problem, found: Fitted, terms: Sequence[Term]) -> dict[
     return {
         term.full(own): drivers[driver].abs().flatten().sort().values
         for term in terms for own, driver in term.scales.items()
-        if driver in drivers and driver != "t"
+        if driver in drivers and not base.is_time(driver)
     }  # fmt: skip
 
 

@@ -110,7 +110,7 @@ def responses(problem: Problem, found: Fitted, forcing: Tensor) -> tuple[Tensor,
             block[:filled, where[k]] += active @ forcing[r, k]
             adjoint[:filled] = active @ flow[r, k]
         result[mine] = block
-    along = bound.along(values, states)
+    along = bound.along(states)
     drivers = {name: _bin_means(bins, count, 0.5 * (table[:, :-1] + table[:, 1:])) for name, table in along.items()}
     return result, drivers, drivers["t"]
 

@@ -33,8 +33,7 @@ def smooth_columns(problem: Problem, places: Tensor, *, ends: bool = False, rank
         along = rank if uneven or span <= 0 else (at - at.min()) / span
         waves = torch.cos(math.pi * along[:, None] * torch.arange(count, dtype=torch.float64))
         return torch.cat([waves, along[:, None], along[:, None].square()], dim=1) if ends else waves
-    x = problem.recording.x
-    given = [column[problem.condition_of[places]] for column in x.values()]  # type: ignore[union-attr]
+    given = problem.recording.columns[problem.condition_of[places]].unbind(-1)
     columns = torch.stack([spread(column) if ranks else column for column in given], dim=-1)
     columns = (columns - columns.mean(0)) / columns.std(0).clamp_min(1e-300)
     powers = [torch.ones(n, 1, dtype=torch.float64)]

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from typing import Any
 
-import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
@@ -423,9 +422,20 @@ def _improved(simulator: Simulator, best: Model) -> Simulator:
 
 def _explains_nothing(search: Search) -> bool:
     """Whether the calibrated base explains no more than a constant would."""
-    recording, found = search.problem.recording, search.base
-    constant = recording.y[found.problem.index].mean()
-    return _size(search) > NO_BETTER and not torch.allclose(found.y, constant)
+    return _size(search) > NO_BETTER and not _is_constant(search)
+
+
+def _is_constant(search: Search) -> bool:
+    """Whether the calibrated base is the mean of each output, as one is that has no more to say."""
+    found, recording = search.base, search.problem.recording
+    weight = found.whitening.sd.square().reciprocal()
+    for k in found.problem.output_of.unique():
+        mine = found.problem.output_of == k
+        mean = float((weight[mine] * found.problem.y[mine]).sum() / weight[mine].sum())
+        spread = recording.spread[found.problem.index[mine]]
+        if bool(((found.y[mine] - mean).abs() > (1 - NO_BETTER) * spread).any()):
+            return False
+    return True
 
 
 def _size(search: Search) -> float:

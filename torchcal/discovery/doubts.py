@@ -115,7 +115,7 @@ def _no_threshold(model: Model) -> str:
     for term in model.candidate.terms:
         for own, driver in term.scales.items():
             value = values[term.full(own)]
-            if driver not in drivers or driver == "t" or value <= 0:
+            if driver not in drivers or problem.is_time(driver) or value <= 0:
                 continue
             below = drivers[driver].abs() <= value
             if len(drivers[driver][below].unique()) <= FREE and _ends(model, term, drivers, driver, value):
@@ -277,7 +277,5 @@ def distinct(problem: Problem) -> int:
     """Data in use at distinct conditions, of a static recording: replicates do not tell one curve from another."""
     if problem.in_time:
         return problem.n
-    x = problem.recording.x
-    columns = torch.stack([c.double() for c in (x.values() if isinstance(x, dict) else [x])], dim=-1)
-    which = columns.unique(dim=0, return_inverse=True)[1][problem.condition_of]
+    which = problem.levels[1][problem.condition_of]
     return len(torch.stack([which, problem.output_of], dim=-1).unique(dim=0))

@@ -62,7 +62,7 @@ def estimates(found: Fitted, places: Sequence[int], window: Window | None = None
         if window is not None and not found.problem.in_time and q.name.endswith(tuple(ENDS.values())):
             spread = _stepped_sd(found, i, window.driver, spread)
         allowed = math.inf if q.low is None or q.high is None else q.high - q.low
-        if spread > min(1e5 * max(abs(value), 1e-300), allowed):
+        if spread > min(1e5 * abs(value) or math.inf, allowed):
             spread = math.inf
         at_bound = i in bound or (i in found.free and value in (q.low, q.high) and not is_window(q.name))
         result.append(Estimate(q.name, value, spread, q.unit, at_bound))

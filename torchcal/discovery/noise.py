@@ -302,18 +302,16 @@ class _Replicates:
 
 def _replicates(problem: Problem) -> list[_Replicates] | None:
     """Replicates of every output; None without any, or with too few of one."""
-    x = problem.recording.x
     if problem.in_time:
         return None
-    columns = torch.stack(list(x.values()), dim=-1) if isinstance(x, dict) else x[:, None]
-    _, group = columns.unique(dim=0, return_inverse=True)
-    if int(group.max()) + 1 == len(columns):
+    levels, group = problem.levels
+    if len(levels) == len(group):
         return None
     found = []
     for output in range(len(problem.recording.outputs)):
         places = (problem.output_of == output).nonzero()[:, 0]
         y, g = problem.y[places], group[problem.condition_of[places]]
-        count = torch.zeros(int(group.max()) + 1, dtype=torch.float64).index_add_(0, g, torch.ones_like(y))
+        count = torch.zeros(len(levels), dtype=torch.float64).index_add_(0, g, torch.ones_like(y))
         total = torch.zeros_like(count).index_add_(0, g, y)
         many = count[g] > 1
         off = (y - total[g] / count[g]) * (count[g] / (count[g] - 1).clamp_min(1)).sqrt()

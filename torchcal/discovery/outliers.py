@@ -212,8 +212,7 @@ def _clustered(problem: Problem, places: Tensor, high: Tensor) -> bool:
     count = int(high.sum())
     if count < 2:
         return False
-    x = problem.recording.x
-    columns = [c[problem.condition_of[places]] for c in (x.values() if isinstance(x, dict) else [x])]
+    columns = problem.recording.columns[problem.condition_of[places]].unbind(-1)
     if any(_one_level(column, high, CHANCE / len(columns)) for column in columns):
         return True
     if count < 3:

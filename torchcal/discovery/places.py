@@ -31,7 +31,6 @@ class Place:
         profile: Estimated change at the channel's points, ``(K,)``; its median is 0 where the base's parameters make
             up for one that is the same everywhere.
         sd: Its standard deviation there.
-        size: Chosen prior size; of an oscillation its amplitude.
         period: Of an oscillation, in units of the driver; None of a smooth change.
     """
 
@@ -41,7 +40,6 @@ class Place:
     share: float
     profile: Tensor
     sd: Tensor
-    size: float
     period: float | None = None
 
 
@@ -86,15 +84,14 @@ class Change:
         along = (v[:, there].T @ (columns.T @ residuals)) / s[there, None]
         return cls(features, scale, s[there], v[:, there], along[:, 0], along[:, 1:])
 
-    def place(self, channel: Channel, driver: str, residual: Residual, excess: float) -> Place:
+    def place(self, channel: Channel, driver: str, residual: Residual) -> Place:
         """The estimate."""
         evidence, size = evidence_of(self.along[:, None], self.s)
         gain = (float(size[0]) * self.s).square()
         shrink = gain / (1 + gain)
         weights = (self.v * (shrink / self.s)) @ self.along / self.scale
         removed = float(((1 - (1 - shrink).square()) * self.along.square()).sum())
-        left = float(residual.e.square().sum()) - removed
-        rest = max(left - residual.freedom + float(shrink.sum()), 0.0)
+        share = residual.share(removed, float(shrink.sum()))
         features, profile = self.features, self.features @ weights
         if _is_unseen(channel, residual):
             features, profile = features - features.mean(0), profile - profile.median()
@@ -102,9 +99,7 @@ class Change:
         # What the data say nothing about keeps its prior sd.
         beyond = (features.square().sum(1) - (features @ self.v).square().sum(1)).clamp_min(0.0)
         sd = (within.square().sum(1) + beyond).sqrt() * float(size[0]) / self.scale
-        return Place(
-            channel, driver, float(evidence[0]), 1.0 - min(rest / excess, 1.0), profile, sd, float(size[0])
-        )
+        return Place(channel, driver, float(evidence[0]), share, profile, sd)
 
 
 def _is_unseen(channel: Channel, residual: Residual) -> bool:

@@ -127,6 +127,11 @@ class Problem:
         return x
 
     @cached_property
+    def levels(self) -> tuple[Tensor, Tensor]:
+        """Different conditions ``(m, C)``, and which of them every row is at, ``(rows,)``."""
+        return self.recording.columns.unique(dim=0, return_inverse=True)  # type: ignore[no-any-return]
+
+    @cached_property
     def sweeps(self) -> Tensor | None:
         """Number of the sweep that every row belongs to, ``(rows,)``; None where rows do not follow one another.
 
@@ -137,7 +142,7 @@ class Problem:
         one = torch.zeros(self.recording.n, dtype=torch.long)
         if self.order is not None:
             return one
-        columns = torch.stack(list(self.recording.x.values()), dim=1)  # type: ignore[union-attr]
+        columns = self.recording.columns
         levels = [len(column.unique()) for column in columns.T]
         if sum(count > SWITCH for count in levels) == 1 or math.prod(levels) > GRID * len(one):
             return one
@@ -249,8 +254,12 @@ class Problem:
         bound = self.simulator
         if not isinstance(bound, Trajectories):
             return {"t": self.recording.x["time"]}  # type: ignore[index]
-        found = bound.along(values, bound.solve(values, warm))
+        found = bound.along(bound.solve(values, warm))
         return {name: table[bound.grid.run_of, bound.grid.node_of] for name, table in found.items()}
+
+    def is_time(self, driver: str) -> bool:
+        """Whether a driver is the time of differential equations, and no condition that somebody calls t."""
+        return self.in_time and driver == "t"
 
     def drivers_at_data(self, values: Tensor, warm: Solution | None) -> dict[str, Tensor]:
         """The same at the data in use, ``(n,)`` each."""

@@ -51,6 +51,11 @@ class Residual:
         """Squared misfit beyond noise, never negative."""
         return max(float(self.e.square().sum()) - self.freedom, 0.0)
 
+    def share(self, removed: float, taken: float) -> float:
+        """Share of the excess that a change removes which takes some degrees of freedom; none where there is none."""
+        left = max(float(self.e.square().sum()) - removed - self.freedom + taken, 0.0)
+        return max(1.0 - left / self.excess, 0.0) if self.excess > 0 else 0.0
+
 
 def _noise_draws(found: Fitted, noise: Noise, draws: int, seed: int) -> Tensor:
     """Whitened noise ``(n, draws)``, as uncertain in size and correlation as the noise model is."""

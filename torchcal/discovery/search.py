@@ -315,7 +315,7 @@ class Search:
         """Go on with another noise: the base and some models are fitted again, the others weighed."""
         self.noise = noise
         self.base = refit(self.base, noise.whitening(self.base.problem))
-        for model in (*self.models, *self.merged.values()):
+        for model in (*self.models, *self.merged.values(), *self.nameless):
             whitening = noise.whitening(model.found.problem)
             model.found = (refit if any(model is one for one in again) else weighed)(model.found, whitening)
         self.residual = Residual(self.base, self.noise, seed=self.seed)

@@ -74,7 +74,7 @@ def responses_of(problem: Problem, available: Sequence[Channel]) -> list[_Look]:
             if distinct < 2:
                 continue
             counts = dict.fromkeys(min(count, distinct) for count in _counts(problem, data, name))
-            scales = [driver, driver.log()] if name != "t" and Span.of(driver).log else [driver]
+            scales = [driver, driver.log()] if not problem.is_time(name) and Span.of(driver).log else [driver]
             parts = [_features(scale, count) for scale in scales for count in counts]
             found.append(_Look(channel, name, parts, channel.response(torch.cat(parts, dim=1))))
     return found
@@ -83,7 +83,7 @@ def responses_of(problem: Problem, available: Sequence[Channel]) -> list[_Look]:
 def _counts(problem: Problem, data: int, driver: str) -> list[int]:
     """Numbers of smooth functions along a driver that are tried with some data."""
     most = max(ALONG[0], data // DATA_EACH[0 if problem.in_time else 1])
-    return [count for count in (IN_TIME if driver == "t" else ALONG) if count <= most]
+    return [count for count in (IN_TIME if problem.is_time(driver) else ALONG) if count <= most]
 
 
 def _lines(residual: Residual, available: Sequence[Channel]) -> list[Lines]:
@@ -97,17 +97,15 @@ def _lines(residual: Residual, available: Sequence[Channel]) -> list[Lines]:
     )  # fmt: skip
 
 
-def _line_place(lines: Lines, residual: Residual, excess: float) -> Place:
+def _line_place(lines: Lines, residual: Residual) -> Place:
     """The likeliest oscillation of an output."""
     found = residual.found
     evidence, number = lines.evidence(residual.e[:, None], SIZES)
     profile, removed = lines.wave(found.residual, residual.e, number, SIZES)
     taken = 2.0 * len(lines.parts) + 1.0  # two amplitudes in every run, and the frequency
-    left = max(float(residual.e.square().sum()) - removed - residual.freedom + taken, 0.0)
     return Place(
-        lines.channel, lines.driver, float(evidence[0]), 1.0 - min(left / excess, 1.0), profile,
-        lines.sd(found.whitening.sd),
-        float(profile.abs().max()), 1.0 / float(lines.frequencies[number]),
+        lines.channel, lines.driver, float(evidence[0]), residual.share(removed, taken), profile,
+        lines.sd(found.whitening.sd), 1.0 / float(lines.frequencies[number]),
     )  # fmt: skip
 
 
@@ -158,10 +156,9 @@ def analyse(residual: Residual, *, every: bool = False) -> Structure:
     chosen = [c for c in available if every or c.kind in kinds]
     best: dict[int, Place] = {}
     nulls: dict[int, Tensor] = {}
-    excess = max(residual.excess, 1e-300)
     both = torch.cat([residual.e[:, None], residual.null], dim=1)
     for key, look, change in _changes(residual, responses_of(found.problem, chosen), both):
-        place = change.place(look.channel, look.driver, residual, excess)
+        place = change.place(look.channel, look.driver, residual)
         if key not in best or place.evidence > best[key].evidence:
             best[key] = place
         if look.channel.kind in kinds:
@@ -169,9 +166,9 @@ def analyse(residual: Residual, *, every: bool = False) -> Structure:
             nulls[key] = torch.maximum(nulls[key], simulated) if key in nulls else simulated
     places = list(best.values())
     for lines in _lines(residual, chosen):
-        places.append(_line_place(lines, residual, excess))
+        places.append(_line_place(lines, residual))
         nulls[-len(places)] = lines.evidence(residual.null, SIZES)[0]
-    for place, simulated in wave_places(residual, chosen, both, excess):
+    for place, simulated in wave_places(residual, chosen, both):
         places.append(place)
         if place.channel.kind in kinds:
             nulls[-len(places)] = simulated

@@ -134,7 +134,7 @@ def _sweeps(problem: Problem, places: Tensor) -> list[Tensor]:
     x = problem.recording.x
     if problem.in_time or not isinstance(x, dict) or len(x) < 2:
         return [places]
-    columns = torch.stack([column[problem.condition_of[places]] for column in x.values()], dim=1)
+    columns = problem.recording.columns[problem.condition_of[places]]
     return list(places.tensor_split(breaks(columns).nonzero()[:, 0] + 1))
 
 
@@ -149,12 +149,11 @@ def more_than_replicates(search: Search, found: Fitted) -> list[str]:
     """Outputs whose means at the conditions a fit misses by more than replicates tell, but in no order, in words: a
     preparation that replicates share is noise that they do not show."""
     rows: list[str] = []
-    problem, x = found.problem, search.problem.recording.x
+    problem = found.problem
     if search.noise.source != "replicates":
         return rows
-    columns = torch.stack(list(x.values()) if isinstance(x, dict) else [x], dim=-1).double()
-    levels, group = columns.unique(dim=0, return_inverse=True)
-    if max(len(c.unique()) for c in columns.T) < MEANS:
+    levels, group = problem.levels
+    if max(len(c.unique()) for c in levels.T) < MEANS:
         return rows
     standard = found.residual / search.noise.sd[problem.index]
     for number, name in enumerate(problem.recording.outputs):

@@ -33,8 +33,8 @@ def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None
 
     Args:
         recording: The data.
-        holdout: None for the above, False for none, a share between 0 and 1, or a bool array ``(n,)`` or
-            ``(n_total,)``, True where held out.
+        holdout: None for the above, False for none, a share between 0 and 1 (of a run in time one datum at least), or
+            a bool array ``(n,)`` or ``(n_total,)``, True where held out.
         parameters: Number of free parameters.
 
     Raises:
@@ -80,9 +80,12 @@ def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None
         mask = torch.zeros(recording.n, dtype=torch.bool)
         for r in x["run"].unique():
             mine = ((x["run"] == r) & seen).nonzero()[:, 0]
-            mask[mine[math.ceil((1 - share) * len(mine)) :]] = True
+            first = math.ceil((1 - share) * len(mine))
+            if holdout is not None and len(mine) > 1:  # a small share of a short run is its last datum
+                first = min(first, len(mine) - 1)
+            mask[mine[first:]] = True
     else:
-        columns = torch.stack(list(x.values()), dim=-1) if isinstance(x, dict) else x[:, None]
+        columns = recording.columns
         if columns.shape[1] == 1:
             distance = columns[:, 0]
         else:
@@ -123,7 +126,7 @@ def within(recording: Recording) -> Tensor:
     for r in runs.unique():
         mine = ((runs == r) & seen).nonzero()[:, 0]
         mine = mine[along[mine].argsort(stable=True)]
-        for block in mine.tensor_split(min(BLOCKS, len(mine)))[1:-1:4]:
+        for block in mine.tensor_split(min(BLOCKS, max(len(mine), 1)))[1:-1:4]:
             mask[block] = True
     return mask.repeat(len(recording.outputs))
 
@@ -133,12 +136,10 @@ class HeldOut:
     """A model fitted without the held-out data.
 
     Attributes:
-        fitted: The fit.
         prediction: Of all outputs, ``(n_total,)``.
         sd: Predictive sd, noise and parameters, ``(n_total,)``.
     """
 
-    fitted: Fitted
     prediction: Tensor
     sd: Tensor
 
@@ -158,7 +159,7 @@ def held_out_fit(found: Fitted, noise: Noise, mask: Tensor) -> HeldOut | None:
     if again is None:
         return None
     prediction, sd = predict(again, noise)
-    return HeldOut(again, prediction, sd)
+    return HeldOut(prediction, sd)
 
 
 def score(recording: Recording, prediction: Tensor, sd: Tensor, mask: Tensor) -> Score:

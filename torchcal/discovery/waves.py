@@ -101,7 +101,7 @@ def _waves(channel: Channel, frequencies: Tensor) -> Tensor:
 
 
 def wave_places(
-    residual: Residual, chosen: Sequence[Channel], residuals: Tensor, excess: float
+    residual: Residual, chosen: Sequence[Channel], residuals: Tensor
 ) -> Iterator[tuple[Place, Tensor]]:
     """The likeliest wave of every equation and parameter in time, with its evidence in the simulated residuals.
 
@@ -127,5 +127,5 @@ def wave_places(
         change = Change.of(features, residual.tangent(channel.response(features)), 0.0, residuals[:, :1])
         if change is not None:
             found, period = max(float(evidence[0]), around), 1.0 / float(near[seen.argmax()])
-            place = change.place(channel, "t", residual, excess)
+            place = change.place(channel, "t", residual)
             yield dataclasses.replace(place, evidence=found, period=period), evidence[1:]

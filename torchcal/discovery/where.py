@@ -209,10 +209,16 @@ def needed_shifts(search: Search) -> list[NeededShift]:
         order = values.argsort(stable=True)
         pick = order[torch.linspace(0, len(order) - 1, min(60, len(order))).round().long().unique()]
         a, b = values[pick], place.profile[pick]
-        ranks = [v.argsort().argsort().double() for v in (a, b)]
-        correlation = float(torch.corrcoef(torch.stack(ranks))[0, 1]) if len(pick) > 2 else 0.0
+        ranks = torch.stack([_ranks(a), _ranks(b)])
+        correlation = float(torch.corrcoef(ranks)[0, 1].nan_to_num()) if len(pick) > 2 else 0.0
         result.append(NeededShift(name, place.channel.unit, place.driver, a, b, place.sd[pick], correlation))
     return result[:6]
+
+
+def _ranks(values: Tensor) -> Tensor:
+    """Ranks, equal values at the mean of theirs."""
+    _, number, counts = values.unique(return_inverse=True, return_counts=True)
+    return (counts.cumsum(0) - 0.5 * (counts - 1))[number]
 
 
 def _by_plausibility(search: Search) -> list[Place]:

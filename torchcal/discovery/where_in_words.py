@@ -34,19 +34,25 @@ def where_in_words(d: Any) -> str:
             advice = " With per_run=True that parameter would take it up."
         return (
             f"The mismatch sits in the {place.kind} {place.target} and differs from run to run{largest}: one change "
-            f"for each run removes {share_in_words(place.share)} of the misfit beyond noise.{advice}{_embedded(d)}"
+            f"for each run {_does(place)}.{advice}{_embedded(d)}"
         )
     largest = "" if everywhere else f" (largest at {spans})"
     if place.period is not None:
         return (
             f"The mismatch sits in the {place.kind} {place.target} and oscillates with {place.driver} (period "
-            f"{place.period:.3g}): a wave there removes {share_in_words(place.share)} of the misfit beyond noise"
-            f"{_elsewhere(d)}.{_embedded(d)}"
+            f"{place.period:.3g}): a wave there {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
         )
     return (
         f"The mismatch sits in the {place.kind} {place.target} and varies with {place.driver}{largest}: a smooth "
-        f"change there removes {share_in_words(place.share)} of the misfit beyond noise{_elsewhere(d)}.{_embedded(d)}"
+        f"change there {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
     )
+
+
+def _does(place: Any) -> str:
+    """What a change does."""
+    if place.share <= 0:
+        return "takes up what has structure in it, though it is no larger than noise"
+    return f"removes {share_in_words(place.share)} of the misfit beyond noise"
 
 
 def _everywhere(d: Any, place: Any) -> bool:

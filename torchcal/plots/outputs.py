@@ -67,7 +67,7 @@ def output_density(
         raise DomainError(f"Expected index: the number of a condition. Got {index!r}.")
     if recording is not None and not isinstance(recording, Recording):
         raise DomainError(f"Expected recording: a Recording or None. Got {type(recording).__name__}.")
-    groups, n, x = _groups(samples, alpha, index, recording, num, seed)
+    groups, n, x = _groups(samples, alpha, recording, num, seed)
     if not 0 <= index < n:
         raise DomainError(f"Expected index of a condition from 0 to {n - 1}. Got {index}.")
     units = {**(recording.units if recording is not None else {})}
@@ -117,7 +117,7 @@ def _look(key: str, i: int) -> tuple[str, Any]:
 
 
 def _groups(
-    samples: Any, alpha: Any, index: int, recording: Recording | None, num: int, seed: int
+    samples: Any, alpha: Any, recording: Recording | None, num: int, seed: int
 ) -> tuple[dict[str, np.ndarray], int, Any]:
     """Draws ``(S, n_total)`` by label, the number of conditions, and the conditions where known."""
     if isinstance(samples, NISP):

@@ -239,7 +239,7 @@ def _first_seen(run: Run, outputs: Sequence[str]) -> float | None:
     """The first recorded value of the first of some outputs that the run has any of."""
     for output in outputs:
         values = run.outputs.get(output)
-        seen = values[~torch.isnan(values)] if values is not None else []
-        if len(seen):
+        seen = None if values is None else values[~torch.isnan(values)]
+        if seen is not None and len(seen):
             return float(seen[0])
     return None

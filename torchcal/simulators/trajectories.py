@@ -235,8 +235,8 @@ class Trajectories(Simulator):
         with torch.no_grad():
             return self._observe(values.detach(), states, wanted)[0]
 
-    def along(self, values: Tensor, states: Tensor) -> dict[str, Tensor]:
-        """Time, states and inputs at the ends of all steps, each ``(R, K + 1)``; one row of values."""
+    def along(self, states: Tensor) -> dict[str, Tensor]:
+        """Time, states and inputs at the ends of all steps, each ``(R, K + 1)``; of one solution."""
         found = {"t": self.grid.nodes}
         found |= {name: states[0, ..., i] for i, name in enumerate(self._states)}
         found |= {name: torch.cat([table[0], table[2][:, -1:]], dim=1) for name, table in self.grid.u.items()}

@@ -1,0 +1,156 @@
+"""Cases at the edge of what `diagnose` is made for: names, bounds at one side, runs with nothing in them, no misfit."""
+
+import math
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+import torchcal as tc
+from torchcal.discovery import verify, where
+from torchcal.discovery.candidates import _shape_points, sized
+
+F64 = torch.float64
+
+
+def diagnose(simulator, recording, terms=(), **options):
+    return tc.diagnose(simulator, recording, list(terms), **{"seed": 0, "progress": False, **options})
+
+
+def noise(n, seed):
+    return torch.as_tensor(np.random.default_rng(seed).standard_normal(n))
+
+
+def test_a_condition_may_be_called_t():
+    """Only the time of differential equations is cut finer than conditions are, and has no decades."""
+    x = torch.logspace(-2, 2, 160, dtype=F64)
+    y = 1 + 0.5 * x.log() + 0.06 * torch.exp(-((x.log() + 1) ** 2) / 0.5) + 0.02 * noise(160, 3)
+    found = []
+    for name in ("t", "dose"):
+        simulator = tc.Simulator(
+            lambda x, p, name=name: p["a"] + p["b"] * x[name].log(), [tc.Parameter("a"), tc.Parameter("b")]
+        )
+        found.append(diagnose(simulator, tc.Recording(x={name: x}, y=y, noise=0.02)))
+    assert found[0].verdict == found[1].verdict == "unexplained"
+    assert found[0].where[0].evidence == pytest.approx(found[1].where[0].evidence)
+    assert found[0].p_detect == found[1].p_detect
+
+
+def test_a_run_of_which_nothing_was_seen_is_no_trouble():
+    t = torch.linspace(0, 10, 60, dtype=F64)
+    step = (t > 8.5).double()  # nothing before the end foretells what it does
+    x = 1 + 0.5 * t + 0.3 * torch.cumsum(step, 0) + 0.05 * noise(60, 1)
+    model = tc.ODESimulator(
+        lambda t, s, p, u: {"x": p["a"] + p["b"] * u["f"]}, {"x": "m"}, [tc.Parameter("a"), tc.Parameter("b")]
+    )
+    blank = torch.full((60,), math.nan, dtype=F64)
+    runs = [tc.Run(time=t, outputs={"x": y}, inputs={"f": step}, initial={"x": 1.0}) for y in (x, blank)]
+    recording = tc.Recording(runs=runs, missing=True)
+    assert int(verify.within(recording).sum()) > 0
+    d = diagnose(model, recording)
+    assert d.verdict == "consistent"
+    assert not bool(d.held_out[60:].any())
+
+
+@pytest.mark.parametrize(
+    ("parameter", "fits"),
+    [
+        (tc.Parameter("n", low=3.0), lambda v: v > 3),
+        (tc.Parameter("n", low=3.0, initial=4.0), lambda v: v > 3),
+        (tc.Parameter("n", high=-3.0), lambda v: v < -3),
+        (tc.Parameter("n", high=0.5), lambda v: v < 0.5),
+        (tc.Parameter("n", low=0.0), lambda v: v > 0),
+    ],
+)
+def test_a_shape_is_tried_within_its_only_bound(parameter, fits):
+    for count in (1, 5):
+        points = _shape_points(parameter, count)
+        assert len(points) == count
+        assert all(fits(point) for point in points)
+    if parameter.initial is not None:
+        assert _shape_points(parameter, 1) == [parameter.initial]
+    assert _shape_points(tc.Parameter("n", low=0.0), 3) == [0.25, 1.0, 4.0] == _shape_points(tc.Parameter("n"), 3)
+
+
+@pytest.mark.parametrize(
+    ("given", "low", "high", "initial"),
+    [
+        ({}, None, None, None),
+        ({"low": 2.0, "initial": 3.0}, 2.0, None, 3.0),
+        ({"high": 4.0, "initial": 5.0 - 2.0}, None, 4.0, 3.0),
+        ({"low": 1e6}, 1e6, None, None),
+        ({"low": 0.0}, None, None, None),  # and no smaller range than without
+    ],
+)
+def test_what_is_said_of_a_shape_holds_on_a_scale_too(given, low, high, initial):
+    def ranged(**given):
+        term = tc.Term(
+            "onset", equation="x", rate=lambda t, s, p, u: p["k"] * torch.exp(-t / p["tau"]), scales={"tau": "t"},
+            parameters=[tc.Parameter("k"), tc.Parameter("tau", **given)],
+        )  # fmt: skip
+        return sized(term, {"t": 10.0}, recording).parameters[1]
+
+    t = torch.linspace(0, 10, 21, dtype=F64)
+    recording = tc.Recording(runs=[tc.Run(time=t, outputs={"x": t})])
+    plain, found = ranged(), ranged(**given)
+    assert found.low == (plain.low if low is None else low)
+    assert found.high == pytest.approx(plain.high if high is None and given.get("low", 0.0) < 100 else found.high)
+    assert found.low < found.high
+    if high is not None:
+        assert found.high == high
+    assert found.initial == initial
+
+
+def test_structure_in_less_than_noise_removes_no_misfit():
+    x = torch.linspace(0, 1, 39, dtype=F64)
+    y = 1 + 2 * x + 0.025 * torch.sin(4 * math.pi * x) + 0.004 * noise(39, 0)
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    d = diagnose(line, tc.Recording(x=x, y=y, noise=0.02))
+    assert d.base.chi2 < 37  # given too large
+    assert d.verdict == "unexplained"
+    assert all(place.share == 0.0 for place in d.where)
+    text = " ".join(str(d).split())
+    assert "though it is no larger than noise" in text
+    assert "100 % of the misfit" not in text
+
+
+def test_an_estimate_at_a_bound_of_zero_is_determined():
+    x = torch.linspace(0, 1, 60, dtype=F64)
+    y = 1 + 2 * x - 0.05 * x**2 + 0.01 * noise(60, 1)
+    curve = tc.Simulator(
+        lambda x, p: p["a"] + p["b"] * x + p["c"] * x**2,
+        [tc.Parameter("a"), tc.Parameter("b"), tc.Parameter("c", low=0.0)],
+    )
+    found = diagnose(curve, tc.Recording(x=x, y=y, noise=0.01)).base.estimates[2]
+    assert (found.value, found.at_bound) == (0.0, True)
+    assert 0 < found.sd < 0.1
+    assert "not determined" not in str(found)
+
+
+def test_equal_values_have_one_rank():
+    assert where._ranks(torch.tensor([3.0, 1.0, 3.0, 2.0])).tolist() == [3.5, 1.0, 3.5, 2.0]
+    assert where._ranks(torch.ones(3)).tolist() == [2.0, 2.0, 2.0]
+
+
+@pytest.mark.parametrize("scale", [1.0, 100.0])
+def test_a_base_that_is_constant_by_itself_has_not_got_lost(scale):
+    x = torch.linspace(0, 1, 40, dtype=F64)
+    wave = 0.03 * torch.sin(6.3 * x)
+    y = {"one": 1 + wave + 0.01 * noise(40, 0), "other": scale * (1 + wave + 0.01 * noise(40, 1))}
+    flat = tc.Simulator(
+        lambda x, p: {"one": p["a"] + 0 * x, "other": p["b"] + 0 * x}, [tc.Parameter("a"), tc.Parameter("b")]
+    )
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        d = diagnose(flat, tc.Recording(x=x, y=y))
+    assert not d.settings["lost"]
+    assert not any("constant" in str(one.message) for one in caught)
+
+
+def test_a_small_share_of_short_runs_is_held_out():
+    t = torch.linspace(0, 1, 15, dtype=F64)
+    recording = tc.Recording(runs=[tc.Run(time=t, outputs={"x": t}) for _ in range(2)])
+    mask = verify.choose(recording, 0.05, 1)
+    assert mask.nonzero()[:, 0].tolist() == [14, 29]
+    assert int(verify.choose(recording, 0.2, 1).sum()) == 6
