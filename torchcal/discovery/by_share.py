@@ -57,7 +57,8 @@ def decide_exact(search: Search, ranked: list[Model], mask: Tensor | None, decis
                 decision.verdict = "ambiguous"
                 decision.tied_models = [good[0], *rivals]
                 decision.tied = [list(m.names) for m in decision.tied_models]
-                tie_other_names(search, good[0], decision)
+                for model in (good[0], *rivals):
+                    tie_other_names(search, model, decision)
             break
         if accepted is not None and doubt(search, good[0]):
             break  # what is there already may be a name all the same
