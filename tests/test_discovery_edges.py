@@ -154,3 +154,13 @@ def test_a_small_share_of_short_runs_is_held_out():
     mask = verify.choose(recording, 0.05, 1)
     assert mask.nonzero()[:, 0].tolist() == [14, 29]
     assert int(verify.choose(recording, 0.2, 1).sum()) == 6
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9])
+def test_what_leaves_rounding_alone_is_named_though_nobody_said_that_there_is_no_noise(size):
+    x = torch.arange(40, dtype=F64)
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    bend = tc.Term("bend", outputs={"y": lambda x, p, y: y + p["q"] * x**2}, parameters=[tc.Parameter("q")])
+    d = diagnose(line, tc.Recording(x=x, y=1 + 0.5 * x + 0.004 * x**2 + size * noise(40, 0)), [bend])
+    assert (d.terms, d.remaining) == (["bend"], 0.0)
+    assert d.ranking[0].estimates[0].value == pytest.approx(0.004)

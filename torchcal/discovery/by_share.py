@@ -30,8 +30,7 @@ def decide_exact(search: Search, ranked: list[Model], mask: Tensor | None, decis
     """Without noise nothing is white: a term must remove nearly all of the held-out misfit that is left, far more than
     any rival; then another may remove nearly all of what that leaves."""
     decision.none_evidence = -math.inf
-    recording = search.problem.recording
-    if bool((search.base.residual.abs() <= 1e-6 * recording.spread[search.base.problem.index]).all()):
+    if search.base.exact:
         decision.verdict = "consistent"
         return decision
     clean = [m for m in ranked if not m.note]

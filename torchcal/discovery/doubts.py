@@ -242,6 +242,8 @@ def _noise_or_physics(search: Search, model: Model) -> str:
     Noise of unknown size that is slow is what a wrong shape leaves, too; where most of it is small, and some of it
     large, it is no noise of one size. Where rows do not follow one another no correlated noise is estimated.
     """
+    if model.found.exact:
+        return ""
     noise, problem = beside(search, model), model.found.problem
     e = noise.whitening(problem).vector(model.found.residual)
     if problem.sweeps is None and _along_rows(problem, e) > ALONG:

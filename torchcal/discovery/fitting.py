@@ -62,6 +62,12 @@ class Fitted:
         """``y − f`` at the used data."""
         return self.problem.y - self.y
 
+    @property
+    def exact(self) -> bool:
+        """Whether it meets every datum to a millionth of the data's spread: what it leaves is rounding."""
+        spread = self.problem.recording.spread[self.problem.index]
+        return bool((self.residual.abs() <= 1e-6 * spread).all())
+
     def covariance(self) -> Tensor:
         """Of the free parameters, ``(free, free)``; directions without information get a huge variance."""
         j = self.whitening(self.jacobian)
