@@ -34,7 +34,8 @@ class ODESimulator(Simulator):
             every state.
         initial: Initial values that the model itself knows, by state: a number, the name of another state whose
             initial value it takes, or a function ``f(s, p)`` of the other states' initial values. What a run gives
-            comes first; what neither gives is calibrated.
+            comes first; what neither gives is calibrated, begun at the first recorded value of an output that is that
+            state as it is.
         max_step: Longest time step. By default steps are halved until the solution stops changing.
         stiff: Whether steps are implicit, as some states follow others far faster than anything else happens. By
             default they are where explicit ones would have to be too short; with ``max_step`` only where this is True.

@@ -69,11 +69,11 @@ class Term:
         parameters: Its own parameters.
         formula: One line, as a scientist writes it.
         description: One plain sentence.
-        scales: For shape parameters without bounds: the state, input, condition or output (``"t"`` for time) on
+        scales: For shape parameters without two bounds: the state, input, condition or output (``"t"`` for time) on
             whose scale they are measured; they are then sought between 0.02 and 1 of its largest magnitude,
             durations (``"t"``) of the longest run's length, of the whole recording's where ``elapsed`` is that, and
             from a tenth of the usual gap between samples where that is less. A moment on the recording's clock needs
-            bounds of its own, or ``elapsed``.
+            bounds of its own, or ``elapsed``. A bound that is given stays.
         expected: What parameters are in nature, ``{parameter: (value, sd)}``: a hypothesis whose estimate lies apart
             from that, for its own sd too, is the less likely, by a normal density.
         elapsed: For what begins at nothing and goes on, whatever the clock says: t in its functions counts from the
