@@ -348,3 +348,43 @@ def test_a_term_that_is_no_drive_may_act_the_wrong_way_at_first():
     d = diagnose(*pumped(0, dead=0.4), [swell])
     assert d.ranking[0].terms == ("shrink and swell",)
     assert "wrong way" not in str(d)
+
+
+def test_steps_are_short_enough_for_the_smaller_of_two_outputs():
+    t, scale = np.arange(0, 60, 0.8), 1e4
+    z = solve_ivp(
+        lambda t, z: [z[1], -4 * z[0] - 0.05 * z[1], 0.3 - 0.1 * z[2]], (0, t[-1]), [1.0, 0.0, 1.0], t_eval=t,
+        rtol=1e-11, atol=1e-13,
+    ).y  # fmt: skip
+    rng = np.random.default_rng(1)
+    outputs = {"x": z[0] + 0.002 * rng.standard_normal(75), "T": scale * (z[2] + 0.05 * rng.standard_normal(75))}
+    model = tc.ODESimulator(
+        lambda t, s, p, u: {
+            "x": s["v"], "v": -p["k"] * s["x"] - p["c"] * s["v"], "T": p["h"] * scale - p["g"] * s["T"],
+        },
+        {"x": "m", "v": "m/s", "T": "Pa"},
+        [tc.Parameter(name, low=0.0, initial=at) for name, at in (("k", 4.1), ("c", 0.1), ("h", 0.2), ("g", 0.2))],
+        observe=("x", "T"),
+    )  # fmt: skip
+    d = diagnose(model, tc.Recording(runs=[tc.Run(time=t, outputs=outputs)]), [])
+    assert d.verdict == "consistent"
+    k, c = d.base.estimates[:2]
+    assert abs(k.value - 4.0) < 4 * k.sd < 0.01
+    assert abs(c.value - 0.05) < 4 * c.sd < 0.01
+
+
+def test_steps_are_short_enough_for_the_least_noise():
+    """Of noise in proportion to the value, small values are known far better than large ones."""
+    t = np.arange(0, 60.0)
+    y = solve_ivp(lambda t, y: -0.2 * y * (1 + np.sin(0.7 * t)), (0, 59), [50.0], t_eval=t, rtol=1e-11, atol=1e-14).y[0]
+    y *= 1 + 0.012 * np.random.default_rng(1).standard_normal(60)
+    model = tc.ODESimulator(
+        lambda t, s, p, u: {"W": -p["k"] * s["W"] * (1 + torch.sin(0.7 * t))}, {"W": "mm"},
+        [tc.Parameter("k", low=0.0, initial=0.1)],
+    )  # fmt: skip
+    loss = tc.Term(
+        "loss", equation="W", rate=lambda t, s, p, u: -p["b"] * s["W"] ** 2, parameters=[tc.Parameter("b")]
+    )  # fmt: skip
+    d = diagnose(model, tc.Recording(runs=[tc.Run(time=t, outputs={"W": y})]), [loss, *tc.terms.sensor(("W",))[:1]])
+    assert d.verdict == "consistent"
+    assert d.base.estimates[0].value == pytest.approx(0.2, rel=0.01)

@@ -91,7 +91,7 @@ def calibrate_base(
     if not exact:
         base, units = _grown(base, unit, units)
         base, noise = _with_memory(base, units)
-        base = _sharpen(refit(base, noise.whitening(base.problem)))
+        base = _sharpen(refit(base, noise.whitening(base.problem)), noise.sd)
     return base, noise
 
 
@@ -199,15 +199,19 @@ def _again(found: Fitted, keep: Tensor) -> Fitted:
     )
 
 
-def _sharpen(found: Fitted) -> Fitted:
-    """Shorten time steps, where they err, until the solver's error is small against the noise."""
+def _sharpen(found: Fitted, sd: Tensor | None = None) -> Fitted:
+    """Shorten time steps, where they err, until the solver's error is small against the noise, of an sd ``(n_total,)``;
+    against each output's misfit where none is known yet."""
     recording = found.problem.recording
+    if sd is None and isinstance(recording.noise, Tensor):
+        sd = recording.noise
 
     def allowed(now: Fitted) -> Tensor:
-        if isinstance(recording.noise, Tensor):
-            return SOLVER_SHARE * recording.noise[now.problem.index]
-        size = now.residual.square().mean().sqrt()
-        return SOLVER_SHARE * torch.maximum(size, 1e-6 * recording.spread[now.problem.index])
+        size, index = torch.zeros_like(now.y), now.problem.index
+        for k in now.problem.output_of.unique() if sd is None else ():
+            mine = now.problem.output_of == k
+            size[mine] = now.residual[mine].square().mean().sqrt()
+        return SOLVER_SHARE * torch.maximum(size if sd is None else sd[index], 1e-6 * recording.spread[index])
 
     found, error = sharpen(found, allowed, rounds=HALVED)
     if not error:
