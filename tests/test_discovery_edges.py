@@ -10,6 +10,7 @@ import torch
 import torchcal as tc
 from torchcal.discovery import verify, where
 from torchcal.discovery.candidates import _shape_points, sized
+from torchcal.errors import DomainError, SimulatorError
 
 F64 = torch.float64
 
@@ -164,3 +165,63 @@ def test_what_leaves_rounding_alone_is_named_though_nobody_said_that_there_is_no
     d = diagnose(line, tc.Recording(x=x, y=1 + 0.5 * x + 0.004 * x**2 + size * noise(40, 0)), [bend])
     assert (d.terms, d.remaining) == (["bend"], 0.0)
     assert d.ranking[0].estimates[0].value == pytest.approx(0.004)
+
+
+def through_numpy(values):
+    return torch.as_tensor(np.exp(values.detach().numpy()))
+
+
+def decay(exp, *, part=False):
+    def outputs(x, p):
+        return p["a"] * exp(-p["k"] * x) * (p["a"].detach() if part else 1.0)
+
+    return tc.Simulator(outputs, [tc.Parameter("a", low=0.0, initial=2.0), tc.Parameter("k", low=0.0, initial=1.0)])
+
+
+@pytest.mark.parametrize(
+    ("simulator", "of"),
+    [(decay(through_numpy), "'k'"), (decay(torch.exp, part=True), "'a'")],
+    ids=["NumPy", "a factor that is detached"],
+)
+def test_a_simulator_that_loses_a_derivative_is_refused(simulator, of):
+    x = torch.linspace(0, 4, 60, dtype=F64)
+    recording = tc.Recording(x=x, y=3 * torch.exp(-0.7 * x) + 0.02 * noise(60, 0), noise=0.02)
+    with pytest.raises(SimulatorError, match=f"Expected the simulator to depend on {of} through torch operations"):
+        diagnose(simulator, recording)
+
+
+@pytest.mark.parametrize("lost", ["h", "x0", None])
+def test_a_term_that_loses_a_derivative_is_refused(lost):
+    def bump(x, p, y):
+        h, x0 = (p[name].detach() if name == lost else p[name] for name in ("h", "x0"))
+        return y + h * torch.exp(-((x - x0) ** 2))
+
+    x = torch.linspace(0, 4, 60, dtype=F64)
+    y = 3 * torch.exp(-0.7 * x) + 0.3 * torch.exp(-((x - 2) ** 2)) + 0.02 * noise(60, 0)
+    term = tc.Term("bump", outputs={"y": bump}, parameters=[tc.Parameter("h"), tc.Parameter("x0", low=0.0, high=4.0)])
+    recording = tc.Recording(x=x, y=y, noise=0.02)
+    if lost is None:
+        assert diagnose(decay(torch.exp), recording, [term]).terms == ["bump"]
+        return
+    with pytest.raises(SimulatorError, match=f"with 'bump' to depend on 'bump.{lost}' through torch operations"):
+        diagnose(decay(torch.exp), recording, [term])
+
+
+def test_a_kink_is_no_lost_derivative():
+    x = torch.linspace(0, 4, 60, dtype=F64)
+    rest = tc.Term(
+        "stop", outputs={"y": lambda x, p, y: y - p["c"].clamp_min(0.0) * (y - p["y0"]).clamp_min(0.0)},
+        parameters=[tc.Parameter("c", low=0.0), tc.Parameter("y0", low=0.0, high=3.0)],
+    )  # fmt: skip
+    step = tc.Term(
+        "step", outputs={"y": lambda x, p, y: y + p["h"] * (x > p["x0"])},
+        parameters=[tc.Parameter("h"), tc.Parameter("x0", low=0.0, high=4.0)],
+    )  # fmt: skip
+    recording = tc.Recording(x=x, y=3 * torch.exp(-0.7 * x) + 0.02 * noise(60, 0), noise=0.02)
+    assert diagnose(decay(torch.exp), recording, [rest, step]).verdict == "consistent"
+
+
+def test_inference_mode_is_refused():
+    x = torch.linspace(0, 4, 20, dtype=F64)
+    with torch.inference_mode(), pytest.raises(DomainError, match="inference_mode"):
+        diagnose(decay(torch.exp), tc.Recording(x=x, y=torch.exp(-x)))

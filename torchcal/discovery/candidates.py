@@ -12,12 +12,13 @@ from torch import Tensor
 from torchcal.data import Recording
 from torchcal.discovery.fitting import Fitted
 from torchcal.discovery.problem import Problem
+from torchcal.discovery.trial import check_repeats, place_of
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators import Parameter, free_parameters
 from torchcal.terms import Term, extend
 from torchcal.terms.term import neutral_of
 
-__all__ = ["Candidate", "base_columns", "check_repeats", "drivers_scale", "prepare", "spread_values"]
+__all__ = ["Candidate", "base_columns", "drivers_scale", "prepare", "spread_values"]
 
 #: Points of a grid of shape parameters: along one, two, three and more of them.
 GRID_POINTS = (1, 9, 5, 4)
@@ -26,8 +27,8 @@ DRIVER_POINTS = (0, 7, 3, 2)
 #: Range of a shape parameter measured on a driver's scale; on that of time it begins at a share of the usual gap
 #: between samples where that is less: lags and delays may be as fast as these show, however long the recording.
 SCALE_RANGE, OF_A_GAP = (0.02, 1.0), 0.1
-#: Difference of two evaluations, relative to the largest output, up to which a simulator repeats itself.
-JITTER = 1e-4
+#: Share of the data's spread that a candidate adds when it is tried.
+A_LITTLE = 0.03
 #: Change of the outputs, relative to their size, that counts as none.
 UNCHANGED = 1e-6
 
@@ -76,6 +77,17 @@ class Candidate:
         return 0
 
     @property
+    def acting(self) -> Tensor:
+        """Values ``(P,)`` at which it acts a little, to first order, in the middle of its shapes."""
+        values, middle = self.begin.clone(), len(self.shapes) // 2
+        values[self.own] = self.shapes[middle]
+        spread = float(self.problem.recording.spread[self.problem.index].norm())
+        for a, place in enumerate(self.amplitudes):
+            size = float(self.tangents[middle, :, a].norm())
+            values[place] += A_LITTLE * (spread / size if size > 0 else 1.0) * (self.one_sided(place) or 1)
+        return values
+
+    @property
     def blind(self) -> bool:
         """Whether the tangent at the neutral value vanishes or says nothing new, so that only a refit can tell."""
         return self.bent is not None or not bool((self.tangents.abs() > 0).any())
@@ -90,24 +102,6 @@ def base_columns(problem: Problem, fixed: Mapping[str, float] | None) -> tuple[l
     free, held = free_parameters(problem.parameters, fixed, least=0)
     place = {q.name: i for i, q in enumerate(problem.parameters)}
     return [place[q.name] for q in free], {place[name]: value for name, value in held.items()}
-
-
-def check_repeats(problem: Problem, values: Tensor, what: str = "the simulator") -> None:
-    """Raise if the outputs at parameter values ``(P,)`` are others when they are computed again.
-
-    Raises:
-        SimulatorError: If they are.
-    """
-    once, again = (torch.nan_to_num(problem.evaluate(values[None], [])[0][0]) for _ in range(2))
-    moved = (again - once).abs()
-    # What jitters less than this is no random number, but an external solver or sums of single precision.
-    if bool((moved > JITTER * torch.maximum(once.abs().max(), problem.recording.spread[problem.index])).any()):
-        k = int(moved.argmax())
-        raise SimulatorError(
-            f"Expected the same outputs whenever {what} is called with the same parameters. Got {float(once[k]):.6g} "
-            f"and then {float(again[k]):.6g}: {_place(problem, k)}. Leave random numbers out of it, or draw them once, "
-            "before."
-        )
 
 
 def replaces(problem: Problem, values: Tensor, term: Term) -> bool:
@@ -126,13 +120,6 @@ def replaces(problem: Problem, values: Tensor, term: Term) -> bool:
         return any(torch.equal(f(x, p, y) + 0 * y, f(x, p, 2 * y) + 0 * y) for f in term.outputs.values())
     except Exception:  # a term that needs more than that is called by the simulator, which tells what is wrong
         return False
-
-
-def _place(problem: Problem, k: int) -> str:
-    """Which output a used datum is, and at which condition or time, in words."""
-    x, row = problem.recording.x, int(problem.condition_of[k])
-    at = ", ".join(f"{n} = {float(v[row]):.4g}" for n, v in (x if isinstance(x, Mapping) else {"x": x}).items())
-    return f"output {problem.recording.outputs[int(problem.output_of[k])]!r} at {at}"
 
 
 def drivers_scale(problem: Problem, found: Fitted) -> dict[str, float]:
@@ -264,7 +251,7 @@ def prepare(
         bad = (~torch.isfinite(y[0])).nonzero()[:, 0]
         raise SimulatorError(
             f"Expected finite outputs with the term {name!r} at its neutral values {values}. Got {float(y[0, bad[0]])} "
-            f"for {len(bad)} of {problem.n} data, first {_place(problem, int(bad[0]))} (no coefficient switches off "
+            f"for {len(bad)} of {problem.n} data, first {place_of(problem, int(bad[0]))} (no coefficient switches off "
             "what is infinite: keep logarithms, roots and quotients finite at every datum)."
         )
     size = torch.maximum(found.whitening.sd, base.recording.spread[base.index])

@@ -7,13 +7,14 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from typing import Any
 
+import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchcal.checks import whole
 from torchcal.data import Recording
 from torchcal.discovery import explain, verify
-from torchcal.discovery.candidates import base_columns, check_repeats
+from torchcal.discovery.candidates import base_columns
 from torchcal.discovery.decision import Decision
 from torchcal.discovery.embedded import embed_each, model_error_sd
 from torchcal.discovery.experiment import propose
@@ -33,6 +34,7 @@ from torchcal.discovery.rounds import settle, with_all, with_explained, without_
 from torchcal.discovery.search import Search
 from torchcal.discovery.several import refit_several
 from torchcal.discovery.symptoms import more_than_replicates, symptoms, unlike
+from torchcal.discovery.trial import check_repeats, check_slopes
 from torchcal.discovery.verdict import PLAINLY_WHITE, decide
 from torchcal.discovery.where import locate, missing_rate, needed_shifts
 from torchcal.display import NONE
@@ -99,7 +101,8 @@ def diagnose(
     Raises:
         DomainError: If an argument is not as described.
         RecordingError: If simulator and recording do not belong together.
-        SimulatorError: If the simulator or a term raises, or gives other outputs when it is called again.
+        SimulatorError: If the simulator or a term raises, gives other outputs when it is called again, or loses a
+            derivative, as NumPy does.
         ConvergenceError: If the base cannot be calibrated at all.
 
     Warns:
@@ -136,6 +139,7 @@ def diagnose(
     mask = verify.choose(recording, holdout, len(free))
     for values in starts(problem, 2, seed, held):  # at zero nothing may move
         check_repeats(problem, values)
+        check_slopes(problem, values, free)
     bar = tqdm(disable=not progress, desc="diagnose", unit="step", leave=False)
 
     def tick(text: str) -> None:
@@ -202,6 +206,11 @@ def _interruption(search: Search) -> str:
 
 
 def _check(simulator: Any, recording: Any, candidates: Any, confidence: float) -> list[Term]:
+    if torch.is_inference_mode_enabled():
+        raise DomainError(
+            "Expected a diagnosis outside torch.inference_mode(), which takes no derivatives. Got one within "
+            "(torch.no_grad() is allowed)."
+        )
     if not isinstance(simulator, Simulator):
         raise DomainError(f"Expected a Simulator or an ODESimulator. Got {type(simulator).__name__}.")
     if not isinstance(recording, Recording):

@@ -1,5 +1,6 @@
 """Why the best explanation of a recording may be no name, however probable it is."""
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 
@@ -7,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.explain import misfit_size, stated_sd
+from torchcal.discovery.fitting import weighed
 from torchcal.discovery.given import as_good
 from torchcal.discovery.instruments import no_instrument, unnatural
 from torchcal.discovery.local import force, is_window
@@ -42,14 +44,27 @@ FREE = 2
 WRONG_WAY, MORE = 2.0, 1 / 3
 #: Log odds against a nameless change from which on a term in a window is there for its own shape.
 CLEARLY = 3.0
+#: Share of the squared misfit that two terms leave at most, where few data show them together alone.
+NEXT_TO_NOTHING = 1e-3
 #: Share of the largest effect of the base's parameters below which a direction of them moves no datum.
 UNSEEN = 1e-7
 
 
 def doubt(search: Search, model: Model) -> str:
     """Why a model is no name, however probable, in a sentence; empty if it may be one."""
-    found = _no_better(search, model) or unfit(search, model) or by_hold(search, model)
+    found = _no_better(search, model) or unfit(search, model) or by_hold(search, model) or _pair_of_many(search, model)
     return found or ("" if search.exact else _noise_or_physics(search, model))
+
+
+def _pair_of_many(search: Search, model: Model) -> str:
+    """Why terms that show together alone, in few data, are no name unless they leave next to nothing."""
+    left = float(model.found.residual.square().sum() / search.base.residual.square().sum())
+    if not search.paired or left <= NEXT_TO_NOTHING:
+        return ""
+    return (
+        "So few data with noise of unknown size show it by two terms together alone, as two others may do: more data, "
+        "replicates or a known noise sd would tell."
+    )
 
 
 def unfit(search: Search, model: Model) -> str:
@@ -66,6 +81,8 @@ def unfit(search: Search, model: Model) -> str:
 def left_open(search: Search, model: Model) -> str:
     """Why the data do not determine what a model adds; empty if they do."""
     names = [q.name for q in model.found.problem.parameters]
+    if (noise := beside(search, model)) is not search.noise:
+        model = dataclasses.replace(model, found=weighed(model.found, noise.whitening(model.found.problem)))
     for term in model.candidate.terms:
         shapes = [i for i in model.candidate.own if term.brings(names[i]) and not is_window(names[i])]
         places = [i for i in model.candidate.amplitudes if term.brings(names[i])]

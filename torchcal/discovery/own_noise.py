@@ -32,6 +32,7 @@ __all__ = [
     "outdone",
     "outliers",
     "outliers_alone",
+    "pairs_by_chance",
     "suited",
     "weigh_alone",
 ]
@@ -50,6 +51,8 @@ LEAST_FREE = 0.05
 LIKELIER = 3.0
 #: χ² a datum below which the noise estimated is its least, not the misfit's size: a residual so far below is rounding.
 ROUNDING = 0.01
+#: Correlation of two tangents from which on they are one.
+SAME = 0.999
 #: Share of the search's noise sd below which a model's own takes its place.
 OUTDATED = 0.8
 #: Mean relative difference of the noise's sd in its unit, in logarithms, from which on it grows otherwise.
@@ -141,6 +144,28 @@ def fits_by_chance(search: "Search") -> float:
         if freedom > 0 and model.physical and 0.0 <= left < 1.0:
             least = min(least, _beta(left, 0.5 * freedom, 0.5 * added))
     return min(1.0, least * len(search.candidates))
+
+
+def pairs_by_chance(search: "Search") -> float:
+    """Probability that white noise alone lets two candidates together, to first order, do as much as two of them do.
+
+    As `fits_by_chance`, times the number of pairs of tangents: two that each do little may do all together.
+    """
+    residual, screening = search.residual, search.screening
+    there = screening.norm > 0
+    columns, owner = screening.columns[:, there], screening.owner[there]
+    freedom = residual.freedom - 2
+    total = float(residual.e.square().sum())
+    if search.max_terms < 2 or freedom <= 0 or total <= ROUNDING * search.problem.n:
+        return 1.0
+    along, shared = columns.T @ residual.e, columns.T @ columns
+    apart = owner[:, None] < owner
+    apart &= shared.abs() < SAME
+    if not bool(apart.any()):
+        return 1.0
+    taken = along[:, None].square() + along.square() - 2 * shared * along[:, None] * along
+    most = float((taken / (1 - shared.square()))[apart].max())
+    return min(1.0, _beta(max(1.0 - most / total, 0.0), 0.5 * freedom, 1.0) * int(apart.sum()))
 
 
 def _beta(x: float, a: float, b: float) -> float:

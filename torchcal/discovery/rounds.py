@@ -21,6 +21,7 @@ from torchcal.discovery.own_noise import (
     outdone,
     outliers,
     outliers_alone,
+    pairs_by_chance,
 )
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.residual import Residual
@@ -197,6 +198,8 @@ def _refit(search: Search, confidence: float) -> bool:
             alone = base_alone(search)
             detected = alone < HOPELESS or (search.p_detect < OFTEN * level and alone < level)
             detected = detected or (not search.few and odds_alone(search) > -math.log(level))
+        if not detected and search.few and (p := pairs_by_chance(search)) < FEW_DATA * level:
+            detected, search.paired, search.p_detect = True, True, min(p, search.p_detect)
         if detected and not at_once and not search.stop.is_set():
             before, search.models = search.models, []
             refit_singles(search)

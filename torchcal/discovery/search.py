@@ -25,6 +25,7 @@ from torchcal.discovery.screen import Screening, Window, screen, windows
 from torchcal.discovery.sharpen import SOLVER_SHARE, accurate, sharpen
 from torchcal.discovery.stop import Stop
 from torchcal.discovery.structure import Structure, analyse
+from torchcal.discovery.trial import check_slopes
 from torchcal.discovery.verify import HeldOut, held_out_fit
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.terms import Term
@@ -83,6 +84,7 @@ class Search:
     failed: set[int] = field(init=False, default_factory=set)
     left: set[int] = field(init=False, default_factory=set)
     p_detect: float = field(init=False, default=1.0)
+    paired: bool = field(init=False, default=False)
     least: Tensor = field(init=False)
     otherwise: dict[int, tuple[Fitted, Fitted | None]] = field(init=False, default_factory=dict)
     _unknown: dict[int, tuple[Fitted, tuple[Noise, float]]] = field(init=False, default_factory=dict)
@@ -120,6 +122,8 @@ class Search:
         for term in self.terms:
             self.tick(f"screen {term.name}")
             self.candidates.append(prepare(self.base.problem, self.base, [term], self.fixed, scale))
+        for candidate in self.candidates:
+            check_slopes(candidate.problem, candidate.acting, candidate.own, f"the simulator with {candidate.name!r}")
         self.screening = screen(self.residual, self.candidates)
         within = within_bounds(self.base, self.fixed, self.seed)
         for i, candidate in enumerate(self.candidates):
