@@ -10,6 +10,8 @@ import torch
 import torchcal as tc
 from torchcal.discovery import verify, where
 from torchcal.discovery.candidates import _shape_points, sized
+from torchcal.discovery.problem import Problem
+from torchcal.discovery.trial import check_slopes
 from torchcal.errors import DomainError, SimulatorError
 
 F64 = torch.float64
@@ -219,6 +221,22 @@ def test_a_kink_is_no_lost_derivative():
     )  # fmt: skip
     recording = tc.Recording(x=x, y=3 * torch.exp(-0.7 * x) + 0.02 * noise(60, 0), noise=0.02)
     assert diagnose(decay(torch.exp), recording, [rest, step]).verdict == "consistent"
+
+
+def test_a_threshold_at_a_datum_is_no_lost_derivative():
+    """Thresholds are tried at the data's own values, where their slope is that of one side."""
+    x = torch.linspace(0, 1, 12, dtype=F64)
+    recording = tc.Recording(x=x, y=(1 + x).minimum(torch.tensor(1.6)) + 0.01 * noise(12, 1), noise=0.01)
+    rising = tc.Simulator(lambda x, p: p["a"] + x, [tc.Parameter("a")])
+    problem = Problem.of(rising, recording)
+    stop = tc.Term(
+        "stop", outputs={"y": lambda x, p, y: y - p["c"] * (y - p["y0"]).clamp_min(0.0)},
+        parameters=[tc.Parameter("c", low=0.0), tc.Parameter("y0", low=1.0, high=2.0)],
+    )  # fmt: skip
+    with_stop = problem.with_simulator(tc.terms.extend(rising, [stop]))
+    for at in (10, 9):  # one or two data beyond it
+        check_slopes(with_stop, torch.tensor([1.0, 0.5, float(1 + x[at])], dtype=F64), [1, 2])
+    assert diagnose(rising, recording, [stop]).terms == ["stop"]
 
 
 def test_inference_mode_is_refused():
