@@ -59,7 +59,7 @@ def check_slopes(problem: Problem, values: Tensor, columns: Sequence[int], what:
         change = float(seen.norm())
         sure = change > ROUNDED * float(y.norm()) and float(bent.norm()) < AGREE * change
         off = float((seen - steps[k] * jacobian[0, :, k]).norm())
-        if sure and not off <= OFF * change:
+        if sure and off > OFF * change:  # and not where a slope is infinite
             raise SimulatorError(
                 f"Expected {what} to depend on {problem.parameters[place].name!r} through torch operations alone. Got "
                 f"outputs that change otherwise with it than their derivative says, by {off / change:.0%}. Avoid "

@@ -39,7 +39,7 @@ PLAINLY_WHITE, LINEAR = 0.05, 0.02
 #: same along the only condition of a static recording, where nothing else of the term is seen than a piece of a curve.
 TELLING, TELLING_ALONE = 500.0, 3000.0
 #: By how much more than the sd that is given a named model may miss the data, beyond chance: such sd are seldom exact.
-LARGER, CHANCE = 1.25, 3.0
+LARGER, CHANCE = 1.15, 2.0
 #: Of those less likely than the base, a hypothesis is listed among the tied ones with log odds down to this against the
 #: base, and at least this probability.
 WORSE, WORTH = 1.0, 0.05
