@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcal.data import Recording
+from torchcal.data import Recording, Run
 from torchcal.errors import DomainError, MissingDependencyError, RecordingError, ShapeError, TorchcalError
 
 NAN, INF = float("nan"), float("inf")
@@ -553,3 +553,15 @@ def test_repr():
     ]
     assert repr(Recording(x=X, y=Y)).splitlines()[-1] == "  noise     unknown"
     assert repr(Recording(x=X, y=Y, noise="none")).splitlines()[-1] == "  noise     none"
+
+
+def test_copies_of_rows():
+    x, y = [1.0, 2.0, 3.0], [0.5, 0.7, 0.1]
+    assert Recording(x=x + x[:2], y=y + y[:2]).copies.tolist() == [False, False, False, True, True]
+    assert not Recording(x=x, y=y).copies.any()
+    assert not Recording(x=x + x[:2], y=[*y, 0.5, 0.8]).copies.any()  # replicates
+    assert not Recording(x=x + x[:2], y=[4.0, 7.0, 4.0, 4.0, 7.0]).copies.any()  # counts
+    both = Recording(x=x + x[2:], y={"a": y + y[2:], "b": [1.0, np.nan, np.nan, np.nan]}, missing=True)
+    assert both.copies.tolist() == [False, False, False, True]
+    run = Run(time=x, outputs={"a": y})
+    assert not Recording(runs=[run, run]).copies.any()

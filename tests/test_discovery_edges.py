@@ -243,3 +243,15 @@ def test_inference_mode_is_refused():
     x = torch.linspace(0, 4, 20, dtype=F64)
     with torch.inference_mode(), pytest.raises(DomainError, match="inference_mode"):
         diagnose(decay(torch.exp), tc.Recording(x=x, y=torch.exp(-x)))
+
+
+def test_a_table_that_was_read_twice_has_no_replicates():
+    x = torch.linspace(0, 4, 40, dtype=F64)
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    for times, differ in ((1, False), (2, False), (3, False), (2, True)):
+        scatter = noise(40 * times, 2) if differ else noise(40, 2).repeat(times)
+        d = diagnose(line, tc.Recording(x=x.repeat(times), y=(1 + 0.5 * x).repeat(times) + 0.1 * scatter))
+        assert (d.verdict, d.noise.outliers) == ("consistent", 0)
+        assert d.noise.sd["y"] == pytest.approx(0.1, rel=0.15)
+        assert (d.noise.source == "replicates") is differ
+        assert any("read twice" in line for line in d.symptoms) is (times > 1 and not differ)

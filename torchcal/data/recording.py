@@ -191,6 +191,23 @@ class Recording:
             )
         return dict(zip(self.outputs, values.split(self.n, dim=-1), strict=True))
 
+    @property
+    def copies(self) -> Tensor:
+        """Rows of a static recording that are earlier ones once more, numbers and all, bool of shape ``(n,)``.
+
+        As of a table that was read twice. None are where other rows at the same conditions differ, as replicates do,
+        or where different conditions give the same numbers too, as counts do.
+        """
+        none = torch.zeros(self.n, dtype=torch.bool)
+        if self.runs is not None:
+            return none
+        y = torch.nan_to_num(self.y.reshape(len(self.outputs), self.n).T, nan=torch.inf)
+        rows, number = torch.cat([self.columns, y], dim=-1).unique(dim=0, return_inverse=True)
+        if len(rows) == self.n or len(rows) > len(self.columns.unique(dim=0)) or len(y.unique(dim=0)) < len(rows):
+            return none
+        first = torch.full((len(rows),), self.n).scatter_reduce(0, number, torch.arange(self.n), "amin")
+        return torch.arange(self.n) != first[number]
+
     def subset(self, mask: Any) -> "Recording":
         """Keep the conditions where the mask is True, with all their outputs.
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.curves import beyond
-from torchcal.discovery.problem import Problem, Whitening, remembered
+from torchcal.discovery.problem import Problem, Whitening, observed_once, remembered
 from torchcal.discovery.records import NoiseModel
 from torchcal.errors import DomainError
 
@@ -92,7 +92,7 @@ class Noise:
             range={name: (low, high) for name, (low, high) in ends.items() if high > VARIES * low},
             correlation={name: float(c) for name, c in zip(names, self.correlation, strict=True)},
             source=self.source,
-            outliers=int((problem.recording.observed & ~problem.keep).sum()),
+            outliers=int((observed_once(problem.recording) & ~problem.keep).sum()),
             quantisation=self.step,
             memory=("sample" if problem.by_sample else "time") if problem.uneven and self.correlation.any() else "",
         )

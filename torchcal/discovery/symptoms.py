@@ -48,6 +48,11 @@ def symptoms(search: Search, best: Model | None) -> list[str]:
         elif is_bent:
             bent.append(f"{e.name} was bent: {e.amount} in the calibrated base, {with_terms}")
     rows = runs + bent
+    if count := int(search.problem.recording.copies.sum()):
+        rows.append(
+            f"{count} of {search.problem.recording.n} rows are others once more, numbers and all, as of a table that "
+            "was read twice: they count once"
+        )
     if search.noise.doubted > 1:
         # A misfit that is smooth on coarse spacing passes for fast: what leaves less tells more of the noise.
         leader = best or search.physical_leader
