@@ -255,3 +255,14 @@ def test_a_table_that_was_read_twice_has_no_replicates():
         assert d.noise.sd["y"] == pytest.approx(0.1, rel=0.15)
         assert (d.noise.source == "replicates") is differ
         assert any("read twice" in line for line in d.symptoms) is (times > 1 and not differ)
+
+
+def test_an_output_without_noise_is_not_judged_by_its_rounding():
+    x = torch.linspace(0, 4, 60, dtype=F64)
+    both = tc.Simulator(
+        lambda x, p: {"y": p["a"] + p["b"] * x, "level": p["c"] + 0 * x}, [tc.Parameter(name) for name in "abc"]
+    )
+    bend = tc.Term("bend", outputs={"y": lambda x, p, y: y + p["q"] * x**2}, parameters=[tc.Parameter("q")])
+    y = {"y": 1 + 0.5 * x + 0.2 * x**2 + 0.05 * noise(60, 0), "level": torch.full((60,), 5.3, dtype=F64)}
+    d = diagnose(both, tc.Recording(x=x, y=y), [bend])
+    assert (d.terms, d.remaining) == (["bend"], 0.0)

@@ -30,7 +30,7 @@ def decide_exact(search: Search, ranked: list[Model], mask: Tensor | None, decis
     """Without noise nothing is white: a term must remove nearly all of the held-out misfit that is left, far more than
     any rival; then another may remove nearly all of what that leaves."""
     decision.none_evidence = -math.inf
-    if search.base.exact:
+    if bool(search.base.met.all()):
         decision.verdict = "consistent"
         return decision
     clean = [m for m in ranked if not m.note]

@@ -259,18 +259,18 @@ def _noise_or_physics(search: Search, model: Model) -> str:
     Noise of unknown size that is slow is what a wrong shape leaves, too; where most of it is small, and some of it
     large, it is no noise of one size. Where rows do not follow one another no correlated noise is estimated.
     """
-    if model.found.exact:
-        return ""
     noise, problem = beside(search, model), model.found.problem
     e = noise.whitening(problem).vector(model.found.residual)
-    if problem.sweeps is None and _along_rows(problem, e) > ALONG:
+    if problem.sweeps is None and not bool(model.found.met.all()) and _along_rows(problem, e) > ALONG:
         return (
             "What it leaves is correlated in the order of the recording, as noise or as physics: the same conditions "
             "in another order would tell."
         )
     for k, rho in enumerate(noise.correlation.tolist() if noise.open else ()):
         mine = e[problem.output_of == k]
-        if len(mine) and (rho >= SLOWEST or (len(mine) >= MANY and _evenness(mine) < EVEN)):
+        if bool(model.found.met[problem.output_of == k].all()):
+            continue  # what is left is rounding
+        if rho >= SLOWEST or (len(mine) >= MANY and _evenness(mine) < EVEN):
             return (
                 "What it leaves is so slow, or of such uneven size, that it may as well be physics as noise: a known "
                 "noise sd, replicates or a repeated run would tell."

@@ -63,10 +63,9 @@ class Fitted:
         return self.problem.y - self.y
 
     @property
-    def exact(self) -> bool:
-        """Whether it meets every datum to a millionth of the data's spread: what it leaves is rounding."""
-        spread = self.problem.recording.spread[self.problem.index]
-        return bool((self.residual.abs() <= 1e-6 * spread).all())
+    def met(self) -> Tensor:
+        """Which data it meets to a millionth of their spread, bool ``(n,)``: what it leaves of them is rounding."""
+        return self.residual.abs() <= 1e-6 * self.problem.recording.spread[self.problem.index]
 
     def covariance(self) -> Tensor:
         """Of the free parameters, ``(free, free)``; directions without information get a huge variance."""
