@@ -556,12 +556,19 @@ def test_repr():
 
 
 def test_copies_of_rows():
-    x, y = [1.0, 2.0, 3.0], [0.5, 0.7, 0.1]
-    assert Recording(x=x + x[:2], y=y + y[:2]).copies.tolist() == [False, False, False, True, True]
+    x, y = [1.0, 2.0, 3.0, 4.0, 5.0], [0.5, 0.7, 0.1, 0.3, 0.6]
+    twice = Recording(x=x + x, y=y + y)
+    assert twice.copies.tolist() == [False] * 5 + [True] * 5
+    assert torch.equal(twice.observed_once, ~twice.copies)
+    assert int(Recording(x=x * 3, y=y * 3).copies.sum()) == 10
     assert not Recording(x=x, y=y).copies.any()
-    assert not Recording(x=x + x[:2], y=[*y, 0.5, 0.8]).copies.any()  # replicates
-    assert not Recording(x=x + x[:2], y=[4.0, 7.0, 4.0, 4.0, 7.0]).copies.any()  # counts
-    both = Recording(x=x + x[2:], y={"a": y + y[2:], "b": [1.0, np.nan, np.nan, np.nan]}, missing=True)
-    assert both.copies.tolist() == [False, False, False, True]
+    assert not Recording(x=x + x, y=[*y, *y[:4], 0.8]).copies.any()  # replicates
+    assert not Recording(x=x + x, y=y + y, noise=0.1).copies.any()  # of which readings may agree
+    assert not Recording(x=[1.0] * 10, y=[0.5] * 10).copies.any()  # one reading, ten times
+    assert not Recording(x=x[:3] * 2, y=y[:3] * 2).copies.any()
+    missing = {"a": y + y, "b": [1.0, np.nan, np.nan, 2.0, 3.0] * 2}
+    both = Recording(x=x + x, y=missing, missing=True)
+    assert both.copies.tolist() == [False] * 5 + [True] * 5
+    assert int(both.observed_once.sum()) == 8
     run = Run(time=x, outputs={"a": y})
     assert not Recording(runs=[run, run]).copies.any()

@@ -19,6 +19,9 @@ from torchcal.errors import RecordingError, ShapeError
 
 __all__ = ["Recording"]
 
+#: Fewest rows of a table that may have been read twice.
+TABLE = 5
+
 
 @dataclass(frozen=True, init=False, repr=False, eq=False)
 class Recording:
@@ -193,20 +196,27 @@ class Recording:
 
     @property
     def copies(self) -> Tensor:
-        """Rows of a static recording that are earlier ones once more, numbers and all, bool of shape ``(n,)``.
+        """Rows of a static recording without noise= that are earlier ones once more, bool of shape ``(n,)``.
 
-        As of a table that was read twice. None are where other rows at the same conditions differ, as replicates do,
-        or where different conditions give the same numbers too, as counts do.
+        All rows, numbers and order, of a table that was read twice or more. None are where noise is given, whose
+        repeated readings may agree.
         """
         none = torch.zeros(self.n, dtype=torch.bool)
-        if self.runs is not None:
+        if self.runs is not None or self.noise is not None:
             return none
         y = torch.nan_to_num(self.y.reshape(len(self.outputs), self.n).T, nan=torch.inf)
-        rows, number = torch.cat([self.columns, y], dim=-1).unique(dim=0, return_inverse=True)
-        if len(rows) == self.n or len(rows) > len(self.columns.unique(dim=0)) or len(y.unique(dim=0)) < len(rows):
-            return none
-        first = torch.full((len(rows),), self.n).scatter_reduce(0, number, torch.arange(self.n), "amin")
-        return torch.arange(self.n) != first[number]
+        rows = torch.cat([self.columns, y], dim=-1)
+        for times in range(2, self.n // TABLE + 1):
+            once = self.n // times
+            again = self.n % times == 0 and torch.equal(rows, rows[:once].repeat(times, 1))
+            if again and len(rows.unique(dim=0)) == once:
+                return torch.arange(self.n) >= once
+        return none
+
+    @property
+    def observed_once(self) -> Tensor:
+        """Which outputs were observed, those of `copies` aside, bool of shape ``(n_total,)``."""
+        return self.observed & ~self.copies.repeat(len(self.outputs))
 
     def subset(self, mask: Any) -> "Recording":
         """Keep the conditions where the mask is True, with all their outputs.

@@ -23,6 +23,8 @@ HALVED = 7
 #: The solver's error at the first starting value, in the data's spread, from which on the fit begins with shorter
 #: steps, and how often they are halved for that at most.
 WRONG, EARLY = 0.1, 2
+#: Misfit of an output, in that of all, each in its spread, below which the solver need not be more exact for it.
+FAR_BELOW = 0.03
 #: Difference of χ² up to which an initial angle in another turn gives the same fit.
 SAME_FIT = 0.01
 #: Share of the data that may be outliers, and how often some are set aside before those that are left are looked at
@@ -201,17 +203,20 @@ def _again(found: Fitted, keep: Tensor) -> Fitted:
 
 def _sharpen(found: Fitted, sd: Tensor | None = None) -> Fitted:
     """Shorten time steps, where they err, until the solver's error is small against the noise, of an sd ``(n_total,)``;
-    against each output's misfit where none is known yet."""
+    against each output's misfit where none is known yet, but not far below that of all: one without noise tells no more
+    than that of how exact the others must be."""
     recording = found.problem.recording
-    if sd is None and isinstance(recording.noise, Tensor):
-        sd = recording.noise
+    given = isinstance(recording.noise, Tensor)
+    sd = recording.noise if isinstance(recording.noise, Tensor) else sd
 
     def allowed(now: Fitted) -> Tensor:
-        size, index = torch.zeros_like(now.y), now.problem.index
+        index, spread = now.problem.index, recording.spread[now.problem.index]
+        size = torch.zeros_like(now.y) if sd is None else sd[index]
         for k in now.problem.output_of.unique() if sd is None else ():
             mine = now.problem.output_of == k
             size[mine] = now.residual[mine].square().mean().sqrt()
-        return SOLVER_SHARE * torch.maximum(size if sd is None else sd[index], 1e-6 * recording.spread[index])
+        least = 0.0 if given else float((now.residual / spread).square().mean().sqrt())
+        return SOLVER_SHARE * torch.maximum(size, max(FAR_BELOW * least, 1e-6) * spread)
 
     found, error = sharpen(found, allowed, rounds=HALVED)
     if not error:

@@ -85,6 +85,9 @@ class Candidate:
         for a, place in enumerate(self.amplitudes):
             size = float(self.tangents[middle, :, a].norm())
             values[place] += A_LITTLE * (spread / size if size > 0 else 1.0) * (self.one_sided(place) or 1)
+        low, high = self.problem.limits()
+        inside = torch.where((high - low).isfinite(), A_LITTLE * (high - low), torch.zeros_like(low))
+        values[self.own] = values[self.own].clamp(low[self.own] + inside[self.own], high[self.own] - inside[self.own])
         return values
 
     @property
@@ -200,7 +203,8 @@ def _shape_points(parameter: Parameter, count: int) -> list[float]:
         middle = parameter.initial or parameter.neutral or 1.0
         end = low if low is not None else high if high is not None else 0.0
         away = middle - end
-        if (low is not None and away <= 0) or (high is not None and away >= 0):  # on the wrong side of its only bound
+        on_it = away == 0 and count == 1  # as the user may have it
+        if not on_it and ((low is not None and away <= 0) or (high is not None and away >= 0)):
             away = math.copysign(abs(end) or 1.0, 1.0 if low is not None else -1.0)
         factors = torch.linspace(-2, 2, count).tolist() if count > 1 else [0.0]
         return [end + away * 2.0**k for k in factors]

@@ -26,7 +26,7 @@ from torchcal.discovery.model import Model
 from torchcal.discovery.nameless import refit_nameless
 from torchcal.discovery.noise import Noise
 from torchcal.discovery.own_noise import beside, explains
-from torchcal.discovery.problem import Problem, observed_once
+from torchcal.discovery.problem import Problem
 from torchcal.discovery.ranking import ranking
 from torchcal.discovery.records import Scores, Table
 from torchcal.discovery.result import Diagnosis
@@ -116,7 +116,7 @@ def diagnose(
     check_executor(executor, diagnose)
     given = terms
     terms = [term for term in given if not _contains(simulator, term)]
-    problem = Problem.of(simulator, recording)
+    problem = Problem.of(simulator, recording).keeping(recording.observed_once)
     try:
         free, held = base_columns(problem, fixed)
     except EmbeddingError as error:  # which says of the same that it cannot be embedded
@@ -370,7 +370,7 @@ def _result(
         recording=recording,
         simulator=simulator,
         held_out=mask,
-        set_aside=observed_once(recording) & ~search.problem.keep,
+        set_aside=recording.observed_once & ~search.problem.keep,
         p_detect=search.p_detect,
         confidence=confidence,
         library=[term.name for term in terms],

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.curves import beyond
-from torchcal.discovery.problem import Problem, Whitening, observed_once, remembered
+from torchcal.discovery.problem import Problem, Whitening, remembered
 from torchcal.discovery.records import NoiseModel
 from torchcal.errors import DomainError
 
@@ -20,6 +20,8 @@ __all__ = [
     "GRID", "LEAST", "Noise", "decorrelated", "estimate", "growth", "least", "log_prior", "mine", "quantisation"
 ]  # fmt: skip
 
+#: Difference of replicates, in the size of the data, up to which they agree.
+ROUNDING = 1e-12
 #: AR(1) coefficients that are tried.
 GRID = torch.linspace(0.0, 0.95, 39, dtype=torch.float64)
 #: Weights against correlation, in log prior density: of φ, and of the share of a recording that it lasts.
@@ -92,7 +94,7 @@ class Noise:
             range={name: (low, high) for name, (low, high) in ends.items() if high > VARIES * low},
             correlation={name: float(c) for name, c in zip(names, self.correlation, strict=True)},
             source=self.source,
-            outliers=int((observed_once(problem.recording) & ~problem.keep).sum()),
+            outliers=int((problem.recording.observed_once & ~problem.keep).sum()),
             quantisation=self.step,
             memory=("sample" if problem.by_sample else "time") if problem.uneven and self.correlation.any() else "",
         )
@@ -316,6 +318,8 @@ def _replicates(problem: Problem) -> list[_Replicates] | None:
         many = count[g] > 1
         off = (y - total[g] / count[g]) * (count[g] / (count[g] - 1).clamp_min(1)).sqrt()
         found.append(_Replicates(places[many], off[many], int((count - 1).clamp_min(0).sum())))
+    if not any(bool((one.off.abs() > ROUNDING * problem.recording.y.nan_to_num().abs().max()).any()) for one in found):
+        return None  # what always agrees, as coarse readings do, tells nothing of the noise
     return found if min(one.freedom for one in found) >= 3 else None
 
 

@@ -307,7 +307,7 @@ def _of_outliers(search: "Search") -> float:
     """Log density of what is set aside, with that of normal data without its constant for all others."""
     recording, value = search.problem.recording, 0.0
     for output in range(len(recording.outputs)):
-        here = mine(search.problem, output) & recording.observed
+        here = mine(search.problem, output) & recording.observed_once
         y, aside = recording.y[here], int((here & ~search.problem.keep).sum())
         if aside:
             density = RARE / (1 - RARE) * math.sqrt(2 * math.pi) / max(float(y.max() - y.min()), 1e-300)

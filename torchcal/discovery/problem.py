@@ -14,7 +14,7 @@ from torchcal.data import Recording
 from torchcal.errors import SimulatorError
 from torchcal.simulators import Parameter, Simulator, Solution, Trajectories, Values
 
-__all__ = ["Problem", "Whitening", "breaks", "observed_once", "remembered"]
+__all__ = ["Problem", "Whitening", "breaks", "remembered"]
 
 #: Combinations of all levels of all conditions, in the number of rows, up to which these are a grid; the levels of a
 #: condition up to which it switches between sweeps of another one; and the rows of a sweep, on average, at least.
@@ -56,11 +56,6 @@ class Whitening:
         return self(values.unsqueeze(-1)).squeeze(-1)
 
 
-def observed_once(recording: Recording) -> Tensor:
-    """Which outputs were observed, without those that only repeat others, bool ``(n_total,)``."""
-    return recording.observed & ~recording.copies.repeat(len(recording.outputs))
-
-
 @dataclass(frozen=True, eq=False)
 class Problem:
     """What is compared with what.
@@ -80,8 +75,8 @@ class Problem:
 
     @classmethod
     def of(cls, simulator: Simulator, recording: Recording) -> "Problem":
-        """The problem of all observed data, of rows that are there twice once."""
-        return cls(simulator.bind(recording), recording, observed_once(recording))
+        """The problem of all observed data."""
+        return cls(simulator.bind(recording), recording, recording.observed.clone())
 
     def with_simulator(self, simulator: Simulator) -> "Problem":
         """Another simulator of the same data."""

@@ -57,7 +57,10 @@ def sharpen(
         simulator = found.problem.simulator
         if not isinstance(simulator, Trajectories) or not may_change(simulator):
             return found, 0.0
-        finer = simulator.refined(2)
+        try:
+            finer = simulator.refined(2)
+        except DomainError:  # more steps than anyone can take
+            break
         y = finer.outputs_of(found.values[None], finer.solve(found.values[None]))[0, found.problem.index]
         error, most = (y - found.y).abs(), allowed(found)
         states = simulator.solve(found.values[None], found.warm)

@@ -13,10 +13,10 @@ __all__ = ["check_repeats", "check_slopes", "place_of"]
 
 #: Difference of two evaluations, relative to the largest output, up to which a simulator repeats itself.
 JITTER = 1e-4
-#: Step of a difference, in the size of a parameter; how nearly steps forth and back agree where there is no kink; by
-#: how much a derivative is none, more than a kink makes of that; and changes that rounding may be, in the size of
-#: the outputs.
-STEP, AGREE, OFF, ROUNDED = 1e-4, 0.05, 0.1, 1e-10
+#: Steps of differences, in the size of a parameter; how nearly those of either agree, and steps forth and back, where
+#: there is no kink; by how much a derivative is none, more than a kink makes of that; and changes that may be rounding,
+#: of single precision too, in the size of the outputs.
+STEPS, AGREE, OFF, ROUNDED = (1e-2, 1e-3), 0.05, 0.1, 3e-7
 
 
 def check_repeats(problem: Problem, values: Tensor, what: str = "the simulator") -> None:
@@ -41,25 +41,34 @@ def check_slopes(problem: Problem, values: Tensor, columns: Sequence[int], what:
     """Raise if outputs change otherwise with some parameters, at values ``(P,)``, than their derivatives say.
 
     Python numbers, NumPy and ``.detach()`` lose a derivative, or a part of it, without a word: what is then fitted is
-    nonsense. Where outputs have a kink, steps forth and back disagree and tell nothing.
+    nonsense. Where outputs have a kink or a jump, differences of steps disagree and tell nothing. No step leaves the
+    bounds, so that a parameter on one of them is not asked.
 
     Raises:
         SimulatorError: If they do.
     """
     if problem.simulator.dear and not isinstance(problem.simulator, Trajectories):
         return  # other code, which is differentiated by differences
-    y, jacobian, _ = problem.evaluate(values[None], list(columns))
-    size = values[list(columns)].abs()
-    steps = STEP * torch.where(size > 0, size, torch.ones_like(size))
-    moved = torch.zeros(len(columns), len(values), dtype=torch.float64)
-    moved[range(len(columns)), list(columns)] = steps
-    forth, back = problem.evaluate(torch.cat([values + moved, values - moved]), [])[0].chunk(2)
+    columns = list(columns)
+    y, jacobian, _ = problem.evaluate(values[None], columns)
+    low, high = (end[columns] for end in problem.limits())
+    at, width = values[columns], high - low
+    size = torch.where(at != 0, at.abs(), torch.where(width.isfinite(), width, torch.ones_like(width)))
+    room = torch.minimum(at - low, high - at).clamp_min(0.0)
+    moves = []
+    for factor in STEPS:
+        moved = torch.zeros(len(columns), len(values), dtype=torch.float64)
+        moved[range(len(columns)), columns] = factor * torch.minimum(size, room)
+        moves += [moved, -moved]
+    forth, back, near, behind = problem.evaluate(values + torch.cat(moves), [])[0].chunk(4)
     for k, place in enumerate(columns):
-        seen, bent = (forth[k] - back[k]) / 2, forth[k] + back[k] - 2 * y[0]
+        step = float(STEPS[1] * torch.minimum(size, room)[k])
+        far, seen = (forth[k] - back[k]) / 2 * (STEPS[1] / STEPS[0]), (near[k] - behind[k]) / 2
         change = float(seen.norm())
-        sure = change > ROUNDED * float(y.norm()) and float(bent.norm()) < AGREE * change
-        off = float((seen - steps[k] * jacobian[0, :, k]).norm())
-        if sure and off > OFF * change:  # and not where a slope is infinite
+        bent = max(float((far - seen).norm()), float((near[k] + behind[k] - 2 * y[0]).norm()))
+        off = float((seen - step * jacobian[0, :, k]).norm())
+        # Neither rounding nor a kink, nor where a slope is infinite.
+        if change > ROUNDED * float(y.norm()) and bent < AGREE * change and off > OFF * change:
             raise SimulatorError(
                 f"Expected {what} to depend on {problem.parameters[place].name!r} through torch operations alone. Got "
                 f"outputs that change otherwise with it than their derivative says, by {off / change:.0%}. Avoid "

@@ -56,17 +56,18 @@ def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None
                 f"held out. Got {mask.dtype} of shape {tuple(mask.shape)}."
             )
         mask = mask.repeat(len(recording.outputs)) if len(mask) == recording.n and len(recording.outputs) > 1 else mask
-        if int((recording.observed & ~mask).sum()) <= parameters or not bool((recording.observed & mask).any()):
+        kept = int((recording.observed_once & ~mask).sum())
+        if kept <= parameters or not bool((recording.observed_once & mask).any()):
             raise DomainError(
-                f"Expected holdout to leave more than {parameters} data and to hold out at least one. Got "
-                f"{int((recording.observed & ~mask).sum())} left (hold out less)."
+                f"Expected holdout to leave more than {parameters} data and to hold out at least one. Got {kept} left "
+                "(hold out less)."
             )
         return mask
     if isinstance(holdout, float):
         if not 0 < holdout < 1:
             raise DomainError(f"Expected holdout as a share between 0 and 1. Got {holdout}.")
         share = holdout
-    left = int(recording.observed.sum()) * (1 - share)
+    left = int(recording.observed_once.sum()) * (1 - share)
     if left < LEAST_PER_PARAMETER * parameters:
         if holdout is not None:
             raise DomainError(
@@ -75,7 +76,7 @@ def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None
             )
         return None
     x = recording.x
-    seen = recording.observed.reshape(len(recording.outputs), recording.n).any(0)
+    seen = recording.observed_once.reshape(len(recording.outputs), recording.n).any(0)
     if recording.runs is not None and isinstance(x, dict):
         mask = torch.zeros(recording.n, dtype=torch.bool)
         for r in x["run"].unique():
@@ -121,7 +122,7 @@ def within(recording: Recording) -> Tensor:
     columns = x if isinstance(x, dict) else {"x": x}
     along = columns["time"] if recording.runs is not None else next(iter(columns.values()))
     runs = columns["run"] if recording.runs is not None else torch.zeros(recording.n)
-    seen = recording.observed.reshape(len(recording.outputs), recording.n).any(0)
+    seen = recording.observed_once.reshape(len(recording.outputs), recording.n).any(0)
     mask = torch.zeros(recording.n, dtype=torch.bool)
     for r in runs.unique():
         mine = ((runs == r) & seen).nonzero()[:, 0]

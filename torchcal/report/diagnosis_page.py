@@ -141,7 +141,7 @@ def _headline(diagnosis: Any) -> str:
 
 def _facts(diagnosis: Any) -> str:
     recording = diagnosis.recording
-    facts = [("data", f"{int(recording.observed.sum())}")]
+    facts = [("data", f"{int(recording.observed_once.sum())}")]
     if _has(diagnosis, "p_detect"):
         facts.append(
             (
@@ -345,7 +345,7 @@ def _settings(diagnosis: Any) -> str:
 def _recording(recording: Any) -> str:
     runs = getattr(recording, "runs", None)
     kind = f"{len(runs)} run{'s' * (len(runs) > 1)}, {recording.n} samples" if runs else f"{recording.n} conditions"
-    return f"{kind}; outputs {', '.join(recording.outputs)}; {int(recording.observed.sum())} data"
+    return f"{kind}; outputs {', '.join(recording.outputs)}; {int(recording.observed_once.sum())} data"
 
 
 # --- figures ---------------------------------------------------------------------------------------------------
