@@ -13,10 +13,10 @@ __all__ = ["check_repeats", "check_slopes", "place_of"]
 
 #: Difference of two evaluations, relative to the largest output, up to which a simulator repeats itself.
 JITTER = 1e-4
-#: Steps of differences, in the size of a parameter; how nearly those of either agree, and steps forth and back, where
-#: there is no kink; by how much a derivative is none, more than a kink makes of that; and changes that may be rounding,
-#: of single precision too, in the size of the outputs.
-STEPS, AGREE, OFF, ROUNDED = (1e-2, 1e-3), 0.05, 0.1, 3e-7
+#: Steps of differences, in the size of a parameter; how nearly those of the first two agree, and steps forth and back,
+#: where there is no kink; by how much a derivative is off from all that is none, more than a kink makes of that; and
+#: changes that may be rounding, of single precision too, in the size of the outputs.
+STEPS, AGREE, OFF, ROUNDED = (1e-2, 1e-3, 1e-5), 0.05, 0.1, 3e-7
 
 
 def check_repeats(problem: Problem, values: Tensor, what: str = "the simulator") -> None:
@@ -60,15 +60,16 @@ def check_slopes(problem: Problem, values: Tensor, columns: Sequence[int], what:
         moved = torch.zeros(len(columns), len(values), dtype=torch.float64)
         moved[range(len(columns)), columns] = factor * torch.minimum(size, room)
         moves += [moved, -moved]
-    forth, back, near, behind = problem.evaluate(values + torch.cat(moves), [])[0].chunk(4)
+    found = problem.evaluate(values + torch.cat(moves), [])[0].chunk(2 * len(STEPS))
+    pairs = list(zip(STEPS, found[::2], found[1::2], strict=True))
     for k, place in enumerate(columns):
-        step = float(STEPS[1] * torch.minimum(size, room)[k])
-        far, seen = (forth[k] - back[k]) / 2 * (STEPS[1] / STEPS[0]), (near[k] - behind[k]) / 2
+        far, seen, close = ((forth[k] - back[k]) / (2 * factor) for factor, forth, back in pairs)
+        told = torch.minimum(size, room)[k] * jacobian[0, :, k]
+        bent = max(float((far - seen).norm()), float((found[2][k] + found[3][k] - 2 * y[0]).norm()) / STEPS[1])
         change = float(seen.norm())
-        bent = max(float((far - seen).norm()), float((near[k] + behind[k] - 2 * y[0]).norm()))
-        off = float((seen - step * jacobian[0, :, k]).norm())
+        off = min(float((one - told).norm()) for one in (seen, close))
         # Neither rounding nor a kink, nor where a slope is infinite.
-        if change > ROUNDED * float(y.norm()) and bent < AGREE * change and off > OFF * change:
+        if change * STEPS[1] > ROUNDED * float(y.norm()) and bent < AGREE * change and off > OFF * change:
             raise SimulatorError(
                 f"Expected {what} to depend on {problem.parameters[place].name!r} through torch operations alone. Got "
                 f"outputs that change otherwise with it than their derivative says, by {off / change:.0%}. Avoid "
