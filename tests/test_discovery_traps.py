@@ -321,6 +321,7 @@ def pumped(seed, dead=0.0, lag=1e-3):
     return model, tc.Recording(runs=[run], noise=0.01)
 
 
+@pytest.mark.slow
 def test_a_pump_takes_no_more_of_its_effect_away_than_there_is():
     terms = [term for term in tc.terms.hydraulics("h", inflow="q") if term.name in ("leak", "pump lag")]
     d = diagnose(*pumped(0, dead=0.4), terms)  # a dead time is in no list

@@ -229,6 +229,7 @@ def test_a_step_of_a_static_recording_is_found_between_its_data():
         assert found[end].sd < 0.05
 
 
+@pytest.mark.slow
 def test_what_begins_somewhere_and_is_in_no_list_is_not_named_by_a_window():
     """Butler and Volmer's law with a limiting current that no candidate has."""
     drop = torch.linspace(-0.2, 0.2, 61, dtype=torch.float64)
@@ -271,6 +272,7 @@ def test_what_the_base_has_everywhere_acts_where_there_are_fewer_data(side):
     assert next(e.value for e in d.final.estimates if e.name == "another slope.c") == pytest.approx(1.5, abs=0.2)
 
 
+@pytest.mark.slow
 def test_the_sd_of_a_steps_place_says_how_far_it_may_be_off():
     """One step in noise as large as a third of it: over seeds the errors are a few sd, not ten."""
     z = []
@@ -581,6 +583,7 @@ def test_a_loss_like_the_bases_is_found_on_its_own_side_of_an_edge():
     assert float(below[0].region.removeprefix("T < ")) == pytest.approx(18.0, abs=0.3)
 
 
+@pytest.mark.slow
 def test_a_base_that_blows_up_without_its_term_is_no_start_of_a_nameless_change():
     """Growth in proportion to the square, braked for a while: without the brake the rate found beside it diverges."""
     t, rng = np.linspace(0, 7, 120), np.random.default_rng(0)
