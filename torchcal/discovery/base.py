@@ -201,22 +201,28 @@ def _again(found: Fitted, keep: Tensor) -> Fitted:
     )
 
 
+def _misfit_of_each(found: Fitted) -> Tensor:
+    """RMSE of each output, at its data ``(n,)``."""
+    size = torch.zeros_like(found.y)
+    for k in found.problem.output_of.unique():
+        mine = found.problem.output_of == k
+        size[mine] = found.residual[mine].square().mean().sqrt()
+    return size
+
+
 def _sharpen(found: Fitted, sd: Tensor | None = None) -> Fitted:
     """Shorten time steps, where they err, until the solver's error is small against the noise, of an sd ``(n_total,)``;
     against each output's misfit where none is known yet, but not far below that of all: one without noise tells no more
     than that of how exact the others must be."""
     recording = found.problem.recording
-    given = isinstance(recording.noise, Tensor)
-    sd = recording.noise if isinstance(recording.noise, Tensor) else sd
 
     def allowed(now: Fitted) -> Tensor:
-        index, spread = now.problem.index, recording.spread[now.problem.index]
-        size = torch.zeros_like(now.y) if sd is None else sd[index]
-        for k in now.problem.output_of.unique() if sd is None else ():
-            mine = now.problem.output_of == k
-            size[mine] = now.residual[mine].square().mean().sqrt()
-        least = 0.0 if given else float((now.residual / spread).square().mean().sqrt())
-        return SOLVER_SHARE * torch.maximum(size, max(FAR_BELOW * least, 1e-6) * spread)
+        spread = recording.spread[now.problem.index]
+        if isinstance(recording.noise, Tensor):
+            return SOLVER_SHARE * torch.maximum(recording.noise[now.problem.index], 1e-6 * spread)
+        size = _misfit_of_each(now) if sd is None else sd[now.problem.index]
+        least = FAR_BELOW * float((now.residual / spread).square().mean().sqrt())
+        return SOLVER_SHARE * torch.maximum(size, max(least, 1e-6) * spread)
 
     found, error = sharpen(found, allowed, rounds=HALVED)
     if not error:

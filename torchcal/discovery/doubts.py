@@ -58,8 +58,10 @@ def doubt(search: Search, model: Model) -> str:
 
 def _pair_of_many(search: Search, model: Model) -> str:
     """Why terms that show together alone, in few data, are no name unless they leave next to nothing."""
-    left = float(model.found.residual.square().sum() / search.base.residual.square().sum())
-    if not search.paired or left <= NEXT_TO_NOTHING:
+    if not search.paired:
+        return ""
+    left, whole = (float(found.residual.square().sum()) for found in (model.found, search.base))
+    if left <= NEXT_TO_NOTHING * whole:
         return ""
     return (
         "So few data with noise of unknown size show it by two terms together alone, as two others may do: more data, "

@@ -122,7 +122,7 @@ class Search:
         for term in self.terms:
             self.tick(f"screen {term.name}")
             self.candidates.append(prepare(self.base.problem, self.base, [term], self.fixed, scale))
-        for candidate in self.candidates:
+        for candidate in self.candidates if not self.clean else ():  # later searches: these have been asked
             check_slopes(candidate.problem, candidate.acting, candidate.own, f"the simulator with {candidate.name!r}")
         self.screening = screen(self.residual, self.candidates)
         within = within_bounds(self.base, self.fixed, self.seed)

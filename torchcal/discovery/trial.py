@@ -54,17 +54,17 @@ def check_slopes(problem: Problem, values: Tensor, columns: Sequence[int], what:
     low, high = (end[columns] for end in problem.limits())
     at, width = values[columns], high - low
     size = torch.where(at != 0, at.abs(), torch.where(width.isfinite(), width, torch.ones_like(width)))
-    room = torch.minimum(at - low, high - at).clamp_min(0.0)
+    reach = torch.minimum(size, torch.minimum(at - low, high - at).clamp_min(0.0))
     moves = []
     for factor in STEPS:
         moved = torch.zeros(len(columns), len(values), dtype=torch.float64)
-        moved[range(len(columns)), columns] = factor * torch.minimum(size, room)
+        moved[range(len(columns)), columns] = factor * reach
         moves += [moved, -moved]
     found = problem.evaluate(values + torch.cat(moves), [])[0].chunk(2 * len(STEPS))
     pairs = list(zip(STEPS, found[::2], found[1::2], strict=True))
     for k, place in enumerate(columns):
         far, seen, close = ((forth[k] - back[k]) / (2 * factor) for factor, forth, back in pairs)
-        told = torch.minimum(size, room)[k] * jacobian[0, :, k]
+        told = reach[k] * jacobian[0, :, k]
         bent = max(float((far - seen).norm()), float((found[2][k] + found[3][k] - 2 * y[0]).norm()) / STEPS[1])
         change = float(seen.norm())
         off = min(float((one - told).norm()) for one in (seen, close))
