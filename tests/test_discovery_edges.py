@@ -11,7 +11,6 @@ import torchcal as tc
 from torchcal.discovery import verify, where
 from torchcal.discovery.candidates import _shape_points, sized
 from torchcal.discovery.problem import Problem
-from torchcal.discovery.trial import check_slopes
 from torchcal.errors import DomainError, SimulatorError
 
 F64 = torch.float64
@@ -283,7 +282,7 @@ def test_a_threshold_at_a_datum_is_no_lost_derivative():
     )  # fmt: skip
     with_stop = problem.with_simulator(tc.terms.extend(rising, [stop]))
     for at in (10, 9):  # one or two data beyond it
-        check_slopes(with_stop, torch.tensor([1.0, 0.5, float(1 + x[at])], dtype=F64), [1, 2])
+        with_stop.check_slopes(torch.tensor([1.0, 0.5, float(1 + x[at])], dtype=F64), [1, 2])
     assert diagnose(rising, recording, [stop]).terms == ["stop"]
 
 

@@ -432,6 +432,7 @@ def test_what_sticks_out_of_two_terms_is_an_outlier_of_both(seed, noise):
         assert abs(known[name].value - 0.7) < 4 * known[name].sd
 
 
+@pytest.mark.slow
 def test_a_dip_in_both_of_two_sweeps_is_no_pair_of_outliers():
     x = torch.linspace(0, 1, 28, dtype=F64)
     base = tc.Simulator(

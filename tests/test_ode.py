@@ -607,7 +607,6 @@ def bad_rates(rates) -> tc.ODESimulator:
         (lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * (1.0 if t > 1 else 2.0)}, "It raised RuntimeError"),
         (lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"].mean()}, "in a batch|at many times at once"),
         (lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"].mean(-1, keepdim=True)}, "in a batch|at many times"),
-        (lambda t, s, p, u: {"x": s["v"], "v": -p["k"].detach() * s["x"]}, "'k' through torch operations"),
     ],
 )
 def test_rates_that_cannot_be_used_are_told_at_once(rates, message: str) -> None:

@@ -34,7 +34,7 @@ from torchcal.discovery.rounds import settle, with_all, with_explained, without_
 from torchcal.discovery.search import Search
 from torchcal.discovery.several import refit_several
 from torchcal.discovery.symptoms import more_than_replicates, symptoms, unlike
-from torchcal.discovery.trial import check_repeats, check_slopes
+from torchcal.discovery.trial import check_repeats
 from torchcal.discovery.verdict import PLAINLY_WHITE, decide
 from torchcal.discovery.where import locate, missing_rate, needed_shifts
 from torchcal.display import NONE
@@ -139,7 +139,7 @@ def diagnose(
     mask = verify.choose(recording, holdout, len(free))
     for values in starts(problem, 2, seed, held):  # at zero nothing may move
         check_repeats(problem, values)
-        check_slopes(problem, values, free)
+        problem.check_slopes(values, free)
     bar = tqdm(disable=not progress, desc="diagnose", unit="step", leave=False)
 
     def tick(text: str) -> None:

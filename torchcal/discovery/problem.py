@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchcal.data import Recording
 from torchcal.errors import SimulatorError
-from torchcal.simulators import Parameter, Simulator, Solution, Trajectories, Values
+from torchcal.simulators import Parameter, Simulator, Solution, Trajectories, Values, check_slopes
 
 __all__ = ["Problem", "Whitening", "breaks", "remembered"]
 
@@ -226,6 +226,16 @@ class Problem:
                 f"Expected {len(self.recording.y)} output values, as in the recording. Got {found.y.shape[-1]}."
             )
         return found.y[:, self.index], found.jacobian[:, self.index], found.warm
+
+    def check_slopes(self, values: Tensor, columns: Sequence[int], what: str = "the simulator") -> None:
+        """Raise if the outputs at the used data change otherwise with some parameters, at values ``(P,)``, than their
+        derivatives say.
+
+        Raises:
+            SimulatorError: If they do.
+        """
+        x, outputs = self.recording.x, self.recording.outputs
+        check_slopes(self.simulator, x, values[None], columns, outputs, kept=self.index, what=what)
 
     def guess(self, found: Solution | None, values: Tensor) -> Solution | None:
         """Another problem's only solution as a warm start at ``values`` (H, P); None where it is none.

@@ -25,7 +25,6 @@ from torchcal.discovery.screen import Screening, Window, screen, windows
 from torchcal.discovery.sharpen import SOLVER_SHARE, accurate, sharpen
 from torchcal.discovery.stop import Stop
 from torchcal.discovery.structure import Structure, analyse
-from torchcal.discovery.trial import check_slopes
 from torchcal.discovery.verify import HeldOut, held_out_fit
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.terms import Term
@@ -123,7 +122,7 @@ class Search:
             self.tick(f"screen {term.name}")
             self.candidates.append(prepare(self.base.problem, self.base, [term], self.fixed, scale))
         for candidate in self.candidates if not self.clean else ():  # later searches: these have been asked
-            check_slopes(candidate.problem, candidate.acting, candidate.own, f"the simulator with {candidate.name!r}")
+            candidate.problem.check_slopes(candidate.acting, candidate.own, f"the simulator with {candidate.name!r}")
         self.screening = screen(self.residual, self.candidates)
         within = within_bounds(self.base, self.fixed, self.seed)
         for i, candidate in enumerate(self.candidates):

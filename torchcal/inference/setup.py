@@ -14,7 +14,7 @@ from torchcal.inference.fitting import allowed_solver_error
 from torchcal.models import Problem
 from torchcal.priors import CoefficientPrior
 from torchcal.propagation import NISP, RuleChoice
-from torchcal.simulators import Parameter, Scaling, Simulator, Trajectories, free_parameters, workable
+from torchcal.simulators import Parameter, Scaling, Simulator, Trajectories, check_slopes, free_parameters, workable
 
 __all__ = ["PriorMaker", "check_inputs", "check_run", "embedded_problem"]
 
@@ -53,9 +53,9 @@ def check_inputs(
     tries[0] = 0
     tries = torch.maximum(torch.minimum(tries, high), low)
     physical = scaling.physical(tries)
-    columns = {parameter.name: physical[:, i] for i, parameter in enumerate(free)}
-    columns |= {name: torch.full((32,), value, dtype=torch.float64) for name, value in held.items()}
-    values = torch.stack([columns[name] for name in simulator.names], dim=-1)
+    named = {parameter.name: physical[:, i] for i, parameter in enumerate(free)}
+    named |= {name: torch.full((32,), value, dtype=torch.float64) for name, value in held.items()}
+    values = torch.stack([named[name] for name in simulator.names], dim=-1)
     if isinstance(simulator, Trajectories):
         guess = values[0].clone()
         for parameter in free:
@@ -68,6 +68,10 @@ def check_inputs(
             f"Expected {len(recording.y)} output values, as in the recording ({recording.n} conditions × "
             f"{len(recording.outputs)} outputs). Got {count} from the simulator."
         )
+    columns = [simulator.names.index(parameter.name) for parameter in free]
+    # At the guess; and for what is on a bound there, well within.
+    asked = torch.cat([values[:1], values[len(values) // 2 :]])
+    check_slopes(simulator, recording.x, asked, columns, recording.outputs, kept=recording.observed.nonzero()[:, 0])
     return simulator, free
 
 

@@ -7,6 +7,7 @@ from torchcal.simulators.held_out import HeldOutError
 from torchcal.simulators.layout import Values
 from torchcal.simulators.ode import ODESimulator
 from torchcal.simulators.parameter import Parameter, Scaling, free_parameters, is_value_of
+from torchcal.simulators.slopes import check_slopes
 from torchcal.simulators.solution import Solution
 from torchcal.simulators.static import Conditions, Linearisation, Simulator, check_parameters
 from torchcal.simulators.stepping import (
@@ -37,6 +38,7 @@ __all__ = [
     "Values",
     "build_surrogate",
     "check_parameters",
+    "check_slopes",
     "focused",
     "free_parameters",
     "is_value_of",

@@ -162,7 +162,7 @@ class Simulator:
         *,
         march: bool = True,
     ) -> Linearisation:
-        """Outputs and their exact derivatives by the parameters, in forward mode.
+        """Outputs and their exact derivatives by the parameters: in forward mode, in reverse where some part has none.
 
         Args:
             x: Conditions.
@@ -178,6 +178,18 @@ class Simulator:
             with torch.no_grad():
                 y = self.at(x, outputs)(values)
             return Linearisation(y, y.new_zeros(*y.shape, 0))
+        try:
+            return self._forward(x, values, outputs, columns)
+        except (NotImplementedError, SimulatorError) as error:
+            # A user's own autograd.Function may have a backward() and no jvp(), as some operations of torch have.
+            if not isinstance(error.__cause__ or error, NotImplementedError):
+                raise
+        return self._reverse(x, values, outputs, columns)
+
+    def _forward(
+        self, x: Conditions, values: Tensor, outputs: Sequence[str] | None, columns: Sequence[int]
+    ) -> Linearisation:
+        """One call for all columns at once."""
         tangent = values.new_zeros(len(columns), *values.shape)
         for j, column in enumerate(columns):
             tangent[j, ..., column] = 1.0
@@ -189,6 +201,16 @@ class Simulator:
                 # The root of a condition that is 0: it does not move, but 0 times an infinite slope is no number.
                 y, derivative = _unpacked(self.at(x, outputs)(dual))
         return Linearisation(y[0], derivative.permute(1, 2, 0))
+
+    def _reverse(
+        self, x: Conditions, values: Tensor, outputs: Sequence[str] | None, columns: Sequence[int]
+    ) -> Linearisation:
+        """One backward pass for every output."""
+        leaf = values.clone().requires_grad_(True)
+        with torch.enable_grad():
+            y = self.at(x, outputs)(leaf)
+            rows = [torch.autograd.grad(each.sum(), leaf, retain_graph=True)[0] for each in y.unbind(-1)]
+        return Linearisation(y.detach(), torch.stack(rows, dim=-2)[..., columns])
 
     def _flatten(self, result: Any, values: Tensor, n: int, outputs: Sequence[str] | None) -> Tensor:
         if not isinstance(result, Mapping):

@@ -1,0 +1,111 @@
+"""Whether a simulator differentiates is asked before any long work, and it need not do so in forward mode."""
+
+import numpy as np
+import pytest
+import torch
+
+import torchcal as tc
+from torchcal.errors import SimulatorError
+from torchcal.inference.setup import check_inputs
+from torchcal.simulators import check_slopes
+
+F64 = torch.float64
+X = torch.linspace(0, 4, 30, dtype=F64)
+DECAY = [tc.Parameter("a", low=0.0, initial=2.0), tc.Parameter("k", initial=0.5)]
+
+
+def lost(what):
+    """A decay that loses the derivative of its size, of its rate, or of a part of its rate."""
+
+    def decay(x, p):
+        if what == "a":
+            return p["a"].detach() * torch.exp(-p["k"] * x)
+        if what == "k":
+            return p["a"] * torch.as_tensor(np.exp(-p["k"].detach().numpy() * x.numpy()))
+        return p["a"] * torch.exp(-0.5 * (p["k"] + p["k"].detach()) * x)
+
+    return decay
+
+
+def recorded(y=None):
+    return tc.Recording(x=X, y=3 * torch.exp(-0.7 * X) if y is None else y, noise=0.02)
+
+
+@pytest.mark.parametrize("what", ["a", "k", "a part of k"])
+def test_calibration_refuses_a_static_simulator_that_loses_a_derivative(what):
+    simulator = tc.Simulator(lost(what), DECAY)
+    with pytest.raises(SimulatorError, match=f"the simulator to depend on {what[-1]!r} through torch operations alone"):
+        tc.calibrate(simulator, recorded())
+
+
+@pytest.mark.parametrize("what", ["k", "a part of k", "y"])
+def test_calibration_refuses_rates_that_lose_a_derivative(what):
+    def rates(t, s, p, u):
+        k = p["k"].detach() if what == "k" else 0.5 * (p["k"] + p["k"].detach()) if what == "a part of k" else p["k"]
+        return {"y": -k * (s["y"] if what != "y" else s["y"].detach())}
+
+    ode = tc.ODESimulator(rates, ["y"], [tc.Parameter("k", low=0.0, initial=0.5)])
+    run = tc.Run(time=X, outputs={"y": 3 * torch.exp(-0.7 * X)}, initial={"y": 3.0})
+    with pytest.raises(SimulatorError, match=r"depend on '.*' through torch operations alone"):
+        tc.calibrate(ode, tc.Recording(runs=[run], noise=0.02))
+
+
+def test_a_parameter_that_is_held_may_be_a_number():
+    simulator = tc.Simulator(lost("k"), DECAY)
+    check_inputs(simulator, recorded(), {"k": 0.7})
+
+
+def test_a_parameter_whose_guess_is_on_its_bound_is_asked_within():
+    on_bound = [DECAY[0], tc.Parameter("k", low=0.0, high=5.0, initial=0.0)]
+    with pytest.raises(SimulatorError, match="depend on 'k'"):
+        check_inputs(tc.Simulator(lost("k"), on_bound), recorded(), None)
+    sound = tc.Simulator(lambda x, p: p["a"] * torch.exp(-p["k"] * x), on_bound)
+    check_inputs(sound, recorded(), None)
+    values = torch.tensor([[2.0, 0.0]], dtype=F64)
+    check_slopes(tc.Simulator(lost("k"), on_bound), X, values, [1])  # no room for a step, and no other values
+
+
+def test_other_code_is_not_asked():
+    calls = []
+
+    def decay(x, p):
+        calls.append(1)
+        return p["a"] * np.exp(-p["k"] * x)
+
+    simulator = tc.ExternalSimulator(decay, DECAY, vectorized=True)
+    check_slopes(simulator, X, torch.tensor([[2.0, 0.5]], dtype=F64), [0, 1])
+    assert not calls
+
+
+class OneWay(torch.autograd.Function):
+    """An exponential that somebody has written with a backward pass alone."""
+
+    @staticmethod
+    def forward(ctx, value):
+        ctx.save_for_backward(value)
+        return value.exp()
+
+    @staticmethod
+    def backward(ctx, grad):
+        return grad * ctx.saved_tensors[0].exp()
+
+
+def test_a_function_without_forward_derivatives_is_linearised_in_reverse():
+    one_way = tc.Simulator(lambda x, p: p["a"] * OneWay.apply(-p["k"] * x), DECAY)
+    both = tc.Simulator(lambda x, p: p["a"] * torch.exp(-p["k"] * x), DECAY)
+    values = torch.tensor([[2.0, 0.5], [1.0, 0.1], [3.0, 2.0]], dtype=F64)
+    for columns in (None, [1], [1, 0]):
+        found, wanted = (each.linearise(X, values, columns=columns) for each in (one_way, both))
+        torch.testing.assert_close(found.y, wanted.y)
+        torch.testing.assert_close(found.jacobian, wanted.jacobian)
+    noise = 0.02 * torch.randn(30, dtype=F64, generator=torch.Generator().manual_seed(0))
+    diagnosis = tc.diagnose(one_way, recorded(3 * torch.exp(-0.7 * X) + noise), progress=False)
+    assert diagnosis.verdict == "consistent"
+
+
+def test_a_simulator_that_has_not_written_something_says_so():
+    def unwritten(x, p):
+        raise NotImplementedError("not yet")
+
+    with pytest.raises(SimulatorError, match="raised NotImplementedError: not yet"):
+        tc.Simulator(unwritten, DECAY).linearise(X, torch.ones(1, 2, dtype=F64))
