@@ -18,6 +18,7 @@ from torchcal.errors import DomainError, EmbeddingError, ShapeError
 from torchcal.propagation import choice, convergence, parameters, polynomials
 from torchcal.propagation.convergence import PropagationCheck
 from torchcal.propagation.pieces import CACHED, MANY, MOST, forgetful, over_batch
+from torchcal.propagation.projection import prepare
 from torchcal.propagation.rules import RuleChoice
 from torchcal.simulators import Conditions, Scaling, Simulator, free_parameters
 
@@ -493,68 +494,18 @@ class NISP(nn.Module):
 
     # --- rules -------------------------------------------------------------------------------------------
 
-    def _whole_order(self, rule_choice: RuleChoice) -> int | None:
-        """Degree of a polynomial's whole expansion in the germs, where the rule has nodes enough for it."""
-        exact, degree = choice.exact_count(self), self.degree
-        if not self._is_polynomial or exact is None or not degree:
-            return None
-        if rule_choice.kind != "tensor" or rule_choice.size < exact:
-            return None
-        return degree * max(1, self.pattern.order)
-
-    def _interpolated(self, whole: int | None, order: int | None, rule: polychaos.Rule) -> tuple[Tensor, Tensor] | None:
-        """Few of the nodes ``(K,)`` and the projection ``(K, K)`` from them onto a polynomial's whole expansion.
-
-        None where that is not wanted, or would not be fewer than all of them.
-        """
-        germs = self.pattern.num_germs
-        if whole is None or order is None or order < whole or math.comb(germs + whole, whole) >= rule.num:
-            return None
-        terms = polychaos.multi_indices(germs, whole)
-        values = polychaos.evaluate(self.pattern.basis, terms, rule.nodes)
-        values = values / polychaos.norms(self.pattern.basis, terms).sqrt()
-        chosen = polynomials.interpolating(values, rule.weights)
-        return chosen, torch.linalg.inv(values[chosen]).T
-
-    def _affine_map(self, psi: Tensor, projection: Tensor | None) -> Tensor | None:
-        """Projected Legendre products of degree 1 from (1, α), ``(1 + P, k M)``; None where there are higher ones."""
-        if projection is None or self._polynomial is None or int(self._polynomial.sum(-1).max()) > 1:
-            return None
-        along = projection.T @ psi  # (k, K)
-        found = psi.new_zeros(1 + self.num_alpha, len(along), len(self._polynomial))
-        for m, powers in enumerate(self._polynomial.tolist()):
-            if not any(powers):
-                found[0, :, m] = projection.sum(0)
-                continue
-            own = (self.pattern.rows == powers.index(1)).nonzero()[:, 0]
-            found[1 + own, :, m] = along[:, self.pattern.columns[own]].T
-        return found.flatten(1)
-
     def set_rule(self, rule_choice: RuleChoice) -> None:
         """Use another quadrature rule."""
-        basis, indices = self.pattern.basis, self.pattern.indices
-        device, dtype = self._template.device, self._template.dtype
-        rule = rule_choice.build(basis, self.pattern.num_germs)
+        found = prepare(self, rule_choice)
         self._choice = rule_choice
-        projection = None
-        whole = self._whole_order(rule_choice)
-        order = self.order if self.order is not None else rule_choice.carried_order or whole
-        psi = carriers = polychaos.evaluate(basis, indices, rule.nodes)
-        few = self._interpolated(whole, order, rule)
-        if few is not None:
-            carriers, projection = psi[few[0]], few[1]
-        elif order is not None and self.pattern.num_germs:
-            terms = polychaos.multi_indices(self.pattern.num_germs, order)
-            values = polychaos.evaluate(basis, terms, rule.nodes)
-            projection = values * rule.weights[:, None] / polychaos.norms(basis, terms).sqrt()
         for name, value in (
-            ("nodes", rule.nodes),
-            ("weights", rule.weights),
-            ("_psi", psi),
-            ("_carriers", carriers),
-            ("_projection", projection),
-            ("_affine", self._affine_map(carriers, projection)),
+            ("nodes", found.nodes),
+            ("weights", found.weights),
+            ("_psi", found.psi),
+            ("_carriers", found.carriers),
+            ("_projection", found.projection),
+            ("_affine", found.affine),
         ):
             # Built in float64 and only then cast, so that the rule is as good as the dtype allows.
-            cast = None if value is None else value.to(device=device, dtype=dtype)
+            cast = None if value is None else value.to(self._template)
             self.register_buffer(name, cast, persistent=False)
