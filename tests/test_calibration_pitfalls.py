@@ -14,7 +14,9 @@ from torchcal.errors import (
     EmbeddingError,
     IdentifiabilityWarning,
     PropagationWarning,
+    TorchcalWarning,
 )
+from torchcal.inference.setup import check_inputs
 
 X = np.linspace(0, 6, 25)
 
@@ -233,3 +235,12 @@ def test_plots_come_when_they_are_asked_for():
     assert tc.plots.fit is not None
     with pytest.raises(AttributeError, match="no attribute 'plot'"):
         tc.plot  # noqa: B018
+
+
+def test_a_table_that_was_read_twice_is_told():
+    twice = tc.Recording(x=np.tile(X, 2), y=np.tile(1 + X + 0.1 * np.sin(7 * X), 2))
+    with pytest.warns(TorchcalWarning, match="25 of 50 rows are the others once more"):
+        check_inputs(line(), twice, None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_inputs(line(), twice.subset(~twice.copies), None)

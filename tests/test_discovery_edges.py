@@ -367,3 +367,27 @@ def test_an_output_without_noise_is_not_judged_by_its_rounding():
     y = {"y": 1 + 0.5 * x + 0.2 * x**2 + 0.05 * noise(60, 0), "level": torch.full((60,), 5.3, dtype=F64)}
     d = diagnose(both, tc.Recording(x=x, y=y), [bend])
     assert (d.terms, d.remaining) == (["bend"], 0.0)
+
+
+def test_two_terms_that_bend_to_a_fast_process_are_no_name():
+    """A fast relaxation that no term has: a slow one, stretched and saturated, comes near it."""
+    grid = np.meshgrid([20.0, 40.0, 60.0], np.geomspace(0.1, 1e4, 20), indexing="ij")
+    temperature, t = (each.ravel() for each in grid)
+    shifted = np.exp(0.08 * (temperature - 40)) * t / 80
+    truth = 3 + 10 * np.exp(-shifted) + 5.696 * np.exp(-25 * shifted)
+
+    def relaxing(x, p):
+        slow = x["t"] / p["tau"] * torch.exp(p["H"] * 0.01 * (x["T"] - 40))
+        return {"G": p["Ginf"] + p["G1"] * torch.exp(-(slow ** p["beta"]))}
+
+    parameters = [
+        tc.Parameter("Ginf", low=0.0, initial=2.0),
+        tc.Parameter("G1", low=0.0, initial=8.0),
+        tc.Parameter("tau", low=0.1, high=1e5, initial=50.0, transform="log"),
+        tc.Parameter("H", low=0.0, high=60.0, initial=10.0),
+        tc.Parameter("beta", neutral=1.0, low=0.2, high=1.5),
+    ]
+    candidates = [tc.Term("stretched exponential", frees=("beta",)), *tc.terms.sensor(("G",), static=True)]
+    y = truth + 0.207 * np.random.default_rng(3).standard_normal(60)
+    recording = tc.Recording(x={"T": temperature, "t": t}, y={"G": y}, noise=0.207)
+    assert diagnose(tc.Simulator(relaxing, parameters), recording, candidates).verdict in ("unexplained", "ambiguous")

@@ -10,6 +10,7 @@ from torchcal.discovery.decision import Decision, certain, groups_of, other_name
 from torchcal.discovery.doubts import by_hold, doubt, unfit
 from torchcal.discovery.instruments import only_instruments
 from torchcal.discovery.model import PRIOR, Model
+from torchcal.discovery.noise import estimate
 from torchcal.discovery.own_noise import weigh_alone
 from torchcal.discovery.places import Place
 from torchcal.discovery.proof import prove
@@ -38,8 +39,9 @@ PLAINLY_WHITE, LINEAR = 0.05, 0.02
 #: χ² that a term in a window must remove for its shape to be as telling as that of one that acts everywhere; and the
 #: same along the only condition of a static recording, where nothing else of the term is seen than a piece of a curve.
 TELLING, TELLING_ALONE = 500.0, 3000.0
-#: By how much more than the sd that is given a named model may miss the data, beyond chance: such sd are seldom exact.
-LARGER, CHANCE = 1.15, 2.0
+#: By how much more than the sd that is given a named model of one term may miss the data, and one of several, which
+#: bend to more, beyond chance: such sd are seldom exact.
+LARGER, LARGER_TOGETHER, CHANCE = 1.15, 1.08, 2.0
 #: Of those less likely than the base, a hypothesis is listed among the tied ones with log odds down to this against the
 #: base, and at least this probability.
 WORSE, WORTH = 1.0, 0.05
@@ -208,20 +210,23 @@ def base_alone(search: Search) -> float:
 def _small(search: Search, model: Model) -> bool:
     """Whether a model leaves no more than the noise that is given: correlated noise can look like what is left.
 
-    Where the fastest part of the residual is larger than what is given, that is taken for the noise.
+    Where the fastest part of what one term leaves is larger than what is given, that is taken for the noise. Several
+    bend to more, and are held to what is given.
     """
-    noise = search.noise
+    noise, found = search.noise, model.found
     if noise.source != "given":
         return True
-    problem = model.found.problem
-    standard = (model.found.residual / noise.sd[problem.index]).square()
+    problem = found.problem
+    several = len(model.names) > 1
+    fastest = estimate(problem, found.residual, found.jacobian, problem.recording.noise).sizes[:, 0]
+    standard = (found.residual / noise.sd[problem.index]).square()
     for number, rho in enumerate(noise.correlation.tolist()):
         mine = standard[problem.output_of == number]
         if not len(mine):
             continue
-        size = max(float(noise.sizes[number, 0]), 1.0)
+        size = LARGER_TOGETHER if several else LARGER * max(float(fastest[number]), 1.0)
         independent = len(mine) * (1 - rho**2) / (1 + rho**2)  # as many squares tell as much of their mean
-        if float(mine.mean()) > (LARGER * size) ** 2 * (1 + CHANCE * math.sqrt(2 / max(independent, 1.0))):
+        if float(mine.mean()) > size**2 * (1 + CHANCE * math.sqrt(2 / max(independent, 1.0))):
             return False
     return True
 

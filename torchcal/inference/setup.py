@@ -9,7 +9,15 @@ from torchcal import likelihoods
 from torchcal.checks import whole
 from torchcal.data import Recording
 from torchcal.embeddings import Embedding
-from torchcal.errors import DomainError, EmbeddingError, ImproperPosteriorError, RecordingError, SimulatorError
+from torchcal.errors import (
+    DomainError,
+    EmbeddingError,
+    ImproperPosteriorError,
+    RecordingError,
+    SimulatorError,
+    TorchcalWarning,
+    warn,
+)
 from torchcal.inference.fitting import allowed_solver_error
 from torchcal.models import Problem
 from torchcal.priors import CoefficientPrior
@@ -42,6 +50,13 @@ def check_inputs(
         raise RecordingError(
             f"Expected a torchcal.Recording. Got {type(recording).__name__}. Wrap the data: "
             "torchcal.Recording(x=x, y=y)."
+        )
+    if count := int(recording.copies.sum()):
+        warn(
+            f"{count} of {recording.n} rows are the others once more, as of a table that was read twice. They count as "
+            "data of their own, and the posterior is too narrow: drop them with "
+            "recording.subset(~recording.copies).",
+            TorchcalWarning,
         )
     simulator = simulator.bind(recording)
     free, held = free_parameters(simulator.parameters, fixed)
