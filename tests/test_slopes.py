@@ -50,6 +50,32 @@ def test_calibration_refuses_rates_that_lose_a_derivative(what):
         tc.calibrate(ode, tc.Recording(runs=[run], noise=0.02))
 
 
+def large(x, p):
+    return {"large": 1e6 * p["a"] * torch.exp(-0.3 * x), "small": lost("k")(x, p)}
+
+
+def both(x, p):
+    return {"large": 1e3 * p["a"] * torch.exp(-p["k"] * x), "small": lost("k")(x, p)}
+
+
+@pytest.mark.parametrize(
+    ("function", "parameters"),
+    [
+        (lost("k"), [tc.Parameter("a"), tc.Parameter("k")]),
+        (lost("k"), [DECAY[0], tc.Parameter("k", low=0.0, initial=1e-8)]),
+        (lambda x, p: 1e6 + p["b"] + lost("k")(x, p), [*DECAY, tc.Parameter("b")]),
+        (large, DECAY),
+        (both, DECAY),
+    ],
+    ids=["no first guess: 0, without effect", "next to its bound", "an offset", "a larger output", "one of two"],
+)
+def test_what_hides_a_lost_derivative_does_not_help(function, parameters):
+    y = 3 * torch.exp(-0.7 * X)
+    recording = tc.Recording(x=X, y={"large": 1e6 * y, "small": y} if function in (large, both) else y)
+    with pytest.raises(SimulatorError, match="depend on 'k'"):
+        check_inputs(tc.Simulator(function, parameters), recording, None)
+
+
 def test_a_parameter_that_is_held_may_be_a_number():
     simulator = tc.Simulator(lost("k"), DECAY)
     check_inputs(simulator, recorded(), {"k": 0.7})
@@ -80,6 +106,8 @@ def test_other_code_is_not_asked():
 class OneWay(torch.autograd.Function):
     """An exponential that somebody has written with a backward pass alone."""
 
+    passes = 0
+
     @staticmethod
     def forward(ctx, value):
         ctx.save_for_backward(value)
@@ -87,11 +115,33 @@ class OneWay(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, grad):
+        OneWay.passes += 1
         return grad * ctx.saved_tensors[0].exp()
 
 
-def test_a_function_without_forward_derivatives_is_linearised_in_reverse():
-    one_way = tc.Simulator(lambda x, p: p["a"] * OneWay.apply(-p["k"] * x), DECAY)
+class Once(OneWay):
+    """The same, whose backward pass is not differentiated either."""
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, grad):
+        return grad * ctx.saved_tensors[0].exp()
+
+
+def inner(x, p):
+    """One that differentiates forwards by itself: torch does not nest that."""
+    whole = -p["k"] * x
+    found, _ = torch.func.jvp(torch.exp, (whole,), (torch.ones_like(whole),))
+    return p["a"] * found
+
+
+@pytest.mark.parametrize(
+    "function",
+    [lambda x, p: p["a"] * OneWay.apply(-p["k"] * x), lambda x, p: p["a"] * Once.apply(-p["k"] * x), inner],
+    ids=["no jvp", "backward once", "jvp inside"],
+)
+def test_a_function_without_forward_derivatives_is_linearised_in_reverse(function):
+    one_way = tc.Simulator(function, DECAY)
     both = tc.Simulator(lambda x, p: p["a"] * torch.exp(-p["k"] * x), DECAY)
     values = torch.tensor([[2.0, 0.5], [1.0, 0.1], [3.0, 2.0]], dtype=F64)
     for columns in (None, [1], [1, 0]):
@@ -101,6 +151,15 @@ def test_a_function_without_forward_derivatives_is_linearised_in_reverse():
     noise = 0.02 * torch.randn(30, dtype=F64, generator=torch.Generator().manual_seed(0))
     diagnosis = tc.diagnose(one_way, recorded(3 * torch.exp(-0.7 * X) + noise), progress=False)
     assert diagnosis.verdict == "consistent"
+
+
+def test_many_outputs_take_a_few_backward_passes():
+    many = torch.linspace(0, 4, 5000, dtype=F64)
+    simulator = tc.Simulator(lambda x, p: p["a"] * OneWay.apply(-p["k"] * x), DECAY)
+    before = OneWay.passes
+    check_inputs(simulator, tc.Recording(x=many, y=3 * torch.exp(-0.7 * many), noise=0.02), None)
+    simulator.linearise(many, torch.tensor([[2.0, 0.5]], dtype=F64))
+    assert 0 < OneWay.passes - before < 50
 
 
 def test_a_simulator_that_has_not_written_something_says_so():

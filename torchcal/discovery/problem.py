@@ -235,7 +235,7 @@ class Problem:
             SimulatorError: If they do.
         """
         x, outputs = self.recording.x, self.recording.outputs
-        check_slopes(self.simulator, x, values[None], columns, outputs, kept=self.index, what=what)
+        check_slopes(self.simulator, x, values[None], columns, outputs, kept=self.keep, what=what)
 
     def guess(self, found: Solution | None, values: Tensor) -> Solution | None:
         """Another problem's only solution as a warm start at ``values`` (H, P); None where it is none.

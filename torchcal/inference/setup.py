@@ -86,7 +86,7 @@ def check_inputs(
     columns = [simulator.names.index(parameter.name) for parameter in free]
     # At the guess; and for what is on a bound there, well within.
     asked = torch.cat([values[:1], values[len(values) // 2 :]])
-    check_slopes(simulator, recording.x, asked, columns, recording.outputs, kept=recording.observed.nonzero()[:, 0])
+    check_slopes(simulator, recording.x, asked, columns, recording.outputs, kept=recording.observed)
     return simulator, free
 
 

@@ -1,7 +1,7 @@
 """Whether a simulator differentiates: its derivatives beside differences of its outputs."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -13,9 +13,11 @@ from torchcal.simulators.trajectories import Trajectories
 __all__ = ["check_slopes"]
 
 #: Steps of differences, in the size of a parameter; how nearly those of the first two agree, and steps forth and back,
-#: where there is no kink; by how much a derivative is off from all that is none, more than a kink makes of that; and
-#: changes that may be rounding, of single precision too, in the size of the outputs.
-STEPS, AGREE, OFF, ROUNDED = (1e-2, 1e-3, 1e-5), 0.05, 0.1, 3e-7
+#: where there is no kink and no rounding; and by how much a derivative is off from all that is none, more than a kink
+#: makes of that.
+STEPS, AGREE, OFF = (1e-2, 1e-3, 1e-5), 0.05, 0.1
+#: Combinations of the outputs that are derived.
+DRAWS = 8
 
 
 def check_slopes(
@@ -31,17 +33,18 @@ def check_slopes(
     """Raise if outputs change otherwise with some parameters than their derivatives say.
 
     Python numbers, NumPy and ``.detach()`` lose a derivative, or a part of it, without a word: what is then fitted is
-    nonsense. Where outputs have a kink or a jump, differences of steps disagree and tell nothing. No step leaves the
-    bounds. Other code, which is differentiated by differences, is not asked.
+    nonsense. Each output is judged for itself. Where it has a kink or a jump, or is rounded, differences of steps
+    disagree and tell nothing. No step leaves the bounds. Other code, which is differentiated by differences, is not
+    asked.
 
     Args:
         simulator: Bound to the conditions.
         x: Conditions.
         values: Parameter values, ``(m, P)``, physical units. All parameters are asked at the first with finite outputs,
-            those that are on a bound there at the next.
+            and those that tell nothing there at the next.
         columns: Places of the parameters to ask.
         outputs: Names of the outputs wanted.
-        kept: Places of the output values that count; all by default.
+        kept: Which output values count, bool ``(n_total,)``; all by default.
         what: How to call the simulator in the error.
 
     Raises:
@@ -49,24 +52,30 @@ def check_slopes(
     """
     if simulator.dear and not isinstance(simulator, Trajectories):
         return
-    places = slice(None) if kept is None else kept
+    evaluate = simulator.at(x, outputs)
 
-    def evaluate(values: Tensor, columns: Sequence[int] = ()) -> tuple[Tensor, Tensor]:
-        found = simulator.linearise(x, values, outputs, columns)
-        return found.y[:, places], found.jacobian[:, places]
+    def jacobian(values: Tensor) -> Tensor:
+        return simulator.linearise(x, values, outputs).jacobian
 
-    good = torch.isfinite(evaluate(values)[0]).all(-1)
+    with torch.no_grad():
+        good = evaluate(values).detach()
+    used = torch.ones(good.shape[-1], dtype=torch.bool) if kept is None else kept
+    rows = len(next(iter(x.values())) if isinstance(x, Mapping) else x)
+    parts = [k * rows + part.nonzero()[:, 0] for k, part in enumerate(used.split(rows)) if bool(part.any())]
     asked = list(columns)
-    for here in values[good]:
+    for here in values[torch.isfinite(good[:, used]).all(-1)]:
         reach = _reach(simulator, here)
+        judged = set()
         inside = [column for column in asked if reach[column] > 0]
-        for column, off in _errors(evaluate, here, reach, inside):
-            raise SimulatorError(
-                f"Expected {what} to depend on {simulator.names[column]!r} through torch operations alone. Got "
-                f"outputs that change otherwise with it than their derivative says, by {off:.0%}. Avoid NumPy, "
-                "float(), .item() and .detach(), or wrap other code in torchcal.ExternalSimulator."
-            )
-        asked = [column for column in asked if column not in inside]
+        for column, off in _errors(evaluate, jacobian, here, reach, inside, parts):
+            if off > OFF:
+                raise SimulatorError(
+                    f"Expected {what} to depend on {simulator.names[column]!r} through torch operations alone. Got "
+                    f"outputs that change otherwise with it than their derivative says, by {off:.0%}. Avoid NumPy, "
+                    "float(), .item() and .detach(), or wrap other code in torchcal.ExternalSimulator."
+                )
+            judged.add(column)
+        asked = [column for column in asked if column not in judged]
         if not asked:
             break
 
@@ -81,11 +90,16 @@ def _reach(simulator: Simulator, values: Tensor) -> Tensor:
 
 
 def _errors(
-    evaluate: Callable[..., tuple[Tensor, Tensor]], values: Tensor, reach: Tensor, columns: list[int]
+    evaluate: Callable[[Tensor], Tensor],
+    jacobian: Callable[[Tensor], Tensor],
+    values: Tensor,
+    reach: Tensor,
+    columns: list[int],
+    parts: list[Tensor],
 ) -> Iterator[tuple[int, float]]:
-    """Parameters whose derivative is wrong at values ``(P,)``, and by which part of the change.
+    """By which part of the change derivatives at values ``(P,)`` are off, for each parameter that tells it.
 
-    They may move from there by their ``reach`` times `STEPS`.
+    They may move from there by their ``reach`` times `STEPS`. The places of each output are ``parts``.
     """
     if not columns:
         return
@@ -94,15 +108,47 @@ def _errors(
         moved = torch.zeros(len(columns), len(values), dtype=torch.float64)
         moved[range(len(columns)), columns] = factor * reach[columns]
         moves += [moved, -moved]
-    y, jacobian = (each[0] for each in evaluate(values[None], columns))
-    tried = evaluate(values + torch.cat(moves))[0].chunk(2 * len(STEPS))
-    pairs = list(zip(STEPS, tried[::2], tried[1::2], strict=True))
+    with torch.no_grad():
+        y, *tried = evaluate(torch.cat([values[None], values + torch.cat(moves)])).detach().split(
+            [1, *[len(columns)] * len(moves)]
+        )
+    generator = torch.Generator().manual_seed(0)
+    signs = [torch.randint(2, (DRAWS, len(part)), generator=generator).double() * 2 - 1 for part in parts]
+    told = _combined(evaluate, jacobian, values[None], parts, signs)
     for k, column in enumerate(columns):
-        far, seen, close = ((forth[k] - back[k]) / (2 * factor) for factor, forth, back in pairs)
-        told = reach[column] * jacobian[:, k]
-        bent = max(float((far - seen).norm()), float((tried[2][k] + tried[3][k] - 2 * y).norm()) / STEPS[1])
-        change = float(seen.norm())
-        off = min(float((one - told).norm()) for one in (seen, close))
-        # Neither rounding nor a kink, nor where a slope is infinite.
-        if change * STEPS[1] > ROUNDED * float(y.norm()) and bent < AGREE * change and off > OFF * change:
-            yield column, off / change
+        steps = [(factor, tried[2 * i][k], tried[2 * i + 1][k]) for i, factor in enumerate(STEPS)]
+        for part, own, slopes in zip(parts, signs, told, strict=True):
+            far, seen, close = ((forth[part] - back[part]) / (2 * factor) for factor, forth, back in steps)
+            _, forth, back = steps[1]
+            bent = max(float((far - seen).norm()), float((forth + back - 2 * y[0])[part].norm()) / STEPS[1])
+            change = float(seen.norm())
+            if change > 0 and bent < AGREE * change:  # neither a kink, nor where a slope is infinite
+                slope = reach[column] * slopes[:, column]
+                size = float((own @ seen).norm())
+                yield column, min(float((own @ one - slope).norm()) for one in (seen, close)) / size
+
+
+def _combined(
+    evaluate: Callable[[Tensor], Tensor],
+    jacobian: Callable[[Tensor], Tensor],
+    values: Tensor,
+    parts: list[Tensor],
+    signs: list[Tensor],
+) -> list[Tensor]:
+    """Derivatives of the sums of each output's values with signs ``(DRAWS, m)``, ``(DRAWS, P)``, at values ``(1, P)``.
+
+    Some backward passes do, where the whole Jacobian may be a matter of as many as there are outputs.
+    """
+    leaf = values.clone().requires_grad_(True)
+    found = []
+    try:
+        with torch.enable_grad():
+            y = evaluate(leaf)[0]
+        for part, own in zip(parts, signs, strict=True):
+            sums = (own @ y[part]).unbind()
+            each = [torch.autograd.grad(one, leaf, retain_graph=True, allow_unused=True)[0] for one in sums]
+            found.append(torch.cat([torch.zeros_like(values) if one is None else one for one in each]))
+    except RuntimeError:  # no gradient at all, or one that writing in place has spoilt
+        whole = jacobian(values)[0]
+        return [own @ whole[part] for part, own in zip(parts, signs, strict=True)]
+    return found

@@ -180,11 +180,13 @@ class Simulator:
             return Linearisation(y, y.new_zeros(*y.shape, 0))
         try:
             return self._forward(x, values, outputs, columns)
-        except (NotImplementedError, SimulatorError) as error:
-            # A user's own autograd.Function may have a backward() and no jvp(), as some operations of torch have.
-            if not isinstance(error.__cause__ or error, NotImplementedError):
-                raise
-        return self._reverse(x, values, outputs, columns)
+        except Exception as error:
+            # A user's own autograd.Function may have a backward() and no jvp(), as some operations of torch have, and
+            # a simulator may differentiate forwards by itself, which torch does not nest.
+            try:
+                return self._reverse(x, values, outputs, columns)
+            except Exception:
+                raise error from error.__cause__
 
     def _forward(
         self, x: Conditions, values: Tensor, outputs: Sequence[str] | None, columns: Sequence[int]
@@ -205,10 +207,22 @@ class Simulator:
     def _reverse(
         self, x: Conditions, values: Tensor, outputs: Sequence[str] | None, columns: Sequence[int]
     ) -> Linearisation:
-        """One backward pass for every output."""
+        """A backward pass for every column, through another one; or where that has none, one for every output."""
         leaf = values.clone().requires_grad_(True)
         with torch.enable_grad():
             y = self.at(x, outputs)(leaf)
+            # What is pulled back is linear in them.
+            weights = torch.linspace(1, 2, y.shape[-1]).to(y).expand(y.shape).clone().requires_grad_(True)
+            try:
+                (pulled,) = torch.autograd.grad(y, leaf, weights, create_graph=True)
+                ones = [pulled[..., column].sum() for column in columns]
+                slopes = [torch.autograd.grad(one, weights, retain_graph=True)[0] for one in ones]
+                found = torch.stack(slopes, dim=-1)
+                # A part whose backward pass is not differentiated is lost without a word.
+                if torch.allclose((weights.unsqueeze(-1) * found).sum(-2), pulled[..., columns]):
+                    return Linearisation(y.detach(), found)
+            except RuntimeError:
+                pass
             rows = [torch.autograd.grad(each.sum(), leaf, retain_graph=True)[0] for each in y.unbind(-1)]
         return Linearisation(y.detach(), torch.stack(rows, dim=-2)[..., columns])
 
