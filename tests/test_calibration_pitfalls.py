@@ -13,6 +13,7 @@ from torchcal.errors import (
     DomainError,
     EmbeddingError,
     IdentifiabilityWarning,
+    ImproperPosteriorError,
     PropagationWarning,
     TorchcalWarning,
 )
@@ -244,3 +245,31 @@ def test_a_table_that_was_read_twice_is_told():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_inputs(line(), twice.subset(~twice.copies), None)
+
+
+@pytest.mark.filterwarnings("ignore::torchcal.errors.TorchcalWarning")
+@pytest.mark.parametrize("calibrate", [tc.calibrate, tc.calibrate_additive])
+def test_a_ridge_without_an_end_is_not_drawn_from(calibrate):
+    """A product is known on a hyperbola, the sum of two squares on a circle."""
+    parameters = [tc.Parameter(name) for name in "abc"]
+    recording = tc.Recording(x=X, y=1 + 0.5 * X + 0.1 * X**2)
+    few = {"num_samples": 2, "num_warmup": 2, "num_chains": 2, "seed": 0}
+    with pytest.raises(ImproperPosteriorError, match="goes on without end in a, c"):
+        calibrate(tc.Simulator(lambda x, p: p["a"] * p["c"] + p["b"] * x, parameters), recording, **few)
+    closed = calibrate(tc.Simulator(lambda x, p: p["a"] ** 2 + p["c"] ** 2 + p["b"] * x, parameters), recording, **few)
+    assert closed.samples is not None
+
+
+@pytest.mark.filterwarnings("ignore::torchcal.errors.ConvergenceWarning", "ignore::torchcal.errors.PropagationWarning")
+@pytest.mark.parametrize(("count", "told"), [(4, True), (5, False)])
+def test_a_marginal_posterior_without_a_variance_is_told(count, told):
+    """Two flat coefficients: the density falls as the radius to the power of −N, over a plane."""
+    x = np.linspace(1, 2, count)
+    proportional = tc.Simulator(lambda x, p: p["a"] * x, [tc.Parameter("a")])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", IdentifiabilityWarning)
+        tc.calibrate(
+            proportional, tc.Recording(x=x, y=2 * x + 0.1 * np.cos(9 * x), noise=0.2), likelihood="gausmarg",
+            num_samples=2, num_warmup=2, num_chains=2, seed=0,
+        )  # fmt: skip
+    assert any("no finite variance" in str(each.message) for each in caught) is told

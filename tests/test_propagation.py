@@ -14,6 +14,7 @@ from scipy import integrate, stats
 from torchcal import NISP, Parameter, Simulator, polychaos
 from torchcal.embeddings import Gaussian, IndependentGaussian, PolynomialChaos, Uniform
 from torchcal.errors import DomainError, EmbeddingError, PropagationWarning, ShapeError, SimulatorError
+from torchcal.inference.summary import warn_of_moments
 from torchcal.propagation.pieces import CACHED, MOST
 from torchcal.terms import Term, extend
 
@@ -745,3 +746,23 @@ def test_numpy_conditions_are_taken():
     found = NISP(Simulator(lambda x, p: p["a"] * x["t"], [Parameter("a")]), Gaussian(), {"t": np.arange(3)})
     mean, _ = found(tensor(2.0, 0.1))
     torch.testing.assert_close(mean, tensor(0.0, 2.0, 4.0), rtol=ROUNDING, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("weight", [0.1, 0.24, 0.3, 0.6])
+def test_a_square_in_the_logarithm_may_leave_no_moments(weight):
+    """Of exp(b ξ + c (ξ² − 1)) there is a mean where c < 1/2, and a variance where c < 1/4."""
+    simulator = Simulator(lambda x, p: p["k"] * x + p["b"], [Parameter("k", transform="log"), Parameter("b")])
+    found = NISP(simulator, PolynomialChaos(order=2, parameters=["k"]), X)
+    alpha = torch.tensor([0.3, 0.1, weight, 2.0], dtype=torch.float64)
+
+    def moment(t):
+        lean = 1 - 2 * t * weight
+        return math.exp(t * (0.3 - weight) + 0.5 * (0.1 * t) ** 2 / lean) / math.sqrt(lean) if lean > 0 else math.inf
+
+    mean, covariance = found.parameter_moments(alpha)
+    variance = moment(2) - moment(1) ** 2 if moment(2) < math.inf else math.inf
+    assert float(mean[0]) == pytest.approx(moment(1), rel=1e-12)
+    assert float(covariance[0, 0]) == pytest.approx(variance, rel=1e-12)
+    if variance == math.inf:
+        with pytest.warns(PropagationWarning, match="density of k has no finite"):
+            warn_of_moments(found, mean, covariance)

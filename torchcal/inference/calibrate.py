@@ -16,7 +16,7 @@ from torchcal.inference.draws import Draws
 from torchcal.inference.estimate import maximise
 from torchcal.inference.fitting import allowed_solver_error, least_squares
 from torchcal.inference.sampling import Plan, draw
-from torchcal.inference.setup import PriorMaker, check_inputs, check_run, embedded_problem
+from torchcal.inference.setup import PriorMaker, check_inputs, check_run, embedded_problem, warn_of_tails
 from torchcal.inference.starts import check_starts
 from torchcal.inference.summary import (
     diagnose,
@@ -26,6 +26,7 @@ from torchcal.inference.summary import (
     warn_of_bounds,
     warn_of_box,
     warn_of_chains,
+    warn_of_moments,
     warn_of_spike,
     warn_of_tolerance,
 )
@@ -152,7 +153,10 @@ def calibrate(
         )
 
     # Once with one node, which calls no simulator, so that what cannot work is told at once.
-    check_starts(build(Scaling.from_parameters(free), 1 if rule is None else rule), starts)
+    trial = build(Scaling.from_parameters(free), 1 if rule is None else rule)
+    check_starts(trial, starts)
+    if plan.samples:
+        warn_of_tails(trial)
     fit = least_squares(simulator, recording, fixed, seed=seed)
     simulator = fit.simulator
     problem = build(fit.scaling, rule)
@@ -196,6 +200,7 @@ def calibrate(
     warn_of_spike(problem, estimate.alpha)
     warn_of_chains(quality)
     mean, covariance = propagate.parameter_moments(estimate.alpha)
+    warn_of_moments(propagate, mean, covariance)
     return Calibration(
         map=MapEstimate(
             alpha=to_result(estimate.alpha),

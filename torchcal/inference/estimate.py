@@ -41,6 +41,10 @@ MOST_REFINED = 4
 SAME_MEANS = 1e-3
 """Difference of scaled means up to which two starts ended at one maximum."""
 
+FAR, FORTH, LONGER = 30.0, 0.3, 1.5
+"""Scaled units along a ridge of maxima from which on it has no end; the part of a step along it that must be gone; and
+how much longer the next step is."""
+
 
 @dataclass(frozen=True)
 class Estimate:
@@ -131,7 +135,8 @@ def maximise(
             "record conditions in which it matters.",
             IdentifiabilityWarning,
         )
-    elif together := _known_together(problem, found, null):
+    together = () if unseen else _known_together(problem, found, null)
+    if together:
         warn(
             f"The data determine {', '.join(together)} only together: other values of them give the same maximum, as "
             "where a model has nothing but their product. Hold one of them with fixed=, or give a proper prior.",
@@ -147,7 +152,7 @@ def maximise(
         agreeing=agreeing,
         ties=ties,
         null_directions=null,
-        improper=_unheld(problem, unseen),
+        improper=_unheld(problem, unseen) or _endless(problem, best, null, together),
         others=problem.prior.transform.bound(found.points[found.values - found.values[0] < MODE_GAP]),
     )
 
@@ -243,6 +248,36 @@ def _known_together(problem: Problem, found: Minima, null: Tensor) -> tuple[str,
     apart = flat & (means.amax(0) - means.amin(0) > SAME_MEANS)
     names = [name for name, far in zip(problem.propagate.pattern.names, apart.tolist(), strict=True) if far]
     return tuple(names) if len(names) > 1 else ()
+
+
+def _endless(problem: Problem, best: Tensor, null: Tensor, together: tuple[str, ...]) -> tuple[str, ...]:
+    """Parameters that are known together alone, where the ridge of their maxima goes on far beyond the scale.
+
+    One that is closed, as where a model has the sum of two squares, has a finite integral.
+    """
+    if not together or len(_unheld(problem, together)) < len(together):
+        return ()
+    propagate, prior = problem.propagate, problem.prior
+    rows = propagate.pattern.leading.nonzero()[:, 0].to(null.device)
+    means = null[:, rows]
+    begin = torch.zeros_like(best)
+    begin[rows] = means[means.norm(dim=-1).argmax()]
+    objective, piece = _objective(problem), pieces(propagate, len(problem.y))
+    highest = -float(problem.log_prob(best).detach())
+    highest += AGREEMENT * (1 + abs(highest))
+    for sign in (1.0, -1.0):
+        point, along, step = best, sign * begin, 1.0
+        while float((point - best)[rows].norm()) < FAR:
+            start = torch.maximum(torch.minimum(point + step * along / along.norm(), prior.high), prior.low)
+            found = minimise(lambda u: objective(propagate, u), prior.transform.unbound(start[None]), piece=piece)
+            gone = prior.transform.bound(found.points)[0] - point
+            along = torch.zeros_like(best).index_copy(0, rows, gone[rows])
+            if float(found.values[0]) > highest or float(along.norm()) < FORTH * step:
+                break
+            point, step = point + gone, LONGER * step
+        else:
+            return together
+    return ()
 
 
 def _unheld(problem: Problem, unseen: tuple[str, ...]) -> tuple[str, ...]:

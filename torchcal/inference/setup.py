@@ -12,6 +12,7 @@ from torchcal.embeddings import Embedding
 from torchcal.errors import (
     DomainError,
     EmbeddingError,
+    IdentifiabilityWarning,
     ImproperPosteriorError,
     RecordingError,
     SimulatorError,
@@ -24,7 +25,7 @@ from torchcal.priors import CoefficientPrior
 from torchcal.propagation import NISP, RuleChoice
 from torchcal.simulators import Parameter, Scaling, Simulator, Trajectories, check_slopes, free_parameters, workable
 
-__all__ = ["PriorMaker", "check_inputs", "check_run", "embedded_problem"]
+__all__ = ["PriorMaker", "check_inputs", "check_run", "embedded_problem", "warn_of_tails"]
 
 PriorMaker = Callable[[NISP], CoefficientPrior]
 
@@ -101,6 +102,30 @@ def check_run(num_starts: int, device: torch.device | str | None) -> None:
         raise DomainError(
             f"Expected a device that torch can use here. Got {device!r} ({error}). Use 'cpu', or leave it out."
         ) from error
+
+
+def warn_of_tails(problem: Problem) -> None:
+    """Warn where draws from a posterior have no finite variance, whatever they look like.
+
+    Warns:
+        IdentifiabilityWarning: With the numbers.
+    """
+    flat = _flat(problem.likelihood, problem.prior)
+    count = len(problem.y) if problem.observed is None else int(problem.observed.sum())
+    if flat and count - flat <= 2:
+        warn(
+            f"With N = {count} data and {flat} flat coefficients the posterior of the {problem.likelihood.name} "
+            "likelihood has no finite variance: far out it falls with the spread to the power of -N only, and the sd "
+            "of its draws say nothing. Use a Uniform or Normal prior, ABC(), or more data.",
+            IdentifiabilityWarning,
+        )
+
+
+def _flat(likelihood: likelihoods.Likelihood, prior: CoefficientPrior) -> int:
+    """Coefficients without a bound in whose direction a marginal likelihood alone makes the posterior fall."""
+    if likelihood.name not in ("marginal", "gaussian_marginal") or prior.proper:
+        return 0
+    return int((~torch.isfinite(prior.high - prior.low)).sum())
 
 
 def embedded_problem(
@@ -188,12 +213,12 @@ def embedded_problem(
             "do not constrain all coefficients, and the density at the data grows without limit as the spread "
             "vanishes. Use a Uniform or Normal prior, or ABC()."
         )
-    flat = int((~torch.isfinite(distribution.high - distribution.low)).sum())
-    if likelihood.name in ("marginal", "gaussian_marginal") and not distribution.proper and int(observed.sum()) <= flat:
+    count, flat = int(observed.sum()), _flat(likelihood, distribution)
+    if flat and count <= flat:
         raise ImproperPosteriorError(
-            f"Expected more data than flat coefficients for the {likelihood.name} likelihood. Got N = "
-            f"{int(observed.sum())} and {flat}: far out the likelihood falls with the spread to the power of -N only, "
-            "and the posterior has no finite integral. Use a Uniform or Normal prior, ABC(), or more data."
+            f"Expected more data than flat coefficients for the {likelihood.name} likelihood. Got N = {count} and "
+            f"{flat}: far out the likelihood falls with the spread to the power of -N only, and the posterior has no "
+            "finite integral. Use a Uniform or Normal prior, ABC(), or more data."
         )
     if likelihood.needs == "mean" and germs and not distribution.proper:
         raise ImproperPosteriorError(

@@ -8,7 +8,14 @@ from torch import Tensor
 
 from torchcal import likelihoods
 from torchcal.data import Recording
-from torchcal.errors import ConvergenceWarning, ExtrapolationWarning, IdentifiabilityWarning, ToleranceWarning, warn
+from torchcal.errors import (
+    ConvergenceWarning,
+    ExtrapolationWarning,
+    IdentifiabilityWarning,
+    PropagationWarning,
+    ToleranceWarning,
+    warn,
+)
 from torchcal.inference import diagnostics as measure
 from torchcal.inference.draws import WORTH_CHAINS, Draws, most_divergences
 from torchcal.inference.estimate import Estimate
@@ -27,6 +34,7 @@ __all__ = [
     "warn_of_bounds",
     "warn_of_box",
     "warn_of_chains",
+    "warn_of_moments",
     "warn_of_spike",
     "warn_of_tolerance",
 ]
@@ -184,6 +192,23 @@ def warn_of_bounds(problem: Problem, alpha: Tensor) -> None:
             "bounds that are not physical; others say that the model lacks something.",
             IdentifiabilityWarning,
         )
+
+
+def warn_of_moments(propagate: NISP, mean: Tensor, covariance: Tensor) -> None:
+    """Warn where the density of a parameter at the maximum has no mean or no variance.
+
+    On a logarithmic scale that is so where the square of a normal germ weighs ½, or ¼, in ln λ.
+    """
+    for what, finite in (("mean", mean.isfinite()), ("variance", covariance.diagonal().isfinite())):
+        if not bool(finite.all()):
+            names = [name for name, sure in zip(propagate.pattern.names, finite.tolist(), strict=True) if not sure]
+            warn(
+                f"The best density of {', '.join(names)} has no finite {what}: on a logarithmic scale the square of a "
+                "normal germ makes such tails, and more quadrature nodes do not help. Use germ='legendre', order=1, "
+                "or no transform.",
+                PropagationWarning,
+            )
+            return
 
 
 def warn_of_spike(problem: Problem, alpha: Tensor) -> None:

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 __all__ = ["parameter_density"]
 
+#: Draws that give the extent of a density without a variance.
+FINITE = 4000
+
 
 def parameter_density(
     propagate: NISP,
@@ -133,7 +136,7 @@ def _is_normal(propagate: NISP, pair: tuple[int, int]) -> bool:
 
 
 def _moments(propagate: NISP, alpha: Tensor, pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance of two parameters, averaged over draws of α, ``(S, P)``."""
+    """Mean and covariance of two parameters, averaged over draws of α, ``(S, P)``; medians where there is no mean."""
     mean, covariance = propagate.parameter_moments(alpha)
     mean, covariance = (
         mean[:, list(pair)].cpu().double(),
@@ -141,6 +144,9 @@ def _moments(propagate: NISP, alpha: Tensor, pair: tuple[int, int]) -> tuple[np.
     )
     offset = mean - mean.mean(0)
     total = covariance.mean(0) + offset.T @ offset / len(offset)
+    if not bool(torch.isfinite(total).all()):  # a square in ln λ may leave λ without a variance
+        points = _samples(propagate, alpha, pair, FINITE, seed=0)
+        return np.median(points, axis=0), np.cov(points.T)
     return mean.mean(0).numpy(), total.numpy()
 
 

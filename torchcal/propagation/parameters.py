@@ -18,7 +18,10 @@ def moments(propagate: "NISP", alpha: Tensor) -> tuple[Tensor, Tensor]:
     matrix = propagate.pattern.matrix(alpha)
     center, scale = propagate.scaling.center.to(alpha), propagate.scaling.scale.to(alpha)
     log = propagate.scaling.log.to(alpha.device)
-    if bool(log.any()) and not (propagate.pattern.order <= 1 and propagate.pattern.basis.name == "hermite"):
+    hermite = propagate.pattern.basis.name == "hermite"
+    if bool(log.any()) and hermite and propagate.pattern.order == 2:
+        return _of_exponentials(propagate, matrix)
+    if bool(log.any()) and not hermite:
         # The output's own nodes need not be enough for exp(λ): a line in ln λ takes two.
         germs = propagate.pattern.num_germs
         count = {0: 1, 1: 48, 2: 32, 3: 16}.get(germs)
@@ -44,3 +47,65 @@ def moments(propagate: "NISP", alpha: Tensor) -> tuple[Tensor, Tensor]:
         covariance = gain[..., :, None] * inner * gain[..., None, :]
         mean = torch.where(log, lognormal, mean)
     return mean, covariance
+
+
+def _of_exponentials(propagate: "NISP", matrix: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Moments of polynomials of degree 2 in normal germs, and of exponentials of such; +inf where there is none.
+
+    With :math:`L = c + b^T\xi + \xi^T Q\xi` and :math:`S = (I - 2Q)^{-1}`, where that is positive definite,
+
+    .. math:: E[e^L] = \sqrt{\det S}\, e^{c + b^T S b / 2}, \qquad E[e^L g(\xi)] = E[e^L]\, E[g(Sb + S^{1/2}\xi)]
+    """
+    constant, slope, bend = _quadratics(propagate, matrix)
+    log = propagate.scaling.log.to(matrix.device)
+    trace = bend.diagonal(dim1=-2, dim2=-1).sum(-1)
+    plain = constant + trace
+    lifted, at, spread = _tilted(constant, slope, bend)
+    mean = torch.where(log, lifted, plain)
+    # Of two exponentials their product is one; of one, the other is looked at where it leans; of none, as they are.
+    both, _, _ = _tilted(
+        constant[..., :, None] + constant[..., None, :],
+        slope[..., :, None, :] + slope[..., None, :, :],
+        bend[..., :, None, :, :] + bend[..., None, :, :, :],
+    )
+    both = both - lifted[..., :, None] * lifted[..., None, :]
+    second = torch.einsum("...jgh,...igh->...ij", bend, spread + at[..., :, None] * at[..., None, :])
+    one = constant[..., None, :] + torch.einsum("...jg,...ig->...ij", slope, at) + second - plain[..., None, :]
+    one = lifted[..., :, None] * one
+    none = slope @ slope.transpose(-1, -2) + 2 * torch.einsum("...igh,...jgh->...ij", bend, bend)
+    covariance = torch.where(log[:, None], torch.where(log, both, one), torch.where(log, one.transpose(-1, -2), none))
+    endless = (log & ~torch.isfinite(torch.where(log, both.diagonal(dim1=-2, dim2=-1), 0.0)))[..., None]
+    either = endless | endless.transpose(-1, -2)
+    return mean, torch.where(either & ~torch.isfinite(covariance), torch.inf, covariance)
+
+
+def _quadratics(propagate: "NISP", matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """c ``(*batch, d)``, b ``(*batch, d, germs)`` and Q ``(*batch, d, germs, germs)`` of expansions of degree 2."""
+    center, scale = propagate.scaling.center.to(matrix), propagate.scaling.scale.to(matrix)
+    germs = propagate.pattern.num_germs
+    coefficients = scale[:, None] * matrix
+    constant = center + coefficients[..., 0]
+    slope = matrix.new_zeros(*constant.shape, germs)
+    bend = matrix.new_zeros(*constant.shape, germs, germs)
+    for k, powers in enumerate(propagate.pattern.indices.tolist()):
+        here = [g for g, power in enumerate(powers) for _ in range(power)]
+        if len(here) == 1:
+            slope[..., here[0]] = coefficients[..., k]
+        elif len(here) == 2:
+            g, h = here
+            bend[..., g, h] = bend[..., h, g] = coefficients[..., k] * (1.0 if g == h else 0.5)
+            if g == h:  # He₂(ξ) = ξ² − 1
+                constant = constant - coefficients[..., k]
+    return constant, slope, bend
+
+
+def _tilted(constant: Tensor, slope: Tensor, bend: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """E[exp L] ``(*batch,)``, and mean and covariance of the germs weighed with exp L."""
+    germs = slope.shape[-1]
+    precision = torch.eye(germs).to(bend) - 2 * bend
+    finite = torch.linalg.eigvalsh(precision)[..., 0] > 0
+    precision = torch.where(finite[..., None, None], precision, torch.eye(germs).to(bend))
+    spread = torch.linalg.inv(precision)
+    at = (spread @ slope.unsqueeze(-1)).squeeze(-1)
+    size = (constant + 0.5 * (slope * at).sum(-1) - 0.5 * torch.logdet(precision)).exp()
+    return torch.where(finite, size, torch.inf), at, spread
