@@ -1,6 +1,7 @@
 """float32 within stated error of float64; and on a GPU, where there is one."""
 
 import dataclasses
+import warnings
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ from test_sampler_agreement import check_same_distribution, quietly, with_moment
 
 import torchcal as tc
 from examples import cubic
+from torchcal.errors import DomainError
 
 ROUNDING = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}
 """Largest relative error of one rounding."""
@@ -130,3 +132,20 @@ def test_the_additive_posterior_is_the_same(device):
 
 def _on_cpu(result):
     return dataclasses.replace(result, propagate=result.propagate.copy().to(device="cpu", dtype=torch.float64))
+
+
+@pytest.mark.parametrize(("scale", "told"), [(1e-20, True), (1e-12, False), (1e12, False), (1e20, True)])
+def test_units_beyond_single_precision_are_told(scale, told):
+    x = torch.linspace(0, 4, 12, dtype=torch.float64)
+    line = tc.Simulator(lambda x, p: scale * (p["a"] + p["b"] * x), [tc.Parameter("a"), tc.Parameter("b")])
+    recording = tc.Recording(x=x, y=scale * (1 + x + 0.1 * torch.sin(5 * x)))
+    options = {"num_samples": 4, "num_warmup": 20, "num_chains": 2, "seed": 0, "dtype": torch.float32}
+    for calibrate in (tc.calibrate, tc.calibrate_additive):
+        if told:
+            with pytest.raises(DomainError, match="Use other units"):
+                calibrate(line, recording, **options)
+            continue
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", tc.errors.TorchcalWarning)
+            found = calibrate(line, recording, **options)
+        assert bool(found.samples.isfinite().all())

@@ -12,7 +12,7 @@ from torchcal.errors import IdentifiabilityWarning, ImproperPosteriorError, warn
 from torchcal.inference.estimate import maximise
 from torchcal.inference.fitting import LeastSquares, least_squares, plain_propagation
 from torchcal.inference.sampling import Plan, draw
-from torchcal.inference.setup import check_inputs, check_run
+from torchcal.inference.setup import check_dtype, check_inputs, check_run
 from torchcal.inference.summary import diagnose, settings_of, to_result, warn_of_bounds, warn_of_box, warn_of_chains
 from torchcal.models import Problem
 from torchcal.priors import CoefficientPrior, Flat
@@ -91,6 +91,7 @@ def calibrate_additive(
     )
     check_run(num_starts, device)
     simulator, free = check_inputs(simulator, recording, fixed)
+    check_dtype(recording, plan.dtype)
     observed = recording.observed
     count = int(observed.sum())
     if count <= len(free):

@@ -16,7 +16,7 @@ from torchcal.inference.draws import Draws
 from torchcal.inference.estimate import maximise
 from torchcal.inference.fitting import allowed_solver_error, least_squares
 from torchcal.inference.sampling import Plan, draw
-from torchcal.inference.setup import PriorMaker, check_inputs, check_run, embedded_problem, warn_of_tails
+from torchcal.inference.setup import PriorMaker, check_dtype, check_inputs, check_run, embedded_problem, warn_of_tails
 from torchcal.inference.starts import check_starts
 from torchcal.inference.summary import (
     diagnose,
@@ -135,6 +135,7 @@ def calibrate(
             f"Expected embedding as one of torchcal.embeddings, such as Gaussian(). Got {embedding!r}{instead}."
         )
     simulator, free = check_inputs(simulator, recording, fixed)
+    check_dtype(recording, plan.dtype)
     if isinstance(simulator, Trajectories):
         embedding = embedding.sparing([parameter.name for parameter in free], simulator.nuisance)
 

@@ -25,9 +25,12 @@ from torchcal.priors import CoefficientPrior
 from torchcal.propagation import NISP, RuleChoice
 from torchcal.simulators import Parameter, Scaling, Simulator, Trajectories, check_slopes, free_parameters, workable
 
-__all__ = ["PriorMaker", "check_inputs", "check_run", "embedded_problem", "warn_of_tails"]
+__all__ = ["PriorMaker", "check_dtype", "check_inputs", "check_run", "embedded_problem", "warn_of_tails"]
 
 PriorMaker = Callable[[NISP], CoefficientPrior]
+
+SINGLE = (1e-15, 1e17)
+"""Spread at least, and values at most, of data whose likelihood single precision can hold."""
 
 NODES_IN_TIME = 3
 """Gauss nodes for each germ with which the search for trajectories begins; at the maximum they are refined."""
@@ -89,6 +92,20 @@ def check_inputs(
     asked = torch.cat([values[:1], values[len(values) // 2 :]])
     check_slopes(simulator, recording.x, asked, columns, recording.outputs, kept=recording.observed)
     return simulator, free
+
+
+def check_dtype(recording: Recording, dtype: torch.dtype) -> None:
+    """Raise for data whose squares, and those of what is small beside them, single precision cannot hold."""
+    if dtype != torch.float32:
+        return
+    seen = recording.observed
+    size, spread = float(recording.y[seen].abs().max()), float(recording.spread[seen].min())
+    if spread < SINGLE[0] or size > SINGLE[1]:
+        raise DomainError(
+            f"Expected data between {SINGLE[0]:g} and {SINGLE[1]:g} for dtype=torch.float32, which holds no squares "
+            f"of others. Got a spread of {spread:.3g} and values up to {size:.3g}. Use other units, or "
+            "dtype=torch.float64."
+        )
 
 
 def check_run(num_starts: int, device: torch.device | str | None) -> None:
