@@ -570,5 +570,19 @@ def test_copies_of_rows():
     both = Recording(x=x + x, y=missing, missing=True)
     assert both.copies.tolist() == [False] * 5 + [True] * 5
     assert int(both.observed_once.sum()) == 8
-    run = Run(time=x, outputs={"a": y})
-    assert not Recording(runs=[run, run]).copies.any()
+
+
+def test_copies_of_runs():
+    t, h = [0.0, 1.0, 2.0, 3.0, 4.0], [0.5, 0.7, np.nan, 0.3, 0.6, 0.2]
+
+    def run(**changes):
+        return Run(**{"time": [*t, 5.0], "outputs": {"h": h}, "inputs": {"q": [*t, 1.0]}, **changes})
+
+    twice = Recording(runs=[run(), run(initial={"h": 1.0}), run()], missing=True)
+    assert twice.copies.tolist() == [False] * 12 + [True] * 6
+    assert not Recording(runs=[run(), run()], missing=True, noise=0.1).copies.any()
+    changed = {"time": [*t, 6.0], "outputs": {"h": [*h[:5], 0.3]}, "inputs": {"q": [*t, 2.0]}, "hold": "zero"}
+    for other in ({name: value} for name, value in changed.items()):
+        assert not Recording(runs=[run(), run(**other)], missing=True).copies.any()
+    short = Run(time=t[:4], outputs={"h": h[2:]}, inputs={"q": t[:4]})
+    assert not Recording(runs=[short, short], missing=True).copies.any()

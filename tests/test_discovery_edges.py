@@ -391,3 +391,18 @@ def test_two_terms_that_bend_to_a_fast_process_are_no_name():
     y = truth + 0.207 * np.random.default_rng(3).standard_normal(60)
     recording = tc.Recording(x={"T": temperature, "t": t}, y={"G": y}, noise=0.207)
     assert diagnose(tc.Simulator(relaxing, parameters), recording, candidates).verdict in ("unexplained", "ambiguous")
+
+
+def test_a_run_that_was_read_twice_counts_once():
+    t = np.linspace(0, 4, 41)
+    decay = tc.ODESimulator(
+        lambda t, s, p, u: {"h": -p["k"] * s["h"]}, {"h": "m"}, [tc.Parameter("k", low=0.0, initial=0.5)]
+    )
+    inflow = tc.Term("inflow", equation="h", rate=lambda t, s, p, u: p["f"], parameters=[tc.Parameter("f")])
+    run = tc.Run(time=t, outputs={"h": 2 * np.exp(-0.7 * t) + 0.3 + 0.02 * np.asarray(noise(41, 0))})
+    once, often = (diagnose(decay, tc.Recording(runs=[run] * count), [inflow]) for count in (1, 4))
+    assert once.terms == often.terms == ["inflow"]
+    one, four = (d.ranking[0].estimates[0] for d in (once, often))
+    assert (four.value, four.sd) == (pytest.approx(one.value, rel=1e-3), pytest.approx(one.sd, rel=0.1))
+    assert any("123 of 164 rows" in line for line in often.symptoms)
+    assert "from run to run" not in str(often)

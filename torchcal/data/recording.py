@@ -14,7 +14,7 @@ from torchcal.data.arrays import sample_spread, value_range
 from torchcal.data.frames import check_columns, column_names, read_csv
 from torchcal.data.noise import noise_sd
 from torchcal.data.parts import run_parts, static_parts
-from torchcal.data.run import Run, change
+from torchcal.data.run import Run, change, same
 from torchcal.errors import RecordingError, ShapeError
 
 __all__ = ["Recording"]
@@ -196,14 +196,17 @@ class Recording:
 
     @property
     def copies(self) -> Tensor:
-        """Rows of a static recording without noise= that are earlier ones once more, bool of shape ``(n,)``.
+        """Rows of a recording without noise= that are earlier ones once more, bool of shape ``(n,)``.
 
-        All rows, numbers and order, of a table that was read twice or more. None are where noise is given, whose
-        repeated readings may agree.
+        All rows, numbers and order, of a table that was read twice or more; in time, all samples of a run. None are
+        where noise is given, whose repeated readings may agree.
         """
         none = torch.zeros(self.n, dtype=torch.bool)
-        if self.runs is not None or self.noise is not None:
+        if self.noise is not None:
             return none
+        if self.runs is not None:
+            repeats = [any(same(run, earlier) for earlier in self.runs[:k]) for k, run in enumerate(self.runs)]
+            return torch.cat([torch.full((len(r.time),), told) for r, told in zip(self.runs, repeats, strict=True)])
         y = torch.nan_to_num(self.y.reshape(len(self.outputs), self.n).T, nan=torch.inf)
         rows = torch.cat([self.columns, y], dim=-1)
         for times in range(2, self.n // TABLE + 1):

@@ -13,10 +13,13 @@ from torchcal.data.frames import check_columns, column_names
 from torchcal.data.interpolation import HOLDS, evaluate_pieces, pieces
 from torchcal.errors import DomainError, RecordingError, ShapeError
 
-__all__ = ["Run", "change", "convert"]
+__all__ = ["Run", "change", "convert", "same"]
 
 RESERVED = ("time", "run", "t")
 """Names that a recording in time has for itself."""
+
+SEVERAL = 5
+"""Fewest samples by which two runs are known as one."""
 
 OUTSIDE = 1e-12
 """How far outside the span a time counts as its end, as share of the largest time: a few roundings."""
@@ -201,6 +204,22 @@ def change(run: Run, **changes: Any) -> Run:
     for name in ("time", "outputs", "inputs", "initial", "hold", "units", "_quantities"):
         object.__setattr__(twin, name, changes.get(name, getattr(run, name)))
     return twin
+
+
+def same(run: Run, other: Run) -> bool:
+    """Whether two runs of `SEVERAL` samples at least are one, number for number, as of a file that was read twice."""
+    if (run.hold, run.initial, set(run.outputs), set(run.inputs)) != (
+        other.hold, other.initial, set(other.outputs), set(other.inputs)
+    ):  # fmt: skip
+        return False
+    pairs = [(run.time, other.time)]
+    pairs += [(run.outputs[name], other.outputs[name]) for name in run.outputs]
+    pairs += [(run.inputs[name], other.inputs[name]) for name in run.inputs]
+    seen = torch.stack([~torch.isnan(values) for values in run.outputs.values()]).any(0)
+    several = int(seen.sum()) >= SEVERAL
+    return several and all(
+        torch.equal(one.nan_to_num(nan=torch.inf), two.nan_to_num(nan=torch.inf)) for one, two in pairs
+    )
 
 
 def convert(run: Run, units: Mapping[str, str], where: str) -> Run:

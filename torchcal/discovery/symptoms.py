@@ -50,8 +50,8 @@ def symptoms(search: Search, best: Model | None) -> list[str]:
     rows = runs + bent
     if count := int(search.problem.recording.copies.sum()):
         rows.append(
-            f"{count} of {search.problem.recording.n} rows are others once more, numbers and all, as of a table that "
-            "was read twice: they count once"
+            f"{count} of {search.problem.recording.n} rows are others once more, numbers and all, as of a table or a "
+            "run that was read twice: they count once"
         )
     if search.noise.doubted > 1:
         # A misfit that is smooth on coarse spacing passes for fast: what leaves less tells more of the noise.

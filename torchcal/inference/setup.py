@@ -56,10 +56,10 @@ def check_inputs(
             "torchcal.Recording(x=x, y=y)."
         )
     if count := int(recording.copies.sum()):
+        todo = "drop them with recording.subset(~recording.copies)" if recording.runs is None else "leave the run out"
         warn(
-            f"{count} of {recording.n} rows are the others once more, as of a table that was read twice. They count as "
-            "data of their own, and the posterior is too narrow: drop them with "
-            "recording.subset(~recording.copies).",
+            f"{count} of {recording.n} rows are the others once more, as of a table or a run that was read twice. They "
+            f"count as data of their own, and the posterior is too narrow: {todo}.",
             TorchcalWarning,
         )
     simulator = simulator.bind(recording)
