@@ -293,7 +293,7 @@ REFUSED = {
     "a string": ({"y": "data"}, RecordingError, r"y as real numbers.*'data' at index 0"),
     "None within": ({"y": [1.0, 2.0, None]}, RecordingError, r"None at index 2.*missing sample is NaN"),
     "None as array": ({"y": {"a": None}}, RecordingError, r"Expected y\['a'\].*None at index 0"),
-    "dates": ({"x": np.arange(3).astype("M8[s]")}, RecordingError, r"x as real numbers.*datetime64"),
+    "dates": ({"x": np.arange(3).astype("M8[s]")}, RecordingError, r"x as real numbers.*datetime64.*as seconds"),
     "generator": ({"y": (v for v in Y)}, RecordingError, r"Expected y as real.*object"),
     "list of quantities": ({"x": [Quantity(1, "m")] * 3}, RecordingError, r"a Quantity at index 0"),
     "one data point": ({"x": [1], "y": [1]}, RecordingError, r"at least 2 data points\. Got 1"),

@@ -406,3 +406,19 @@ def test_a_run_that_was_read_twice_counts_once():
     assert (four.value, four.sd) == (pytest.approx(one.value, rel=1e-3), pytest.approx(one.sd, rel=0.1))
     assert any("123 of 164 rows" in line for line in often.symptoms)
     assert "from run to run" not in str(often)
+
+
+def test_what_is_wrong_with_arguments_is_told():
+    x = torch.linspace(0, 4, 30, dtype=F64)
+    recording = tc.Recording(x=x, y=1 + x + 0.1 * noise(30, 0))
+    with pytest.raises(DomainError, match=r"a share, or a bool array .* Got 0\."):
+        diagnose(LINE, recording, holdout=0)
+    other = tc.Term("bump", outputs={"y": lambda t, s, p, u, y: y + p["h"]}, parameters=[tc.Parameter("h")])
+    with pytest.raises(SimulatorError, match="given 3 arguments"):
+        diagnose(LINE, recording, [other])
+    decay = tc.ODESimulator(lambda t, s, p, u: {"h": -p["k"] * s["h"]}, {"h": "m"}, [tc.Parameter("k", initial=0.5)])
+    parameters = [tc.Parameter("f")]
+    inflow = tc.Term("inflow", equation="h", rate=lambda t, s, p, u: np.sin(p["f"].numpy()), parameters=parameters)
+    run = tc.Run(time=x, outputs={"h": 2 * torch.exp(-0.7 * x) + 0.02 * noise(30, 0)})
+    with pytest.raises(SimulatorError, match="Use torch functions on them, without"):
+        diagnose(decay, tc.Recording(runs=[run]), [inflow])

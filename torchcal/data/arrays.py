@@ -133,7 +133,10 @@ def _plain(value: Any, label: str) -> Tensor:
             "(give rows of equal length, or a tensor)."
         ) from error
     if array.dtype.kind not in "fiu":
-        _refuse(label, f"dtype {array.dtype}{_first_text(array)}")
+        got = f"dtype {array.dtype}{_first_text(array)}"
+        if array.dtype.kind in "mM":
+            _refuse(label, got, "as seconds they are (t - t[0]) / np.timedelta64(1, 's'); or choose another unit")
+        _refuse(label, got)
     if isinstance(array, np.ma.MaskedArray):
         array = np.ma.filled(array.astype(np.float64), np.nan)
     return torch.from_numpy(np.array(array, dtype=np.float64))

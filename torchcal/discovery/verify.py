@@ -50,10 +50,11 @@ def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None
             got = repr(holdout) if isinstance(holdout, str | int) else type(holdout).__name__
             raise DomainError(f"Expected holdout as None, False, a share or a bool array. Got {got}.") from error
         if mask.dtype != torch.bool or mask.shape not in ((recording.n,), recording.y.shape):
+            got = f"{mask.dtype} of shape {tuple(mask.shape)}" if mask.ndim else repr(holdout)
             several = f" or, one output after another, ({len(recording.y)},)" if len(recording.outputs) > 1 else ""
             raise DomainError(
                 f"Expected holdout as False, a share, or a bool array of shape ({recording.n},){several}, True where "
-                f"held out. Got {mask.dtype} of shape {tuple(mask.shape)}."
+                f"held out. Got {got}."
             )
         mask = mask.repeat(len(recording.outputs)) if len(mask) == recording.n and len(recording.outputs) > 1 else mask
         kept = int((recording.observed_once & ~mask).sum())

@@ -41,6 +41,12 @@ def _is_finite(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
+def _advice(error: Exception) -> str:
+    if "numpy()" in str(error) or "converted to Python scalars" in str(error):
+        return " Use torch functions on them, without .detach(): derivatives are needed."
+    return ""
+
+
 def outer(p: Mapping[str, Any]) -> Mapping[str, Any]:
     """The simulator's ``p``, for what a user wrote for that, out of a term's."""
     return p.outer if isinstance(p, _Own) else p
@@ -251,7 +257,7 @@ class Term:
             known = "; ".join(", ".join(part) for part in given if isinstance(part, Mapping) and part)
             raise SimulatorError(
                 f"Expected a tensor from every function of the term {self.name!r}. One of them raised "
-                f"{type(error).__name__}: {error}. It was given {known}."
+                f"{type(error).__name__}: {error}. It was given {len(given)} arguments: {known}.{_advice(error)}"
             ) from error
         if isinstance(result, np.ndarray | np.generic):
             result = torch.as_tensor(result)
