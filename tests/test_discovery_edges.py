@@ -151,7 +151,7 @@ def test_a_base_that_is_constant_by_itself_has_not_got_lost(scale):
 
 def test_a_small_share_of_short_runs_is_held_out():
     t = torch.linspace(0, 1, 15, dtype=F64)
-    recording = tc.Recording(runs=[tc.Run(time=t, outputs={"x": t}) for _ in range(2)])
+    recording = tc.Recording(runs=[tc.Run(time=t, outputs={"x": t + shift}) for shift in (0, 1)])
     mask = verify.choose(recording, 0.05, 1)
     assert mask.nonzero()[:, 0].tolist() == [14, 29]
     assert int(verify.choose(recording, 0.2, 1).sum()) == 6

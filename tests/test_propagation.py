@@ -766,3 +766,24 @@ def test_a_square_in_the_logarithm_may_leave_no_moments(weight):
     if variance == math.inf:
         with pytest.warns(PropagationWarning, match="density of k has no finite"):
             warn_of_moments(found, mean, covariance)
+
+
+def test_moments_of_the_second_order_end_in_those_of_the_first():
+    """To the last digits: variances are no differences of large numbers."""
+    parameters = [Parameter("k", transform="log"), Parameter("b"), Parameter("g", transform="log")]
+    simulator = Simulator(lambda x, p: p["k"] * x + p["b"] * p["g"], parameters)
+    first, second = (NISP(simulator, PolynomialChaos(order=order, parameters=["k", "b"]), X) for order in (1, 2))
+    for size in (0.3, 1e-4, 1e-9):
+        chosen = {"k[0]": 0.3, "b[0]": 1000.0, "g[0]": 0.7, "k[xi1]": size, "b[xi1]": 0.4, "b[xi2]": size}
+        found = []
+        for module in (first, second):
+            alpha = torch.zeros(module.num_alpha, dtype=torch.float64)
+            for name, value in chosen.items():
+                alpha[module.alpha_names.index(name)] = value
+            alpha.requires_grad_(True)
+            mean, covariance = module.parameter_moments(alpha)
+            (slope,) = torch.autograd.grad(mean.sum() + covariance.sum(), alpha)
+            assert bool(slope.isfinite().all())
+            found.append((mean.detach(), covariance.detach()))
+        for one, other in zip(*found, strict=True):
+            torch.testing.assert_close(one, other, rtol=1e-9, atol=0.0)

@@ -168,3 +168,61 @@ def test_a_simulator_that_has_not_written_something_says_so():
 
     with pytest.raises(SimulatorError, match="raised NotImplementedError: not yet"):
         tc.Simulator(unwritten, DECAY).linearise(X, torch.ones(1, 2, dtype=F64))
+
+
+class InNumPy(torch.autograd.Function):
+    """One whose backward pass is right, and is not differentiated, without a word."""
+
+    @staticmethod
+    def forward(ctx, value):
+        ctx.save_for_backward(value)
+        return value.exp()
+
+    @staticmethod
+    def backward(ctx, grad):
+        return torch.as_tensor(grad.detach().numpy() * np.exp(ctx.saved_tensors[0].detach().numpy()))
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-12])
+def test_a_part_that_is_lost_in_two_backward_passes_is_not_lost(scale):
+    """However small it is, beside others or in its units."""
+    outputs = ("large", "small")
+
+    def two(x, p, exp):
+        return {"large": 1e6 * p["a"] * torch.exp(-p["k"] * x), "small": scale * p["a"] * exp(-p["k"] * x)}
+
+    one_way = tc.Simulator(lambda x, p: two(x, p, InNumPy.apply), DECAY)
+    both = tc.Simulator(lambda x, p: two(x, p, torch.exp), DECAY)
+    values = torch.tensor([[2.0, 0.5], [1.0, 0.1]], dtype=F64)
+    found, wanted = (each.linearise(X, values, outputs).jacobian for each in (one_way, both))
+    torch.testing.assert_close(found, wanted, atol=0.0, rtol=1e-9)
+
+
+def test_a_failing_simulator_is_called_once():
+    calls = []
+
+    def failing(x, p):
+        calls.append(1)
+        raise MemoryError("too much")
+
+    for simulator in (tc.Simulator(failing, DECAY), tc.ExternalSimulator(failing, DECAY, vectorized=True)):
+        calls.clear()
+        with pytest.raises(SimulatorError, match="too much"):
+            simulator.linearise(X, torch.ones(1, 2, dtype=F64))
+        assert len(calls) == 1
+
+
+def test_a_diagnosis_asks_for_the_derivatives_that_it_goes_by():
+    """Forward mode passes through no_grad(), which a backward pass does not."""
+
+    def partly(x, p):
+        with torch.no_grad():
+            decaying = torch.exp(-p["k"] * x)
+        return p["a"] * decaying
+
+    simulator = tc.Simulator(partly, DECAY)
+    noise = 0.02 * torch.randn(30, dtype=F64, generator=torch.Generator().manual_seed(0))
+    diagnosis = tc.diagnose(simulator, recorded(3 * torch.exp(-0.7 * X) + noise), progress=False)
+    assert diagnosis.verdict == "consistent"
+    with pytest.raises(SimulatorError, match="depend on 'k'"):
+        check_inputs(simulator, recorded(), None)

@@ -14,7 +14,7 @@ from torchcal.data.arrays import sample_spread, value_range
 from torchcal.data.frames import check_columns, column_names, read_csv
 from torchcal.data.noise import noise_sd
 from torchcal.data.parts import run_parts, static_parts
-from torchcal.data.run import Run, change, same
+from torchcal.data.run import Run, change, fingerprint
 from torchcal.errors import RecordingError, ShapeError
 
 __all__ = ["Recording"]
@@ -205,8 +205,11 @@ class Recording:
         if self.noise is not None:
             return none
         if self.runs is not None:
-            repeats = [any(same(run, earlier) for earlier in self.runs[:k]) for k, run in enumerate(self.runs)]
-            return torch.cat([torch.full((len(r.time),), told) for r, told in zip(self.runs, repeats, strict=True)])
+            known, told = set(), []
+            for mark, run in ((fingerprint(run), run) for run in self.runs):
+                told.append(torch.full((len(run.time),), mark is not None and mark in known))
+                known.add(mark)
+            return torch.cat(told)
         y = torch.nan_to_num(self.y.reshape(len(self.outputs), self.n).T, nan=torch.inf)
         rows = torch.cat([self.columns, y], dim=-1)
         for times in range(2, self.n // TABLE + 1):

@@ -13,7 +13,7 @@ from torchcal.data.frames import check_columns, column_names
 from torchcal.data.interpolation import HOLDS, evaluate_pieces, pieces
 from torchcal.errors import DomainError, RecordingError, ShapeError
 
-__all__ = ["Run", "change", "convert", "same"]
+__all__ = ["Run", "change", "convert", "fingerprint"]
 
 RESERVED = ("time", "run", "t")
 """Names that a recording in time has for itself."""
@@ -206,20 +206,18 @@ def change(run: Run, **changes: Any) -> Run:
     return twin
 
 
-def same(run: Run, other: Run) -> bool:
-    """Whether two runs of `SEVERAL` samples at least are one, number for number, as of a file that was read twice."""
-    if (run.hold, run.initial, set(run.outputs), set(run.inputs)) != (
-        other.hold, other.initial, set(other.outputs), set(other.inputs)
-    ):  # fmt: skip
-        return False
-    pairs = [(run.time, other.time)]
-    pairs += [(run.outputs[name], other.outputs[name]) for name in run.outputs]
-    pairs += [(run.inputs[name], other.inputs[name]) for name in run.inputs]
+def fingerprint(run: Run) -> tuple[Any, ...] | None:
+    """What two runs share that are one, number for number, as of a file that was read twice.
+
+    None where there are too few samples to tell.
+    """
     seen = torch.stack([~torch.isnan(values) for values in run.outputs.values()]).any(0)
-    several = int(seen.sum()) >= SEVERAL
-    return several and all(
-        torch.equal(one.nan_to_num(nan=torch.inf), two.nan_to_num(nan=torch.inf)) for one, two in pairs
-    )
+    if int(seen.sum()) < SEVERAL:
+        return None
+    series = {f"output {name}": values for name, values in run.outputs.items()}
+    series |= {f"input {name}": values for name, values in run.inputs.items()} | {"time": run.time}
+    held = tuple(sorted((name, values.nan_to_num(nan=torch.inf).numpy().tobytes()) for name, values in series.items()))
+    return run.hold, tuple(sorted(run.initial.items())), held
 
 
 def convert(run: Run, units: Mapping[str, str], where: str) -> Run:

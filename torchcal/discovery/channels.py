@@ -117,7 +117,9 @@ def responses(problem: Problem, found: Fitted, forcing: Tensor) -> tuple[Tensor,
 
 def _by_run(problem: Problem, drivers: dict[str, Tensor], runs: Tensor) -> dict[str, Tensor]:
     """With the number of the run among the drivers, where there are several: what differs between runs alone."""
-    if not problem.in_time or RUN in drivers or len(problem.recording.x[RUN][problem.condition_of].unique()) < 2:  # type: ignore[index]
+    if not isinstance(problem.recording.x, dict) or RUN in drivers or not problem.in_time:
+        return drivers
+    if len(problem.recording.x[RUN][problem.condition_of].unique()) < 2:
         return drivers
     return {**drivers, RUN: runs.to(torch.float64)}
 

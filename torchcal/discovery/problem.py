@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchcal.data import Recording
 from torchcal.errors import SimulatorError
-from torchcal.simulators import Parameter, Simulator, Solution, Trajectories, Values, check_slopes
+from torchcal.simulators import Parameter, Simulator, Solution, Trajectories, Values, check_slopes, limits
 
 __all__ = ["Problem", "Whitening", "breaks", "remembered"]
 
@@ -212,9 +212,7 @@ class Problem:
 
     def limits(self) -> tuple[Tensor, Tensor]:
         """Physical bounds, ``(P,)`` twice."""
-        low = [-math.inf if q.low is None else q.low for q in self.parameters]
-        high = [math.inf if q.high is None else q.high for q in self.parameters]
-        return torch.tensor(low, dtype=torch.float64), torch.tensor(high, dtype=torch.float64)
+        return limits(self.parameters)
 
     def evaluate(
         self, values: Tensor, columns: list[int], warm: Solution | None = None, *, march: bool = True
@@ -235,7 +233,7 @@ class Problem:
             SimulatorError: If they do.
         """
         x, outputs = self.recording.x, self.recording.outputs
-        check_slopes(self.simulator, x, values[None], columns, outputs, kept=self.keep, what=what)
+        check_slopes(self.simulator, x, values[None], columns, outputs, kept=self.keep, whole=True, what=what)
 
     def guess(self, found: Solution | None, values: Tensor) -> Solution | None:
         """Another problem's only solution as a warm start at ``values`` (H, P); None where it is none.

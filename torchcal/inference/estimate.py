@@ -42,8 +42,8 @@ SAME_MEANS = 1e-3
 """Difference of scaled means up to which two starts ended at one maximum."""
 
 FAR, FORTH, LONGER = 30.0, 0.3, 1.5
-"""Scaled units along a ridge of maxima from which on it has no end; the part of a step along it that must be gone; and
-how much longer the next step is."""
+"""Sizes of the parameters, or scaled units, along a ridge of maxima from which on it has no end; the part of a step
+along it that must be gone; and how much longer the next step is."""
 
 
 @dataclass(frozen=True)
@@ -265,9 +265,12 @@ def _endless(problem: Problem, best: Tensor, null: Tensor, together: tuple[str, 
     objective, piece = _objective(problem), pieces(propagate, len(problem.y))
     highest = -float(problem.log_prob(best).detach())
     highest += AGREEMENT * (1 + abs(highest))
+    scaling = propagate.scaling
+    size = (scaling.physical(best[rows]) / scaling.scale.to(best))[~scaling.log.to(best.device)]
+    far = FAR * max(1.0, float(size.norm()))
     for sign in (1.0, -1.0):
         point, along, step = best, sign * begin, 1.0
-        while float((point - best)[rows].norm()) < FAR:
+        while float((point - best)[rows].norm()) < far:
             start = torch.maximum(torch.minimum(point + step * along / along.norm(), prior.high), prior.low)
             found = minimise(lambda u: objective(propagate, u), prior.transform.unbound(start[None]), piece=piece)
             gone = prior.transform.bound(found.points)[0] - point

@@ -115,7 +115,7 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
     """
     if estimate.improper:
         raise ImproperPosteriorError(
-            "Expected a proper posterior to draw from. Got one that goes on without end in "
+            "Expected a proper posterior to draw from. Got one that does not change along "
             f"{', '.join(estimate.improper)}, under a flat prior. Hold a parameter with fixed=, use a Uniform prior, "
             "or num_samples=0 for the maximum alone."
         )

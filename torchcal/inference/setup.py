@@ -58,7 +58,7 @@ def check_inputs(
     if count := int(recording.copies.sum()):
         todo = "drop them with recording.subset(~recording.copies)" if recording.runs is None else "leave the run out"
         warn(
-            f"{count} of {recording.n} rows are the others once more, as of a table or a run that was read twice. They "
+            f"{count} of {recording.n} rows are others once more, as of a table or a run that was read twice. They "
             f"count as data of their own, and the posterior is too narrow: {todo}.",
             TorchcalWarning,
         )
@@ -88,8 +88,8 @@ def check_inputs(
             f"{len(recording.outputs)} outputs). Got {count} from the simulator."
         )
     columns = [simulator.names.index(parameter.name) for parameter in free]
-    # At the guess; and for what is on a bound there, well within.
-    asked = torch.cat([values[:1], values[len(values) // 2 :]])
+    # In the middle of the scales; and for what tells nothing there, ever farther off.
+    asked = torch.cat([values[:1], values[len(values) // 2 :: 4]])
     check_slopes(simulator, recording.x, asked, columns, recording.outputs, kept=recording.observed)
     return simulator, free
 
@@ -129,7 +129,8 @@ def warn_of_tails(problem: Problem) -> None:
     """
     flat = _flat(problem.likelihood, problem.prior)
     count = len(problem.y) if problem.observed is None else int(problem.observed.sum())
-    if flat and count - flat <= 2:
+    # On a logarithmic scale outputs grow faster than any power.
+    if flat and count - flat <= 2 and not bool(problem.propagate.scaling.log.any()):
         warn(
             f"With N = {count} data and {flat} flat coefficients the posterior of the {problem.likelihood.name} "
             "likelihood has no finite variance: far out it falls with the spread to the power of -N only, and the sd "

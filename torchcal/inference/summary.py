@@ -138,7 +138,10 @@ def _parameter_draws(propagate: NISP, samples: Tensor) -> tuple[tuple[str, ...],
             if j == i or (j < i and bool(covariance[..., i, j].any())):
                 labels.append(f"Cov[{names[i]}, {names[j]}]" if i != j else f"Var[{names[i]}]")
                 columns.append(covariance[..., i, j, None])
-    return tuple(labels), to_result(torch.cat(columns, dim=-1))
+    found = torch.cat(columns, dim=-1)
+    # What is infinite for a few draws is their largest.
+    finite = torch.where(found.isfinite(), found, -torch.inf).flatten(0, -2).amax(0)
+    return tuple(labels), to_result(torch.where(found == torch.inf, finite, found))
 
 
 def warn_of_chains(quality: Diagnostics) -> None:
@@ -199,6 +202,8 @@ def warn_of_moments(propagate: NISP, mean: Tensor, covariance: Tensor) -> None:
 
     On a logarithmic scale that is so where the square of a normal germ weighs ½, or ¼, in ln λ.
     """
+    if propagate.pattern.order < 2 or propagate.pattern.basis.name != "hermite":
+        return  # then they are too large, at most
     for what, finite in (("mean", mean.isfinite()), ("variance", covariance.diagonal().isfinite())):
         if not bool(finite.all()):
             names = [name for name, sure in zip(propagate.pattern.names, finite.tolist(), strict=True) if not sure]

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["parameter_density"]
 
 #: Draws that give the extent of a density without a variance.
-FINITE = 4000
+DRAWN = 4000
 
 
 def parameter_density(
@@ -145,7 +145,7 @@ def _moments(propagate: NISP, alpha: Tensor, pair: tuple[int, int]) -> tuple[np.
     offset = mean - mean.mean(0)
     total = covariance.mean(0) + offset.T @ offset / len(offset)
     if not bool(torch.isfinite(total).all()):  # a square in ln λ may leave λ without a variance
-        points = _samples(propagate, alpha, pair, FINITE, seed=0)
+        points = _samples(propagate, alpha, pair, DRAWN, seed=0)
         return np.median(points, axis=0), np.cov(points.T)
     return mean.mean(0).numpy(), total.numpy()
 

@@ -276,8 +276,8 @@ class NISP(nn.Module):
     def parameter_moments(self, alpha: Tensor) -> tuple[Tensor, Tensor]:
         r"""E[λ] ``(*batch, d)`` and Cov[λ] ``(*batch, d, d)`` of the free parameters, physical units (Eq. 9).
 
-        A parameter on a logarithmic scale has the moments of exp(λ): exact for a first-order normal germ,
-        :math:`E = \exp(m + v/2)`; by this module's nodes otherwise.
+        A parameter on a logarithmic scale has the moments of exp(λ): exact for normal germs of the first order,
+        :math:`E = \exp(m + v/2)`, and of the second, where they may be +inf; by Gauss nodes for others.
         """
         self._check_alpha(alpha)
         return parameters.moments(self, alpha)

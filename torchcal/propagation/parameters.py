@@ -40,7 +40,7 @@ def moments(propagate: "NISP", alpha: Tensor) -> tuple[Tensor, Tensor]:
     covariance = (factor * norms) @ factor.transpose(-1, -2)
     if bool(log.any()):
         variance = covariance.diagonal(dim1=-2, dim2=-1)
-        lognormal = (mean + 0.5 * variance).exp()
+        lognormal = torch.where(log, mean + 0.5 * variance, 0 * mean).exp()
         gain = torch.where(log, lognormal, torch.ones_like(mean))
         both = log[:, None] & log[None, :]
         inner = torch.where(both, torch.where(both, covariance, 0 * covariance).expm1(), covariance)
@@ -58,25 +58,26 @@ def _of_exponentials(propagate: "NISP", matrix: Tensor) -> tuple[Tensor, Tensor]
     """
     constant, slope, bend = _quadratics(propagate, matrix)
     log = propagate.scaling.log.to(matrix.device)
-    trace = bend.diagonal(dim1=-2, dim2=-1).sum(-1)
-    plain = constant + trace
-    lifted, at, spread = _tilted(constant, slope, bend)
+    plain = constant + bend.diagonal(dim1=-2, dim2=-1).sum(-1)
+    # Of those that are no exponential nothing is taken that might be too large for one.
+    lean, turn = slope * log[:, None], bend * log[:, None, None]
+    raised, at, spread = _tilted(lean, turn)
+    lifted = torch.where(log, torch.where(log, constant, 0.0).exp() * raised.exp(), torch.ones_like(constant))
     mean = torch.where(log, lifted, plain)
     # Of two exponentials their product is one; of one, the other is looked at where it leans; of none, as they are.
-    both, _, _ = _tilted(
-        constant[..., :, None] + constant[..., None, :],
-        slope[..., :, None, :] + slope[..., None, :, :],
-        bend[..., :, None, :, :] + bend[..., None, :, :, :],
+    together, _, _ = _tilted(
+        lean[..., :, None, :] + lean[..., None, :, :], turn[..., :, None, :, :] + turn[..., None, :, :, :]
     )
-    both = both - lifted[..., :, None] * lifted[..., None, :]
+    pairs = lifted[..., :, None] * lifted[..., None, :]
+    both = pairs * torch.expm1(together - raised[..., :, None] - raised[..., None, :])
     second = torch.einsum("...jgh,...igh->...ij", bend, spread + at[..., :, None] * at[..., None, :])
     one = constant[..., None, :] + torch.einsum("...jg,...ig->...ij", slope, at) + second - plain[..., None, :]
     one = lifted[..., :, None] * one
     none = slope @ slope.transpose(-1, -2) + 2 * torch.einsum("...igh,...jgh->...ij", bend, bend)
     covariance = torch.where(log[:, None], torch.where(log, both, one), torch.where(log, one.transpose(-1, -2), none))
-    endless = (log & ~torch.isfinite(torch.where(log, both.diagonal(dim1=-2, dim2=-1), 0.0)))[..., None]
-    either = endless | endless.transpose(-1, -2)
-    return mean, torch.where(either & ~torch.isfinite(covariance), torch.inf, covariance)
+    endless = torch.isinf(lifted)
+    either = endless[..., :, None] | endless[..., None, :] | (torch.isinf(together) & log & log[:, None])
+    return mean, torch.where(either, torch.inf, covariance)
 
 
 def _quadratics(propagate: "NISP", matrix: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -99,13 +100,13 @@ def _quadratics(propagate: "NISP", matrix: Tensor) -> tuple[Tensor, Tensor, Tens
     return constant, slope, bend
 
 
-def _tilted(constant: Tensor, slope: Tensor, bend: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """E[exp L] ``(*batch,)``, and mean and covariance of the germs weighed with exp L."""
-    germs = slope.shape[-1]
-    precision = torch.eye(germs).to(bend) - 2 * bend
-    finite = torch.linalg.eigvalsh(precision)[..., 0] > 0
-    precision = torch.where(finite[..., None, None], precision, torch.eye(germs).to(bend))
-    spread = torch.linalg.inv(precision)
+def _tilted(slope: Tensor, bend: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """ln E[exp(bᵀξ + ξᵀQξ)] ``(*batch,)``, and mean and covariance of the germs weighed with that exponential."""
+    unit = torch.eye(slope.shape[-1]).to(bend)
+    values = torch.linalg.eigvalsh(bend)
+    finite = (values < 0.5).all(-1)
+    spread = torch.linalg.inv(unit - 2 * torch.where(finite[..., None, None], bend, 0 * bend))
     at = (spread @ slope.unsqueeze(-1)).squeeze(-1)
-    size = (constant + 0.5 * (slope * at).sum(-1) - 0.5 * torch.logdet(precision)).exp()
+    shrunk = torch.log1p(-2 * torch.where(finite[..., None], values, 0 * values)).sum(-1)
+    size = 0.5 * ((slope * at).sum(-1) - shrunk)
     return torch.where(finite, size, torch.inf), at, spread

@@ -6,7 +6,7 @@ from torchcal.simulators.external import ExternalSimulator
 from torchcal.simulators.held_out import HeldOutError
 from torchcal.simulators.layout import Values
 from torchcal.simulators.ode import ODESimulator
-from torchcal.simulators.parameter import Parameter, Scaling, free_parameters, is_value_of
+from torchcal.simulators.parameter import Parameter, Scaling, free_parameters, is_value_of, limits
 from torchcal.simulators.slopes import check_slopes
 from torchcal.simulators.solution import Solution
 from torchcal.simulators.static import Conditions, Linearisation, Simulator, check_parameters
@@ -42,6 +42,7 @@ __all__ = [
     "focused",
     "free_parameters",
     "is_value_of",
+    "limits",
     "may_change",
     "outgrown",
     "settled",

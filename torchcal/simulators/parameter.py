@@ -127,6 +127,13 @@ class Parameter:
         return (self.low is None or value >= self.low) and (self.high is None or value <= self.high)
 
 
+def limits(parameters: Sequence[Parameter]) -> tuple[Tensor, Tensor]:
+    """Physical bounds, infinite where there is none, ``(P,)`` twice."""
+    low = [-math.inf if q.low is None else q.low for q in parameters]
+    high = [math.inf if q.high is None else q.high for q in parameters]
+    return torch.tensor(low, dtype=torch.float64), torch.tensor(high, dtype=torch.float64)
+
+
 def free_parameters(
     parameters: Sequence[Parameter], fixed: Mapping[str, float] | None = None, *, least: int = 1
 ) -> tuple[tuple[Parameter, ...], dict[str, float]]:

@@ -1,12 +1,12 @@
 """Whether a simulator differentiates: its derivatives beside differences of its outputs."""
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import torch
 from torch import Tensor
 
 from torchcal.errors import SimulatorError
+from torchcal.simulators.parameter import limits
 from torchcal.simulators.static import Conditions, Simulator
 from torchcal.simulators.trajectories import Trajectories
 
@@ -28,6 +28,7 @@ def check_slopes(
     outputs: Sequence[str] | None = None,
     *,
     kept: Tensor | None = None,
+    whole: bool = False,
     what: str = "the simulator",
 ) -> None:
     """Raise if outputs change otherwise with some parameters than their derivatives say.
@@ -45,6 +46,8 @@ def check_slopes(
         columns: Places of the parameters to ask.
         outputs: Names of the outputs wanted.
         kept: Which output values count, bool ``(n_total,)``; all by default.
+        whole: Whether to ask the Jacobian of `Simulator.linearise`, by which a diagnosis goes, in place of backward
+            passes, by which a sampler does.
         what: How to call the simulator in the error.
 
     Raises:
@@ -67,7 +70,7 @@ def check_slopes(
         reach = _reach(simulator, here)
         judged = set()
         inside = [column for column in asked if reach[column] > 0]
-        for column, off in _errors(evaluate, jacobian, here, reach, inside, parts):
+        for column, off in _errors(evaluate, jacobian, here, reach, inside, parts, whole):
             if off > OFF:
                 raise SimulatorError(
                     f"Expected {what} to depend on {simulator.names[column]!r} through torch operations alone. Got "
@@ -82,8 +85,7 @@ def check_slopes(
 
 def _reach(simulator: Simulator, values: Tensor) -> Tensor:
     """The size of every parameter, and no more than what is left to its bounds, ``(P,)``."""
-    low = torch.tensor([-math.inf if q.low is None else q.low for q in simulator.parameters], dtype=torch.float64)
-    high = torch.tensor([math.inf if q.high is None else q.high for q in simulator.parameters], dtype=torch.float64)
+    low, high = limits(simulator.parameters)
     width = high - low
     size = torch.where(values != 0, values.abs(), torch.where(width.isfinite(), width, torch.ones_like(width)))
     return torch.minimum(size, torch.minimum(values - low, high - values).clamp_min(0.0))
@@ -96,6 +98,7 @@ def _errors(
     reach: Tensor,
     columns: list[int],
     parts: list[Tensor],
+    whole: bool,
 ) -> Iterator[tuple[int, float]]:
     """By which part of the change derivatives at values ``(P,)`` are off, for each parameter that tells it.
 
@@ -114,7 +117,10 @@ def _errors(
         )
     generator = torch.Generator().manual_seed(0)
     signs = [torch.randint(2, (DRAWS, len(part)), generator=generator).double() * 2 - 1 for part in parts]
-    told = _combined(evaluate, jacobian, values[None], parts, signs)
+    told = None if whole else _pulled_back(evaluate, values[None], parts, signs)
+    if told is None:
+        every = jacobian(values[None])[0]
+        told = [own @ every[part] for part, own in zip(parts, signs, strict=True)]
     for k, column in enumerate(columns):
         steps = [(factor, tried[2 * i][k], tried[2 * i + 1][k]) for i, factor in enumerate(STEPS)]
         for part, own, slopes in zip(parts, signs, told, strict=True):
@@ -128,16 +134,13 @@ def _errors(
                 yield column, min(float((own @ one - slope).norm()) for one in (seen, close)) / size
 
 
-def _combined(
-    evaluate: Callable[[Tensor], Tensor],
-    jacobian: Callable[[Tensor], Tensor],
-    values: Tensor,
-    parts: list[Tensor],
-    signs: list[Tensor],
-) -> list[Tensor]:
+def _pulled_back(
+    evaluate: Callable[[Tensor], Tensor], values: Tensor, parts: list[Tensor], signs: list[Tensor]
+) -> list[Tensor] | None:
     """Derivatives of the sums of each output's values with signs ``(DRAWS, m)``, ``(DRAWS, P)``, at values ``(1, P)``.
 
-    Some backward passes do, where the whole Jacobian may be a matter of as many as there are outputs.
+    Some backward passes do, where the whole Jacobian may be a matter of as many as there are outputs. None where there
+    is no gradient at all, or writing in place has spoilt it.
     """
     leaf = values.clone().requires_grad_(True)
     found = []
@@ -148,7 +151,6 @@ def _combined(
             sums = (own @ y[part]).unbind()
             each = [torch.autograd.grad(one, leaf, retain_graph=True, allow_unused=True)[0] for one in sums]
             found.append(torch.cat([torch.zeros_like(values) if one is None else one for one in each]))
-    except RuntimeError:  # no gradient at all, or one that writing in place has spoilt
-        whole = jacobian(values)[0]
-        return [own @ whole[part] for part, own in zip(parts, signs, strict=True)]
+    except RuntimeError:
+        return None
     return found

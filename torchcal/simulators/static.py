@@ -180,9 +180,11 @@ class Simulator:
             return Linearisation(y, y.new_zeros(*y.shape, 0))
         try:
             return self._forward(x, values, outputs, columns)
-        except Exception as error:
+        except (RuntimeError, SimulatorError) as error:
             # A user's own autograd.Function may have a backward() and no jvp(), as some operations of torch have, and
             # a simulator may differentiate forwards by itself, which torch does not nest.
+            if self.dear or not isinstance(error.__cause__ or error, RuntimeError):
+                raise
             try:
                 return self._reverse(x, values, outputs, columns)
             except Exception:
@@ -211,15 +213,13 @@ class Simulator:
         leaf = values.clone().requires_grad_(True)
         with torch.enable_grad():
             y = self.at(x, outputs)(leaf)
-            # What is pulled back is linear in them.
-            weights = torch.linspace(1, 2, y.shape[-1]).to(y).expand(y.shape).clone().requires_grad_(True)
+            weights = torch.ones_like(y, requires_grad=True)  # what is pulled back is linear in them
             try:
                 (pulled,) = torch.autograd.grad(y, leaf, weights, create_graph=True)
                 ones = [pulled[..., column].sum() for column in columns]
                 slopes = [torch.autograd.grad(one, weights, retain_graph=True)[0] for one in ones]
                 found = torch.stack(slopes, dim=-1)
-                # A part whose backward pass is not differentiated is lost without a word.
-                if torch.allclose((weights.unsqueeze(-1) * found).sum(-2), pulled[..., columns]):
+                if _complete(found, y, leaf, columns, _length(x)):
                     return Linearisation(y.detach(), found)
             except RuntimeError:
                 pass
@@ -292,6 +292,24 @@ class Simulator:
     def _raised(self, x: Conditions, values: Tensor, column: int) -> Exception | None:
         """What a simulator raised where NaN stands for it, at parameters ``(d,)`` and an output; None where nothing."""
         return None
+
+
+def _complete(found: Tensor, y: Tensor, leaf: Tensor, columns: Sequence[int], rows: int) -> bool:
+    """Whether derivatives ``(H, n, columns)`` that went through two backward passes are those of one, for each output.
+
+    A part whose backward pass is not differentiated is lost without a word.
+    """
+    generator = torch.Generator().manual_seed(0)
+    tolerance = torch.finfo(y.dtype).eps ** 0.5
+    for part in torch.arange(y.shape[-1]).split(rows):
+        signs = torch.zeros(y.shape[-1]).to(y)
+        signs[part] = (2 * torch.randint(2, (len(part),), generator=generator) - 1).to(y)
+        wanted = torch.autograd.grad((signs * y).sum(), leaf, retain_graph=True)[0][..., columns]
+        weighed = signs[:, None] * found
+        off, size = (weighed.sum(-2) - wanted).abs(), weighed.norm(dim=-2) + wanted.abs()
+        if bool((torch.isfinite(wanted) & ~(off <= tolerance * size)).any()):
+            return False
+    return True
 
 
 def _unpacked(dual: Tensor) -> tuple[Tensor, Tensor]:
