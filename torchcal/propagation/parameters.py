@@ -70,8 +70,8 @@ def _of_exponentials(propagate: "NISP", matrix: Tensor) -> tuple[Tensor, Tensor]
     )
     pairs = lifted[..., :, None] * lifted[..., None, :]
     both = pairs * torch.expm1(together - raised[..., :, None] - raised[..., None, :])
-    second = torch.einsum("...jgh,...igh->...ij", bend, spread + at[..., :, None] * at[..., None, :])
-    one = constant[..., None, :] + torch.einsum("...jg,...ig->...ij", slope, at) + second - plain[..., None, :]
+    wider = 2 * turn @ spread + at[..., :, None] * at[..., None, :]  # than of germs that nothing weighs
+    one = torch.einsum("...jg,...ig->...ij", slope, at) + torch.einsum("...jgh,...igh->...ij", bend, wider)
     one = lifted[..., :, None] * one
     none = slope @ slope.transpose(-1, -2) + 2 * torch.einsum("...igh,...jgh->...ij", bend, bend)
     covariance = torch.where(log[:, None], torch.where(log, both, one), torch.where(log, one.transpose(-1, -2), none))
