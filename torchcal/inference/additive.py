@@ -82,7 +82,8 @@ def calibrate_additive(
 
     Warns:
         ConvergenceWarning: If starts or chains disagree.
-        IdentifiabilityWarning: If the data do not determine a parameter.
+        IdentifiabilityWarning: If the data do not determine a parameter, or the posterior has no finite variance.
+        TorchcalWarning: If a table or a run of the recording is there twice.
 
     Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 2-4.
     """

@@ -116,9 +116,11 @@ def calibrate(
     Warns:
         ConvergenceWarning: If starts or chains disagree.
         ToleranceWarning: If the tolerance rather than the model error sets the width of the prediction.
-        PropagationWarning: If moments have not converged in nodes or order.
+        PropagationWarning: If moments have not converged in nodes or order, or the best density has none.
         ExtrapolationWarning: If the calibration leaves the box of a surrogate.
-        IdentifiabilityWarning: If the data do not determine a parameter, or its bound does.
+        IdentifiabilityWarning: If the data do not determine a parameter, its bound does, or the posterior has no
+            finite variance.
+        TorchcalWarning: If a table or a run of the recording is there twice.
         UnitWarning: If units of recording and simulator differ.
         WorkerWarning: If workers that evaluate the simulator died, and their work was done again.
 
