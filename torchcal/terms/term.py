@@ -257,7 +257,7 @@ class Term:
             known = "; ".join(", ".join(part) for part in given if isinstance(part, Mapping) and part)
             raise SimulatorError(
                 f"Expected a tensor from every function of the term {self.name!r}. One of them raised "
-                f"{type(error).__name__}: {error}. It was given {len(given)} arguments: {known}.{_advice(error)}"
+                f"{type(error).__name__}: {error}. It was given {len(given)} arguments, with {known}.{_advice(error)}"
             ) from error
         if isinstance(result, np.ndarray | np.generic):
             result = torch.as_tensor(result)
