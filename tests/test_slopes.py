@@ -27,8 +27,13 @@ def lost(what):
     return decay
 
 
-def recorded(y=None):
-    return tc.Recording(x=X, y=3 * torch.exp(-0.7 * X) if y is None else y, noise=0.02)
+def recorded():
+    return tc.Recording(x=X, y=3 * torch.exp(-0.7 * X), noise=0.02)
+
+
+def noisy():
+    noise = 0.02 * torch.randn(30, dtype=F64, generator=torch.Generator().manual_seed(0))
+    return tc.Recording(x=X, y=3 * torch.exp(-0.7 * X) + noise, noise=0.02)
 
 
 @pytest.mark.parametrize("what", ["a", "k", "a part of k"])
@@ -148,8 +153,7 @@ def test_a_function_without_forward_derivatives_is_linearised_in_reverse(functio
         found, wanted = (each.linearise(X, values, columns=columns) for each in (one_way, both))
         torch.testing.assert_close(found.y, wanted.y)
         torch.testing.assert_close(found.jacobian, wanted.jacobian)
-    noise = 0.02 * torch.randn(30, dtype=F64, generator=torch.Generator().manual_seed(0))
-    diagnosis = tc.diagnose(one_way, recorded(3 * torch.exp(-0.7 * X) + noise), progress=False)
+    diagnosis = tc.diagnose(one_way, noisy(), progress=False)
     assert diagnosis.verdict == "consistent"
 
 
@@ -170,13 +174,8 @@ def test_a_simulator_that_has_not_written_something_says_so():
         tc.Simulator(unwritten, DECAY).linearise(X, torch.ones(1, 2, dtype=F64))
 
 
-class InNumPy(torch.autograd.Function):
+class InNumPy(OneWay):
     """One whose backward pass is right, and is not differentiated, without a word."""
-
-    @staticmethod
-    def forward(ctx, value):
-        ctx.save_for_backward(value)
-        return value.exp()
 
     @staticmethod
     def backward(ctx, grad):
@@ -221,8 +220,7 @@ def test_a_diagnosis_asks_for_the_derivatives_that_it_goes_by():
         return p["a"] * decaying
 
     simulator = tc.Simulator(partly, DECAY)
-    noise = 0.02 * torch.randn(30, dtype=F64, generator=torch.Generator().manual_seed(0))
-    diagnosis = tc.diagnose(simulator, recorded(3 * torch.exp(-0.7 * X) + noise), progress=False)
+    diagnosis = tc.diagnose(simulator, noisy(), progress=False)
     assert diagnosis.verdict == "consistent"
     with pytest.raises(SimulatorError, match="depend on 'k'"):
         check_inputs(simulator, recorded(), None)

@@ -14,13 +14,10 @@ from torchcal.data.arrays import sample_spread, value_range
 from torchcal.data.frames import check_columns, column_names, read_csv
 from torchcal.data.noise import noise_sd
 from torchcal.data.parts import run_parts, static_parts
-from torchcal.data.run import Run, change, fingerprint
+from torchcal.data.run import SEVERAL, Run, change, fingerprint
 from torchcal.errors import RecordingError, ShapeError
 
 __all__ = ["Recording"]
-
-#: Fewest rows of a table that may have been read twice.
-TABLE = 5
 
 
 @dataclass(frozen=True, init=False, repr=False, eq=False)
@@ -212,7 +209,7 @@ class Recording:
             return torch.cat(told)
         y = torch.nan_to_num(self.y.reshape(len(self.outputs), self.n).T, nan=torch.inf)
         rows = torch.cat([self.columns, y], dim=-1)
-        for times in range(2, self.n // TABLE + 1):
+        for times in range(2, self.n // SEVERAL + 1):
             once = self.n // times
             again = self.n % times == 0 and torch.equal(rows, rows[:once].repeat(times, 1))
             if again and len(rows.unique(dim=0)) == once:

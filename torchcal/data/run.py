@@ -13,13 +13,13 @@ from torchcal.data.frames import check_columns, column_names
 from torchcal.data.interpolation import HOLDS, evaluate_pieces, pieces
 from torchcal.errors import DomainError, RecordingError, ShapeError
 
-__all__ = ["Run", "change", "convert", "fingerprint"]
+__all__ = ["SEVERAL", "Run", "change", "convert", "fingerprint"]
 
 RESERVED = ("time", "run", "t")
 """Names that a recording in time has for itself."""
 
 SEVERAL = 5
-"""Fewest samples by which two runs are known as one."""
+"""Fewest samples, or rows of a table, that are known to have been read twice."""
 
 OUTSIDE = 1e-12
 """How far outside the span a time counts as its end, as share of the largest time: a few roundings."""

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 from torchcal.discovery.by_share import decide_exact, nearly
@@ -218,17 +217,17 @@ def _small(search: Search, model: Model) -> bool:
     if noise.source != "given":
         return True
     problem = found.problem
-    largest = torch.full((len(noise.correlation),), LARGER_TOGETHER)
+    largest = [LARGER_TOGETHER] * len(noise.correlation)
     if len(model.names) == 1:
         fastest = estimate(problem, found.residual, found.jacobian, problem.recording.noise).sizes[:, 0]
-        largest = LARGER * fastest.clamp_min(1.0)
+        largest = (LARGER * fastest.clamp_min(1.0)).tolist()
     standard = (found.residual / noise.sd[problem.index]).square()
-    for number, rho in enumerate(noise.correlation.tolist()):
+    for number, (rho, size) in enumerate(zip(noise.correlation.tolist(), largest, strict=True)):
         mine = standard[problem.output_of == number]
         if not len(mine):
             continue
         independent = len(mine) * (1 - rho**2) / (1 + rho**2)  # as many squares tell as much of their mean
-        if float(mine.mean()) > float(largest[number]) ** 2 * (1 + CHANCE * math.sqrt(2 / max(independent, 1.0))):
+        if float(mine.mean()) > size**2 * (1 + CHANCE * math.sqrt(2 / max(independent, 1.0))):
             return False
     return True
 

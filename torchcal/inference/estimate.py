@@ -58,7 +58,7 @@ class Estimate:
         agreeing: Number of starts that reached the best objective.
         ties: Number of different densities of λ that reach it: a symmetry of model and data makes more than one.
         null_directions: Unit vectors in α along which the log-posterior does not change, ``(k, P)``.
-        improper: Those of them that no bounds hold either, or whose spread is as free.
+        improper: Those of them that no bounds hold either, or whose spread is as free; or those of an endless ridge.
         others: Where the other starts ended, if not far below the best, ``(k, P)``.
     """
 

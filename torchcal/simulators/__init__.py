@@ -9,7 +9,7 @@ from torchcal.simulators.ode import ODESimulator
 from torchcal.simulators.parameter import Parameter, Scaling, free_parameters, is_value_of, limits
 from torchcal.simulators.slopes import check_slopes
 from torchcal.simulators.solution import Solution
-from torchcal.simulators.static import Conditions, Linearisation, Simulator, check_parameters
+from torchcal.simulators.static import Conditions, Linearisation, Simulator, asks_for_numbers, check_parameters
 from torchcal.simulators.stepping import (
     focused,
     may_change,
@@ -36,6 +36,7 @@ __all__ = [
     "Solution",
     "Trajectories",
     "Values",
+    "asks_for_numbers",
     "build_surrogate",
     "check_parameters",
     "check_slopes",

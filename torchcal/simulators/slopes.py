@@ -56,21 +56,27 @@ def check_slopes(
     if simulator.dear and not isinstance(simulator, Trajectories):
         return
     evaluate = simulator.at(x, outputs)
-
-    def jacobian(values: Tensor) -> Tensor:
-        return simulator.linearise(x, values, outputs).jacobian
-
     with torch.no_grad():
         good = evaluate(values).detach()
     used = torch.ones(good.shape[-1], dtype=torch.bool) if kept is None else kept
     rows = len(next(iter(x.values())) if isinstance(x, Mapping) else x)
     parts = [k * rows + part.nonzero()[:, 0] for k, part in enumerate(used.split(rows)) if bool(part.any())]
+    generator = torch.Generator().manual_seed(0)
+    looks = [(part, torch.randint(2, (DRAWS, len(part)), generator=generator).double() * 2 - 1) for part in parts]
+
+    def derive(values: Tensor, columns: list[int]) -> list[Tensor]:
+        found = None if whole else _pulled_back(evaluate, values, looks)
+        if found is not None:
+            return [each[:, columns] for each in found]
+        jacobian = simulator.linearise(x, values, outputs, columns).jacobian[0]
+        return [signs @ jacobian[part] for part, signs in looks]
+
     asked = list(columns)
     for here in values[torch.isfinite(good[:, used]).all(-1)]:
         reach = _reach(simulator, here)
         judged = set()
         inside = [column for column in asked if reach[column] > 0]
-        for column, off in _errors(evaluate, jacobian, here, reach, inside, parts, whole):
+        for column, off in _errors(evaluate, derive, here, reach, inside, looks):
             if off > OFF:
                 raise SimulatorError(
                     f"Expected {what} to depend on {simulator.names[column]!r} through torch operations alone. Got "
@@ -93,16 +99,16 @@ def _reach(simulator: Simulator, values: Tensor) -> Tensor:
 
 def _errors(
     evaluate: Callable[[Tensor], Tensor],
-    jacobian: Callable[[Tensor], Tensor],
+    derive: Callable[[Tensor, list[int]], list[Tensor]],
     values: Tensor,
     reach: Tensor,
     columns: list[int],
-    parts: list[Tensor],
-    whole: bool,
+    looks: list[tuple[Tensor, Tensor]],
 ) -> Iterator[tuple[int, float]]:
     """By which part of the change derivatives at values ``(P,)`` are off, for each parameter that tells it.
 
-    They may move from there by their ``reach`` times `STEPS`. The places of each output are ``parts``.
+    They may move from there by their ``reach`` times `STEPS`. Of each output, ``looks`` holds the places and the signs
+    ``(DRAWS, m)`` with which its values are summed.
     """
     if not columns:
         return
@@ -115,29 +121,24 @@ def _errors(
         y, *tried = evaluate(torch.cat([values[None], values + torch.cat(moves)])).detach().split(
             [1, *[len(columns)] * len(moves)]
         )
-    generator = torch.Generator().manual_seed(0)
-    signs = [torch.randint(2, (DRAWS, len(part)), generator=generator).double() * 2 - 1 for part in parts]
-    told = None if whole else _pulled_back(evaluate, values[None], parts, signs)
-    if told is None:
-        every = jacobian(values[None])[0]
-        told = [own @ every[part] for part, own in zip(parts, signs, strict=True)]
+    told = derive(values[None], columns)
     for k, column in enumerate(columns):
         steps = [(factor, tried[2 * i][k], tried[2 * i + 1][k]) for i, factor in enumerate(STEPS)]
-        for part, own, slopes in zip(parts, signs, told, strict=True):
+        for (part, signs), slopes in zip(looks, told, strict=True):
             far, seen, close = ((forth[part] - back[part]) / (2 * factor) for factor, forth, back in steps)
             _, forth, back = steps[1]
             bent = max(float((far - seen).norm()), float((forth + back - 2 * y[0])[part].norm()) / STEPS[1])
             change = float(seen.norm())
             if change > 0 and bent < AGREE * change:  # neither a kink, nor where a slope is infinite
-                slope = reach[column] * slopes[:, column]
-                size = float((own @ seen).norm())
-                yield column, min(float((own @ one - slope).norm()) for one in (seen, close)) / size
+                slope = reach[column] * slopes[:, k]
+                size = float((signs @ seen).norm())
+                yield column, min(float((signs @ one - slope).norm()) for one in (seen, close)) / size
 
 
 def _pulled_back(
-    evaluate: Callable[[Tensor], Tensor], values: Tensor, parts: list[Tensor], signs: list[Tensor]
+    evaluate: Callable[[Tensor], Tensor], values: Tensor, looks: list[tuple[Tensor, Tensor]]
 ) -> list[Tensor] | None:
-    """Derivatives of the sums of each output's values with signs ``(DRAWS, m)``, ``(DRAWS, P)``, at values ``(1, P)``.
+    """Derivatives of the sums of each output's values with signs, ``(DRAWS, P)``, at values ``(1, P)``.
 
     Some backward passes do, where the whole Jacobian may be a matter of as many as there are outputs. None where there
     is no gradient at all, or writing in place has spoilt it.
@@ -147,8 +148,8 @@ def _pulled_back(
     try:
         with torch.enable_grad():
             y = evaluate(leaf)[0]
-        for part, own in zip(parts, signs, strict=True):
-            sums = (own @ y[part]).unbind()
+        for part, signs in looks:
+            sums = (signs @ y[part]).unbind()
             each = [torch.autograd.grad(one, leaf, retain_graph=True, allow_unused=True)[0] for one in sums]
             found.append(torch.cat([torch.zeros_like(values) if one is None else one for one in each]))
     except RuntimeError:

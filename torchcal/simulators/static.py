@@ -17,7 +17,7 @@ from torchcal.simulators.dual import Still, still
 from torchcal.simulators.parameter import Parameter, spans
 from torchcal.simulators.solution import Solution
 
-__all__ = ["Conditions", "Linearisation", "Simulator", "check_parameters"]
+__all__ = ["Conditions", "Linearisation", "Simulator", "asks_for_numbers", "check_parameters"]
 
 _DUAL = threading.RLock()
 """torch keeps one level of forward derivatives for the whole process, and refuses a second thread its own."""
@@ -331,6 +331,11 @@ def _describe(x: Conditions) -> str:
     return str(tuple(x.shape))
 
 
+def asks_for_numbers(error: Exception) -> bool:
+    """Whether torch has refused to make plain numbers of tensors, as NumPy and float() want them."""
+    return "numpy()" in str(error) or "converted to Python scalars" in str(error)
+
+
 def _advice(error: Exception, x: Conditions, parameters: Sequence[str]) -> str:
     """What to do where a function took x, or what x or p hold, for something else than they are."""
     named = isinstance(x, Mapping)
@@ -346,7 +351,7 @@ def _advice(error: Exception, x: Conditions, parameters: Sequence[str]) -> str:
             f" Here x holds {list(x)}, the recording's conditions, and p holds {list(parameters)}: names in "
             "the recording and in the simulator must agree."
         )
-    if "numpy()" in str(error) or "converted to Python scalars" in str(error):
+    if asks_for_numbers(error):
         return (
             " Use torch functions on p and x: values of many parameters come at once, with gradients. A function that "
             "cannot be written so goes into torchcal.ExternalSimulator."

@@ -20,6 +20,7 @@ from torchcal.simulators import (
     Simulator,
     Trajectories,
     Values,
+    asks_for_numbers,
     is_value_of,
 )
 
@@ -39,12 +40,6 @@ class _Own(Values):
 
 def _is_finite(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _advice(error: Exception) -> str:
-    if "numpy()" in str(error) or "converted to Python scalars" in str(error):
-        return " Use torch functions on them, without .detach(): derivatives are needed."
-    return ""
 
 
 def outer(p: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -254,10 +249,12 @@ class Term:
         except TorchcalError:
             raise
         except Exception as error:
+            advice = " Use torch functions on them, without .detach(): derivatives are needed."
+            advice = advice if asks_for_numbers(error) else ""
             known = "; ".join(", ".join(part) for part in given if isinstance(part, Mapping) and part)
             raise SimulatorError(
                 f"Expected a tensor from every function of the term {self.name!r}. One of them raised "
-                f"{type(error).__name__}: {error}. It was given {len(given)} arguments, with {known}.{_advice(error)}"
+                f"{type(error).__name__}: {error}. It was given {len(given)} arguments, with {known}.{advice}"
             ) from error
         if isinstance(result, np.ndarray | np.generic):
             result = torch.as_tensor(result)
