@@ -7,6 +7,7 @@ import torch
 
 import torchcal as tc
 from torchcal.discovery import given
+from torchcal.errors import DomainError
 
 N, STEP = 150, 0.1
 A, GAIN = 1.5, 2.0
@@ -132,3 +133,30 @@ def test_another_hold_for_each_run():
     assert float(twin.runs[0].inputs_at(0.05)["c"]) == float(twin.runs[0].inputs["c"][0])
     with pytest.raises(tc.errors.RecordingError, match=r"hold for each run. Got 2 for 1"):
         twin.with_hold(["zero", "zero"])
+
+
+@pytest.mark.parametrize("sd", [1e-7, 1e-9, 1e-12])
+def test_a_noise_too_small_for_the_arithmetic_is_taken_as_large_as_it_must_be(sd: float) -> None:
+    # χ² of 1e18 has no digits left for what one explanation is better than another by.
+    x = torch.linspace(0, 5, 40, dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    y = 1 + 2 * x + 0.3 * x**2 + sd * torch.randn(40, generator=generator, dtype=torch.float64)
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")], degree=1)
+    terms = [
+        tc.Term("bend", outputs={"y": lambda x, p, y: y + p["q"] * x**2}, parameters=[tc.Parameter("q")]),
+        tc.Term("wave", outputs={"y": lambda x, p, y: y + p["w"] * torch.sin(x)}, parameters=[tc.Parameter("w")]),
+    ]
+    d = tc.diagnose(line, tc.Recording(x=x, y=y, noise=sd), terms, progress=False)
+    assert d.terms == ["bend"]
+    assert any("arithmetic" in text for text in d.symptoms)
+    assert not any("smaller one" in text for text in d.symptoms)
+    assert d.noise.sd["y"] > sd and 0.1 * given.DIGITS < d.base.chi2 < 1.01 * given.DIGITS  # less what is set aside
+
+
+def test_a_recording_with_another_noise_is_the_same_otherwise() -> None:
+    data = tc.Recording(x=torch.arange(4.0), y=torch.tensor([0.0, 1.0, 3.0, 2.0]), noise=0.5)
+    other = data.with_noise([0.1, 0.2, 0.3, 0.4])
+    torch.testing.assert_close(other.noise, torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64))
+    assert float(data.noise[0]) == 0.5 and other.y is data.y  # type: ignore[index]
+    with pytest.raises(DomainError, match="sd > 0"):
+        data.with_noise(0.0)

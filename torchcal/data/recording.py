@@ -308,6 +308,18 @@ class Recording:
             put(twin, "runs", tuple(change(r, outputs={k: kept[k][i].clone() for k in r.outputs}) for i, r in runs))
         return twin
 
+    def with_noise(self, noise: Any) -> "Recording":
+        """The same recording with noise of another sd, given as in the constructor.
+
+        Raises:
+            DomainError: If an sd is not finite and positive.
+            RecordingError: If it names other outputs.
+            ShapeError: If it has another shape.
+        """
+        twin = copy.copy(self)
+        object.__setattr__(twin, "noise", noise_sd(noise, self.outputs, self.n, self.units))
+        return twin
+
     def without_initial(self, states: Sequence[Sequence[str]]) -> "Recording":
         """The same recording with the initial values of some states, of each run in turn, unknown.
 

@@ -19,7 +19,7 @@ from torchcal.discovery.decision import Decision
 from torchcal.discovery.embedded import embed_each, model_error_sd
 from torchcal.discovery.experiment import propose
 from torchcal.discovery.fitting import Fitted, starts
-from torchcal.discovery.given import from_samples, held_otherwise
+from torchcal.discovery.given import coarser, from_samples, held_otherwise
 from torchcal.discovery.likeliest import settled
 from torchcal.discovery.limits import limits
 from torchcal.discovery.model import Model
@@ -151,6 +151,11 @@ def diagnose(
         with search.stop.listening():
             tick("calibrate the base")
             search.calibrate_base()
+            if (times := coarser(search.base)) > 1 and isinstance(recording.noise, Tensor):
+                recording = recording.with_noise(times * recording.noise)
+                problem = dataclasses.replace(problem, recording=recording)
+                search = dataclasses.replace(search, problem=problem, coarser=times)
+                search.calibrate_base()
             if holdout is not None and mask is not None:
                 verify.check_left(search.base, mask)
             if holdout is None and mask is not None and _beyond_prediction(search, search.base, mask):

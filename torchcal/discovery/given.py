@@ -1,6 +1,7 @@
-"""What was given beside the outputs: initial values, and how inputs go on between samples."""
+"""What was given beside the outputs: noise, initial values, and how inputs go on between samples."""
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 
 import torch
@@ -17,8 +18,10 @@ from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators import Trajectories
 from torchcal.simulators.layout import initial_name
 
-__all__ = ["as_good", "from_samples", "held_otherwise"]
+__all__ = ["as_good", "coarser", "from_samples", "held_otherwise"]
 
+#: χ² of the base up to which double precision still tells log evidences apart by a hundredth.
+DIGITS = 1e14
 #: Probability by chance of what is left, from which on it is noise; and noise sd up to which an initial value that is
 #: found free is the one that was given.
 NOISE, CONFIRMED = 0.05, 0.2
@@ -31,6 +34,11 @@ STAYS = 0.5
 #: Log evidence, and share of that of the best model, from which on another hold is told of; and log odds below which a
 #: model is not clearly better than it.
 TOLD, AS_MUCH, CLEARLY = 10.0, 0.5, 3.0
+
+
+def coarser(base: Fitted) -> float:
+    """How many times as large a noise that was given must be taken for evidences to be told apart; 1 if it may stay."""
+    return max(1.0, math.sqrt(base.chi2 / DIGITS)) if isinstance(base.problem.recording.noise, Tensor) else 1.0
 
 
 def from_samples(search: Search) -> list[str]:

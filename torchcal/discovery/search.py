@@ -50,7 +50,8 @@ SAME = 0.9999
 class Search:
     """The state of a diagnosis: the base's fit, the noise, the candidates and the models refitted so far.
 
-    Ctrl-C sets ``stop``: refits that have ended stay, and no other one begins.
+    Noise that was given is taken for ``coarser`` times as large, where arithmetic tells no less. Ctrl-C sets ``stop``:
+    refits that have ended stay, and no other one begins.
     """
 
     problem: Problem
@@ -63,6 +64,7 @@ class Search:
     executor: Executor | None = None
     clean: bool = False
     unit: Tensor | None = None
+    coarser: float = 1.0
     stop: Stop = field(default_factory=Stop)
     base: Fitted = field(init=False)
     noise: Noise = field(init=False)

@@ -60,7 +60,13 @@ def symptoms(search: Search, best: Model | None) -> list[str]:
         doubted = estimate(left.problem, left.residual, left.jacobian, search.problem.recording.noise).doubted
         if doubted > 1:
             rows.append(f"the residual's fastest part is {doubted:.1f} times the noise sd that was given")
-    if search.noise.source == "given":
+    if search.coarser > 1:
+        rows.append(
+            f"the calibrated base misses the data by so many times the noise sd that was given that arithmetic cannot "
+            f"weigh it: the noise was taken for {search.coarser:.2g} times as large (noise=\"none\" says that there is "
+            "none)"
+        )
+    elif search.noise.source == "given":
         rows += _too_large(search, base if best is None else best.found)
     return rows
 
