@@ -150,13 +150,15 @@ def test_a_noise_too_small_for_the_arithmetic_is_taken_as_large_as_it_must_be(sd
     assert d.terms == ["bend"]
     assert any("arithmetic" in text for text in d.symptoms)
     assert not any("smaller one" in text for text in d.symptoms)
-    assert d.noise.sd["y"] > sd and 0.1 * given.DIGITS < d.base.chi2 < 1.01 * given.DIGITS  # less what is set aside
+    assert d.noise.sd["y"] > sd
+    assert 0.1 * given.DIGITS < d.base.chi2 < 1.01 * given.DIGITS  # less what is set aside
 
 
 def test_a_recording_with_another_noise_is_the_same_otherwise() -> None:
     data = tc.Recording(x=torch.arange(4.0), y=torch.tensor([0.0, 1.0, 3.0, 2.0]), noise=0.5)
     other = data.with_noise([0.1, 0.2, 0.3, 0.4])
     torch.testing.assert_close(other.noise, torch.tensor([0.1, 0.2, 0.3, 0.4], dtype=torch.float64))
-    assert float(data.noise[0]) == 0.5 and other.y is data.y  # type: ignore[index]
+    assert float(data.noise[0]) == 0.5  # type: ignore[index]
+    assert other.y is data.y
     with pytest.raises(DomainError, match="sd > 0"):
         data.with_noise(0.0)
