@@ -1,7 +1,6 @@
 """`diagnose`: locate the mismatch of a simulation and a recording, name it, model it, prove it."""
 
 import dataclasses
-import math
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
@@ -13,45 +12,29 @@ from tqdm.auto import tqdm
 
 from torchcal.checks import whole
 from torchcal.data import Recording
-from torchcal.discovery import explain, verify
+from torchcal.discovery import verify
 from torchcal.discovery.candidates import base_columns
+from torchcal.discovery.conclude import conclude
 from torchcal.discovery.decision import Decision
-from torchcal.discovery.embedded import embed_each, model_error_sd
-from torchcal.discovery.experiment import propose
 from torchcal.discovery.fitting import Fitted, starts
-from torchcal.discovery.given import coarser, from_samples, held_otherwise
-from torchcal.discovery.likeliest import settled
-from torchcal.discovery.limits import limits
-from torchcal.discovery.model import Model
+from torchcal.discovery.given import coarser
 from torchcal.discovery.nameless import refit_nameless
-from torchcal.discovery.noise import Noise
-from torchcal.discovery.own_noise import beside, explains
+from torchcal.discovery.own_noise import explains
 from torchcal.discovery.problem import Problem
-from torchcal.discovery.ranking import ranking
-from torchcal.discovery.records import Scores, Table
 from torchcal.discovery.result import Diagnosis
 from torchcal.discovery.rounds import settle, with_all, with_explained, without_others
 from torchcal.discovery.search import Search
 from torchcal.discovery.several import refit_several
-from torchcal.discovery.symptoms import more_than_replicates, symptoms, unlike
 from torchcal.discovery.trial import check_repeats
-from torchcal.discovery.verdict import PLAINLY_WHITE, decide
-from torchcal.discovery.where import locate, missing_rate, needed_shifts
+from torchcal.discovery.verdict import decide
 from torchcal.display import NONE
 from torchcal.errors import ConvergenceWarning, DomainError, EmbeddingError, RecordingError, warn
-from torchcal.simulators import ODESimulator, Parameter, Simulator, Trajectories, is_value_of
+from torchcal.simulators import ODESimulator, Simulator, is_value_of
 from torchcal.simulators.executor import check_executor
 from torchcal.terms import Term, extend
 from torchcal.threads import with_few_threads
 
 __all__ = ["diagnose"]
-
-#: RMSE of a calibrated base, in the data's spread, from which on it explains nothing.
-NO_BETTER = 0.95
-#: Probability of what is tied from which on its noise is told.
-HALF = 0.5
-#: Power of the stated detection limits.
-POWER = 0.95
 
 
 @with_few_threads
@@ -181,7 +164,7 @@ def diagnose(
             interrupted = _interruption(search)
             if interrupted:
                 _hold_back(search, decision)
-            return _result(
+            return conclude(
                 search, decision, simulator, recording, mask, confidence, begun, given, seed, suspect, interrupted
             )
     finally:
@@ -261,213 +244,3 @@ def _beyond_prediction(search: Search, found: Fitted, mask: Tensor) -> bool:
         return False
     own = (apart.sd.square() - search.noise.sd.square()).clamp_min(0).sqrt()[seen]
     return bool((own > search.problem.recording.spread[seen]).any())
-
-
-def _embeddable(search: Search) -> list[str]:
-    """The base's calibrated parameters without unknown initial states."""
-    base = [search.base.problem.parameters[i].name for i in search.base.free]
-    hidden = getattr(search.base.problem.simulator, "initial_names", [])
-    return [name for name in base if name not in hidden]
-
-
-def _scores(search: Search, found: Fitted, mask: Tensor | None) -> Scores:
-    recording = search.problem.recording
-    noise = search.noise
-    if search.exact:  # the misfit is what predictions are uncertain by
-        noise = dataclasses.replace(noise, sd=noise.sd * explain.misfit_size(found))
-    width = model_error_sd(found, search.noise, _embeddable(search))
-    prediction, sd = verify.predict(found, noise)
-    fitted = verify.score(recording, prediction, sd, search.problem.keep)
-    if mask is None:
-        return Scores(fitted, None, None, width)
-    apart = verify.held_out_fit(found, noise, mask) if search.exact else search.held_out(found, mask)
-    if apart is None:
-        return Scores(fitted, None, None, width)
-    seen = mask & search.problem.keep
-    if not bool(seen.any()):
-        return Scores(fitted, None, None, width)
-    held = verify.score(recording, apart.prediction, apart.sd, seen)
-    return Scores(fitted, held, apart.prediction, width)
-
-
-def _result(
-    search: Search,
-    decision: Decision,
-    simulator: Simulator,
-    recording: Recording,
-    mask: Tensor | None,
-    confidence: float,
-    begun: float,
-    terms: list[Term],
-    seed: int,
-    suspect: tuple[str, ...],
-    interrupted: str,
-) -> Diagnosis:
-    best = decision.best
-    told = [best] if best is not None else decision.tied_models if decision.none + decision.base < HALF else []
-    if told and (noise := beside(search, told[0])) is not search.noise:
-        search.take(noise, told)  # what is told of them rests on the noise beside them
-    shown = best or (decision.tied_models[0] if decision.tied_models else None)
-    if shown is not None:
-        search.examine(shown)
-    base = explain.fit_record(search.base, search.structure, ())
-    final = base if best is None else explain.fit_record(best.found, best.structure, best.names, best.window)
-    lost = decision.verdict == "unexplained" and _explains_nothing(search)
-    _warn(search, lost)
-    before = _scores(search, search.base, mask)
-    after = None if best is None else _scores(search, best.found, mask)
-    if best is None:
-        improved: Simulator = simulator
-    else:
-        improved = _improved(simulator, best)
-    left = search.base if best is None else best.found
-    apart = unlike(search, left) if decision.verdict in ("consistent", "named") else []
-    any_unlike = bool(apart)
-    if decision.verdict != "consistent":
-        apart = [*from_samples(search), *more_than_replicates(search, left), *apart]
-    if decision.verdict in ("ambiguous", "unexplained"):
-        apart = [*held_otherwise(search), *apart]
-    remaining, depends = 0.0 if decision.verdict == "consistent" else 1.0, ""
-    if best is not None:
-        white = best.structure is not None and best.structure.p_value >= PLAINLY_WHITE and not search.exact
-        remaining = 0.0 if white else 1.0 - explain.removed(search, best)
-        larger = next((m for m in decision.tied_models if len(m.names) > len(best.names)), None)
-        if larger is not None:  # something beside it is likely
-            remaining = max(remaining, explain.surpassed(search, best, larger))
-            if decision.probability[id(larger)] > decision.probability[id(best)]:
-                more = [name for name in larger.names if name not in best.names]
-                other = explain.estimates(larger.found, larger.found.free)
-                depends = explain.depends(final.estimates, other, more)
-    return Diagnosis(
-        verdict=decision.verdict,
-        terms=_in_order(search, best) if best else [],
-        tied=decision.tied,
-        where=Table([], ("kind", "target"))
-        if decision.verdict == "consistent"
-        else locate(search, shown, named=best is not None),
-        ranking=ranking(search, decision, mask),
-        detection_limit=limits(
-            search, 1.0 - confidence, POWER, [term for term in terms if _contains(simulator, term)]
-        ),
-        remaining=remaining,
-        before=before,
-        after=after,
-        improved=improved,
-        symptoms=[*apart, *symptoms(search, best)],
-        noise=_told_noise(search, decision, 1.0 - confidence).record(search.problem),
-        base=base,
-        final=final,
-        embedded=Table(
-            embed_each(search.base, search.noise, _embeddable(search)),
-            ("parameter", "sd", "output_sd", "log_likelihood"),
-        ),
-        shifts=needed_shifts(search) if decision.verdict != "consistent" else [],
-        missing=missing_rate(search) if decision.verdict != "consistent" else None,
-        experiment=propose(decision.tied_models, search.noise) if decision.tied_models else None,
-        equations=explain.formulas(best) if best else [],
-        identifiability=explain.identifiability(search, best)
-        + ([] if best is None else explain.other_minima(search, best))
-        + [
-            f"{term.name} frees what is calibrated already, and was no candidate"
-            for term in terms
-            if not term.parameters and _contains(simulator, term)
-        ],
-        recording=recording,
-        simulator=simulator,
-        held_out=mask,
-        set_aside=recording.observed_once & ~search.problem.keep,
-        p_detect=search.p_detect,
-        confidence=confidence,
-        library=[term.name for term in terms],
-        settings={
-            "seed": seed,
-            "withdrawn": decision.withdrawn,
-            "doubt": decision.doubt,
-            "depends": depends,
-            "unknown_beside": decision.beside,
-            "nearly": decision.nearly,
-            "lost": lost,
-            "unlike": any_unlike,
-            "set_aside": suspect,
-            "interrupted": interrupted,
-            "region": None if best is None else best.where,
-            "solver": _solver(search.problem.simulator),
-        },
-        seconds=time.perf_counter() - begun,
-        drivers=search.drivers(),
-    )
-
-
-def _told_noise(search: Search, decision: Decision, alpha: float) -> Noise:
-    """The noise that the verdict rests on."""
-    if decision.verdict == "consistent" and search.noise.open and search.p_detect < alpha:
-        return settled(search.base, search.noise, search.tangents)[0]
-    return search.noise
-
-
-def _in_order(search: Search, best: Model) -> list[str]:
-    """Names of the accepted terms, the one with the most evidence of its own first."""
-    alone = {m.names[0]: m.log_evidence for m in search.models if len(m.names) == 1}
-    return sorted(best.names, key=lambda name: -alone.get(name, -math.inf))
-
-
-def _solver(simulator: Simulator) -> str:
-    if isinstance(simulator, Trajectories):
-        method = "Radau IIA (implicit)" if simulator.implicit else "classical Runge–Kutta"
-        return f"{method}, {simulator.num_steps} steps a run"
-    return "static"
-
-
-def _improved(simulator: Simulator, best: Model) -> Simulator:
-    """The user's simulator with the accepted terms, begun at their estimates, or at the mean of each run's."""
-    improved = extend(simulator, best.candidate.terms)
-    estimate = best.found.by_name
-    own = [best.found.problem.parameters[i].name for i in best.candidate.own]
-    parameters = []
-    for q in improved.parameters:
-        values = [estimate[name] for name in own if is_value_of(name, q.name)]
-        value = sum(values) / max(len(values), 1)
-        if values and q.contains(value) and (q.transform != "log" or value > 0):
-            q = Parameter(q.name, q.unit, q.low, q.high, value, None, q.transform, q.per_run)
-        parameters.append(q)
-    improved.parameters = tuple(parameters)
-    return improved
-
-
-def _explains_nothing(search: Search) -> bool:
-    """Whether the calibrated base explains no more than a constant would."""
-    return _size(search) > NO_BETTER and not _is_constant(search)
-
-
-def _is_constant(search: Search) -> bool:
-    """Whether the calibrated base is the mean of each output, as one is that has no more to say."""
-    found, recording = search.base, search.problem.recording
-    weight = found.whitening.sd.square().reciprocal()
-    for k in found.problem.output_of.unique():
-        mine = found.problem.output_of == k
-        mean = float((weight[mine] * found.problem.y[mine]).sum() / weight[mine].sum())
-        spread = recording.spread[found.problem.index[mine]]
-        if bool(((found.y[mine] - mean).abs() > (1 - NO_BETTER) * spread).any()):
-            return False
-    return True
-
-
-def _size(search: Search) -> float:
-    """RMSE of the calibrated base, in the spread of the data."""
-    found = search.base
-    return float((found.residual / search.problem.recording.spread[found.problem.index]).square().mean().sqrt())
-
-
-def _warn(search: Search, lost: bool) -> None:
-    if search.base.agreeing < 0.2:
-        warn(
-            f"Only {search.base.agreeing:.0%} of the base's starting values came to the best fit. Give initial= or "
-            "bounds to its parameters, or more num_starts.",
-            ConvergenceWarning,
-        )
-    if lost:
-        warn(
-            f"The calibrated base explains no more than a constant would (its RMSE is {_size(search):.2g} of the "
-            "data's spread). Check the units and the simulator, and give initial= or bounds to its parameters.",
-            ConvergenceWarning,
-        )
