@@ -234,3 +234,30 @@ def test_two_terms_of_which_no_tangent_shows_anything_are_tried_together(noise):
     known = {e.name: e for e in d.final.estimates}
     for name in ("wave 3.a", "wave 8.a"):
         assert abs(known[name].value - 0.05**0.5) < 4 * known[name].sd
+
+
+def test_a_pair_listed_in_the_wrong_order_does_not_lose_to_one_that_looks_like_it():
+    # A resistance thermometer: the current's effect comes before the shunt, which is listed first; what saturates, as a
+    # shunt nearly makes it do, is listed last.
+    generator = torch.Generator().manual_seed(3)
+    cold = 1.5 * torch.rand(120, generator=generator, dtype=F64) - 0.5
+    power = 3 * torch.rand(120, generator=generator, dtype=F64)
+    inner = 1.8 + 3.6 * cold - 0.14 * (power - 1.5)
+    y = inner - torch.log1p(0.08 * inner.exp()) + 0.07 * torch.randn(120, generator=generator, dtype=F64)
+    base = tc.Simulator(lambda x, p: {"y": p["r"] + p["b"] * x["cold"]}, [tc.Parameter("r"), tc.Parameter("b")])
+
+    def seen(name: str, function: object) -> tc.Term:
+        return tc.Term(name, outputs={"y": function}, parameters=[tc.Parameter("a", low=0.0)])
+
+    shunt = seen("shunt", lambda x, p, y: y - torch.log1p(p["a"] * y.exp()))
+    current = seen("current", lambda x, p, y: y - p["a"] * (x["power"] - 1.5))
+    dull = seen("dull", lambda x, p, y: y - p["a"] * torch.relu(y + 2) ** 2)
+    recording = tc.Recording(x={"cold": cold, "power": power}, y={"y": y}, noise=0.07)
+    chi2 = []
+    for terms in ([shunt, current, dull], [dull, current, shunt]):
+        d = tc.diagnose(base, recording, terms, progress=False)
+        assert {"shunt", "current"} in [set(tied) for tied in (d.tied or [d.terms])]
+        row = next(row for row in d.ranking if set(row.terms) == {"shunt", "current"})
+        assert row.terms == ("current", "shunt")
+        chi2.append(row.log_evidence)
+    assert abs(chi2[0] - chi2[1]) < 0.1

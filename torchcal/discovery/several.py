@@ -18,6 +18,7 @@ from torchcal.discovery.screen import screen
 from torchcal.discovery.search import BETTER, Search
 from torchcal.discovery.verdict import PLAINLY_WHITE
 from torchcal.errors import DomainError, SimulatorError
+from torchcal.terms import extend
 
 __all__ = ["refit_several", "scores_beside"]
 
@@ -33,6 +34,9 @@ ALL = 0.99999
 FROM_LINEAR, FROM_FAR, NEARLY_SAME = 8, 3, 0.999
 #: Log weight behind the leading pair down to which that is tried, and for how many pairs.
 CLOSE, AGAIN = 5.0, 3
+#: Log weight behind the leading pair down to which pairs are tried the other way round, how many at most, and the
+#: change of χ² from which on that is another model.
+FAR_BEHIND, TURNED, ANOTHER = 30.0, 6, 1.0
 #: Correlation of two tangents from which on a candidate is tried in the other's place beside the leading pair's.
 ALIKE = 0.9
 
@@ -65,16 +69,16 @@ def refit_several(search: Search) -> None:
             wanted.setdefault(pair, None)
     pairs = list(wanted)[: FEWER if enough else MOST]
     prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))
-    fitted = _refit_sets(search, [(pair, wanted[pair]) for pair in pairs], prior)
-    search.models += fitted
+    search.models += (fitted := _refit_sets(search, [(pair, wanted[pair]) for pair in pairs], prior))
+    if not enough:
+        fitted = _either_way(search, fitted)
     best = search.physical_leader
     if best is not None and len(best.numbers) == 2:
-        twins = _refit_sets(search, [(pair, None) for pair in _swapped(search, best) if pair not in pairs], prior)
-        fitted += twins
-        search.models += twins
-        if (other := _turned(search, best)) is not None:
-            fitted, search.models = ([other if m is best else m for m in models] for models in (fitted, search.models))
-            best = other
+        search.models += (twins := _refit_sets(
+            search, [(pair, None) for pair in _swapped(search, best) if pair not in pairs], prior
+        ))
+        fitted += _either_way(search, twins)
+        best = search.physical_leader or best
         close = [m for m in search.models if m.physical and len(m.numbers) == 2 and m.weight > best.weight - CLOSE]
         for pair in sorted(close, key=lambda m: -m.weight)[:AGAIN]:
             _alone_again(search, pair)
@@ -85,30 +89,59 @@ def refit_several(search: Search) -> None:
     best = max(fitted, key=lambda m: m.weight)
     if search.examine(best).p_value < 0.01 or search.exact:
         third = math.log(0.2 * PRIOR["several"] / (count * (count - 1) * max(count - 2, 1) / 6))
-        more = [tuple(sorted((*best.numbers, j))) for j in _next_terms(search, best, THIRD) if j not in best.numbers]
-        search.models += _refit_sets(search, [(numbers, None) for numbers in more], third)
+        more = [j for j in _next_terms(search, best, THIRD) if j not in best.numbers]
+        search.models += _refitted(search, [_with_third(search, best, j, third) for j in more])
         leader = search.physical_leader
         if leader is not None and len(leader.numbers) == 3:
             _one_fewer(search, leader, prior)
 
 
-def _turned(search: Search, pair: Model) -> Model | None:
-    """The same two terms the other way round, where these act on one output and do better so.
+def _either_way(search: Search, pairs: list[Model]) -> list[Model]:
+    """Pairs, the leading ones with their terms the other way round where that is another model that does better.
 
-    An instrument shows what the physics gives; which of the two is which nobody says.
+    An instrument shows what the physics gives, and a shunt bears what the leads drop; which of two terms on one output
+    comes first nobody says.
     """
+    best = max((m.weight for m in search.models if len(m.numbers) == 2 and m.window is None), default=0.0)
+    leading = sorted((m for m in pairs if m.weight > best - FAR_BEHIND and _share(m)), key=lambda m: -m.weight)
+    wanted: list[tuple[Model, Hypothetical]] = []
+    for pair in leading:
+        if len(wanted) == TURNED:
+            break
+        known, y = _turned(search, pair)
+        if float(pair.found.whitening.vector(y - pair.found.y).square().sum()) < ANOTHER:
+            continue
+        one = _hypothetical(search, pair.numbers, pair.log_prior, None, order=_order(search, pair)[::-1])
+        if one is not None and one.candidate.terms[0].name != pair.names[0]:
+            row = torch.tensor([[known[q.name] for q in one.candidate.problem.parameters]], dtype=torch.float64)
+            wanted.append((pair, dataclasses.replace(one, begin=torch.cat([one.begin, row]))))
+    better = {
+        id(pair): other
+        for (pair, _), other in zip(wanted, search.refit_together([one for _, one in wanted]), strict=True)
+        if other is not None and other.physical >= pair.physical and other.weight > pair.weight + BETTER
+    }
+    search.models = [better.get(id(m), m) for m in search.models]
+    return [better.get(id(m), m) for m in pairs]
+
+
+def _turned(search: Search, pair: Model) -> tuple[dict[str, float], Tensor]:
+    """Parameters of a pair, and the outputs ``(n,)`` of its terms the other way round with them."""
+    problem, known = search.base.problem, pair.found.by_name
+    problem = problem.with_simulator(extend(problem.simulator, pair.candidate.terms[::-1]))
+    row = torch.tensor([[known[q.name] for q in problem.parameters]], dtype=torch.float64)
+    return known, problem.evaluate(row, [], problem.guess(search.base.warm, row))[0][0]
+
+
+def _share(pair: Model) -> bool:
+    """Whether both terms change the same output, or the same parameter."""
     first, second = pair.candidate.terms
-    if not set(first.outputs) & set(second.outputs):
-        return None
-    one = _hypothetical(search, pair.numbers, pair.log_prior, None, turned=True)
-    if one is None:
-        return None
-    known, row = pair.found.by_name, one.candidate.begin.clone()
-    for k, q in enumerate(one.candidate.problem.parameters):
-        row[k] = known[q.name]
-    (other,) = search.refit_together([dataclasses.replace(one, begin=torch.cat([one.begin, row[None]]))])
-    better = other is not None and other.physical >= pair.physical and other.weight > pair.weight + BETTER
-    return other if better else None
+    return bool(set(first.outputs) & set(second.outputs) or set(first.shifts) & set(second.shifts))
+
+
+def _order(search: Search, model: Model) -> list[int]:
+    """A model's candidates in the order in which they act."""
+    names = list(model.names)
+    return sorted(model.numbers, key=lambda i: names.index(search.candidates[i].terms[0].name))
 
 
 def _one_fewer(search: Search, three: Model, prior: float) -> None:
@@ -248,15 +281,30 @@ def _refit_sets(
     search: Search, sets: Sequence[tuple[tuple[int, ...], tuple[int, int] | None]], prior: float
 ) -> list[Model]:
     """Refit sets of candidates, each with the columns of the linear search that suggested it."""
-    wanted = [_hypothetical(search, numbers, prior, columns) for numbers, columns in sets]
+    return _refitted(search, [_hypothetical(search, numbers, prior, columns) for numbers, columns in sets])
+
+
+def _refitted(search: Search, wanted: Sequence[Hypothetical | None]) -> list[Model]:
     found = search.refit_together([one for one in wanted if one is not None])
     return [model for model in found if model is not None]
 
 
+def _with_third(search: Search, pair: Model, third: int, prior: float) -> Hypothetical | None:
+    """A third term beside two, which act in the order in which they do alone."""
+    numbers, two = tuple(sorted((*pair.numbers, third))), iter(_order(search, pair))
+    return _hypothetical(search, numbers, prior, None, order=[i if i == third else next(two) for i in numbers])
+
+
 def _hypothetical(
-    search: Search, numbers: tuple[int, ...], prior: float, columns: tuple[int, int] | None, *, turned: bool = False
+    search: Search,
+    numbers: tuple[int, ...],
+    prior: float,
+    columns: tuple[int, int] | None,
+    *,
+    order: Sequence[int] = (),
 ) -> Hypothetical | None:
-    terms = [term for i in (reversed(numbers) if turned else numbers) for term in search.candidates[i].terms]
+    """Some candidates together, each begun at its fit alone and, if not as they are listed, acting in an order."""
+    terms = [term for i in order or numbers for term in search.candidates[i].terms]
     terms.sort(key=lambda term: not replaces(search.base.problem, search.base.values, term))  # else others are lost
     try:
         candidate = prepare(
