@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchcal.errors import ConvergenceError
-from torchcal.inference import diagnostics, hmc_step, nuts_step
+from torchcal.errors import ConvergenceError, InterruptionWarning
+from torchcal.inference import batched, diagnostics, hmc_step, nuts_step
 from torchcal.inference.arrays import Device, Host
 from torchcal.inference.batched import run_batched
 from torchcal.inference.bends import Bend
@@ -485,3 +485,22 @@ def test_points_that_are_alone_in_their_modes_stay():
     other, there = gathered(space, z, torch.arange(8), torch.zeros(8, dtype=torch.float64), generator)
     assert other is space
     torch.testing.assert_close(there, z, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("drawn", [0, 8])
+def test_an_interrupted_sampler_keeps_its_draws_and_ends_where_there_are_none(drawn, monkeypatch):
+    sample = batched._sample
+
+    def interrupted(moves, state, space, step_size, collector, num_samples, enough, bar, *, whatever):
+        if drawn:
+            sample(moves, state, space, step_size, collector, drawn, None, bar, whatever=True)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(batched, "_sample", interrupted)
+    if drawn:
+        with pytest.warns(InterruptionWarning, match="keeps 8 of 200 draws"):
+            found = run(lambda z: -0.5 * z.square().sum(-1), 2, num_chains=4)
+        assert found.alpha.shape[1] == drawn
+    else:
+        with pytest.raises(KeyboardInterrupt):
+            run(lambda z: -0.5 * z.square().sum(-1), 2, num_chains=4)

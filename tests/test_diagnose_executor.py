@@ -297,13 +297,13 @@ def test_an_interruption_outside_of_refits_keeps_what_there_is(motion, monkeypat
 @pytest.mark.usefixtures("terminal")
 def test_an_interruption_of_a_finished_search_changes_nothing(motion, monkeypatch):
     module = sys.modules["torchcal.discovery.diagnose"]  # whose name is that of its function, too
-    work = module._result
+    work = module.conclude
 
     def interrupted(*args):
         signal.raise_signal(signal.SIGINT)
         return work(*args)
 
-    monkeypatch.setattr(module, "_result", interrupted)
+    monkeypatch.setattr(module, "conclude", interrupted)
     d = diagnose(motion, library()[-1:])
     assert (d.verdict, d.terms, d.settings["interrupted"]) == ("named", ["bias force"], "")
 

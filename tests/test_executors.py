@@ -36,11 +36,14 @@ from torchcal import (
 from torchcal.errors import (
     ConvergenceWarning,
     DomainError,
+    InterruptionWarning,
     RecordingError,
     SimulatorError,
     TorchcalError,
     WorkerWarning,
+    warn,
 )
+from torchcal.inference import many
 from torchcal.results import Calibration
 from torchcal.simulators import executor as executors
 from torchcal.simulators.cluster import submit
@@ -589,6 +592,29 @@ def test_an_interrupt_keeps_what_ended(tmp_path):
     with pytest.raises(KeyboardInterrupt) as caught:
         calibrate_many(linear(interrupted), records(offsets=(0.0, 0.0, 10.0)), **MAP_ALONE)
     assert list(caught.value.partial) == ["u", "v"]
+
+
+@pytest.mark.filterwarnings("ignore::torchcal.errors.ConvergenceWarning")  # of so few starts
+@pytest.mark.parametrize("executor", [None, "threads"])
+def test_a_calibration_that_was_cut_short_is_no_result(executor, tmp_path, monkeypatch):
+    whole, calls = many.calibrate, []
+
+    @functools.wraps(whole)
+    def cut_short(simulator, recording, **settings):
+        calls.append(recording)
+        if len(calls) == 2:
+            warn("The sampler was interrupted.", InterruptionWarning)
+        return whole(simulator, recording, **settings)
+
+    monkeypatch.setattr(many, "calibrate", cut_short)
+    items = records()
+    with ThreadPoolExecutor(1) as threads, pytest.raises(KeyboardInterrupt) as caught:
+        calibrate_many(linear(), items, folder=tmp_path, executor=threads if executor else None, **MAP_ALONE)
+    assert "v" not in caught.value.partial
+    assert len(calls) == (3 if executor else 2)
+    assert {path.stem for path in tmp_path.iterdir()} == set(caught.value.partial)
+    assert list(calibrate_many(linear(), items, folder=tmp_path, **MAP_ALONE)) == ["u", "v", "w"]
+    assert len(calls) == 4
 
 
 @pytest.mark.slow

@@ -15,7 +15,14 @@ from numpy.polynomial import legendre
 
 from torchcal import Recording, calibrate
 from torchcal.embeddings import Gaussian
-from torchcal.errors import DomainError, ExtrapolationWarning, ShapeError, SimulatorError, SurrogateWarning
+from torchcal.errors import (
+    DomainError,
+    ExtrapolationWarning,
+    ShapeError,
+    SimulatorError,
+    SurrogateWarning,
+    TorchcalWarning,
+)
 from torchcal.likelihoods import ABC
 from torchcal.propagation import NISP
 from torchcal.simulators import (
@@ -333,6 +340,28 @@ def test_a_rerun_goes_on_from_what_was_kept(error, kind, tmp_path):
         build(third, cache=path)
         assert third.calls == 1
         assert os.listdir(tmp_path) == ["cache.npz"]
+
+
+def full_disk(*args, **arrays):
+    raise OSError(28, "No space left on device")
+
+
+def test_a_disk_that_is_full_loses_no_evaluation(tmp_path, monkeypatch):
+    path = tmp_path / "cache.npz"
+    monkeypatch.setattr("torchcal.simulators.design.np.savez", full_disk)
+    monkeypatch.setattr("torchcal.simulators.design._SAVE_SECONDS", 0.0)  # tried at every evaluation
+    with pytest.warns(TorchcalWarning, match=r"could not be kept in .*No space left"):
+        surrogate = build(smooth, cache=path)
+    assert torch.equal(surrogate.coefficients, build(smooth).coefficients)
+    with pytest.raises(SimulatorError) as caught:
+        build(Counted(smooth, stop=101, error=ValueError("no root")), cache=path)
+    assert len(caught.value.partial) == 100
+    assert "as .partial of this error, as" in caught.value.__notes__[0]
+    assert not os.listdir(tmp_path)
+    monkeypatch.undo()
+    again = Counted(smooth)
+    build(again, cache=caught.value.partial)
+    assert again.calls == 4**4 + 200 - 100 + 1
 
 
 def test_an_interrupt_in_a_worker(tmp_path, pool):

@@ -17,6 +17,7 @@ __all__ = [
     "ExtrapolationWarning",
     "IdentifiabilityWarning",
     "ImproperPosteriorError",
+    "InterruptionWarning",
     "MissingDependencyError",
     "PropagationWarning",
     "RecordingError",
@@ -87,6 +88,10 @@ class TorchcalWarning(UserWarning):
 
 class ConvergenceWarning(TorchcalWarning):
     """Optimiser starts disagree, or R-hat, effective sample size or divergences are past their thresholds."""
+
+
+class InterruptionWarning(ConvergenceWarning):
+    """Ctrl-C ended a calculation early; what there was is kept."""
 
 
 class PropagationWarning(TorchcalWarning):

@@ -16,7 +16,7 @@ def check_target(path: str | os.PathLike[str]) -> Path:
     """The path of a file that can be written, checked before anything is computed for it.
 
     Raises:
-        DomainError: If it is no path, its folder does not exist, or it is a folder itself.
+        DomainError: If it is no path, its folder does not exist or cannot be written to, or it is a folder itself.
     """
     if not isinstance(path, str | os.PathLike):
         raise DomainError(f"Expected path: the name of a file. Got {type(path).__name__}.")
@@ -25,6 +25,10 @@ def check_target(path: str | os.PathLike[str]) -> Path:
         raise DomainError(
             f"Expected a file in a folder that exists. Got {os.fspath(path)!r}: there is no folder "
             f"{str(target.parent)!r}. Make it first, or give another one."
+        )
+    if not os.access(target.parent, os.W_OK):
+        raise DomainError(
+            f"Expected a folder that can be written to. Got {str(target.parent)!r}, which cannot. Give another one."
         )
     if target.is_dir():
         raise DomainError(f"Expected the name of a file. Got the folder {os.fspath(path)!r}. Add a name to it.")

@@ -28,7 +28,7 @@ from torchcal.discovery.several import refit_several
 from torchcal.discovery.trial import check_repeats
 from torchcal.discovery.verdict import decide
 from torchcal.display import NONE
-from torchcal.errors import ConvergenceWarning, DomainError, EmbeddingError, RecordingError, warn
+from torchcal.errors import DomainError, EmbeddingError, InterruptionWarning, RecordingError, warn
 from torchcal.simulators import ODESimulator, Simulator, is_value_of
 from torchcal.simulators.executor import check_executor
 from torchcal.terms import Term, extend
@@ -175,7 +175,7 @@ def _hold_back(search: Search, decision: Decision) -> None:
     """An interrupted search names nothing: what it has not refitted might explain as much."""
     warn(
         f"The diagnosis was interrupted. It keeps {len(search.models)} refitted hypotheses and names none of them.",
-        ConvergenceWarning,
+        InterruptionWarning,
     )
     if decision.verdict == "named" and decision.best is not None:
         decision.tied = [list(decision.best.names), list(NONE)]

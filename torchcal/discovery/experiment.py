@@ -31,7 +31,7 @@ MOST = 8
 LEAST = 2.0
 #: How much larger the distance must be for a less simple experiment.
 WORTH = 1.01
-#: Solver error, in noise sd, up to which a model bears an experiment, with steps halved so often at most.
+#: Solver error, in noise sd, up to which a model bears an experiment, with steps of its kind halved so often at most.
 SETTLED, HALVINGS = 0.1, 3
 #: How many times the largest reading no experiment shall make an output.
 FAR = 100.0
@@ -154,7 +154,7 @@ def _bearable(models: Sequence[Model], recording: Recording, noise: Noise) -> bo
         if isinstance(simulator, Trajectories):
             bound, values = _there(model.found, simulator, recording)
             try:
-                there = settled(bound, values, SETTLED * _sd(recording, noise), halvings=HALVINGS)
+                there = settled(bound, values, SETTLED * _sd(recording, noise), halvings=HALVINGS, switch=False)
             except TorchcalError:
                 return False
             if not bool(torch.isfinite(there.outputs_of(values, there.solve(values))).all()):

@@ -11,7 +11,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchcal.display import PATIENCE
-from torchcal.errors import ConvergenceError, ConvergenceWarning, warn
+from torchcal.errors import InterruptionWarning, warn
 from torchcal.inference import hmc_step, nuts_step
 from torchcal.inference.arrays import Arrays, arrays_for
 from torchcal.inference.coordinates import Laplace, Slopes, Whitened, gathered, starting_points
@@ -200,7 +200,8 @@ def run_batched(
         progress: Whether to show a bar.
 
     Raises:
-        ConvergenceError: If the density is not finite around a mode, or it was interrupted before any draw.
+        ConvergenceError: If the density is not finite around a mode.
+        KeyboardInterrupt: Before there are draws to keep.
     """
     loc = modes[0].loc
     generator = torch.Generator(device=loc.device).manual_seed(seed)
@@ -236,11 +237,11 @@ def run_batched(
         if collector.least >= min(drawn.least, _FIRST):  # those before were given up
             drawn = collector
         if drawn.least < 4:
-            raise ConvergenceError("The sampler was interrupted before it had drawn anything.") from None
+            raise
         warn(
             f"The sampler was interrupted. It keeps {drawn.least} of {num_samples} draws of each of {num_chains} "
             "chains.",
-            ConvergenceWarning,
+            InterruptionWarning,
         )
     finally:
         bar.close()

@@ -23,7 +23,7 @@ from tqdm.auto import tqdm
 from torchcal import embeddings, likelihoods
 from torchcal.data import Recording
 from torchcal.display import PATIENCE
-from torchcal.errors import DomainError, RecordingError, TorchcalError, TorchcalWarning, warn
+from torchcal.errors import DomainError, InterruptionWarning, RecordingError, TorchcalError, TorchcalWarning, warn
 from torchcal.inference.calibrate import calibrate
 from torchcal.results import Calibration, reading, storage
 from torchcal.simulators import Simulator
@@ -109,12 +109,18 @@ def calibrate_many(
     store = None if folder is None else _Folder(folder, simulator, settings)
     results: dict[Any, Calibration] = {} if store is None else store.read(items)
     failures: dict[Any, BaseException] = {}
+    cut_short: list[Any] = []
     warned: dict[tuple[type[Warning], str], None] = {}
     work = _Work(simulator, settings, os.getpid())
     bar = tqdm(total=len(items), initial=len(results), desc="calibrations", disable=not progress, delay=PATIENCE)
 
     def take(names: Sequence[Any], index: int, outcome: _Outcome) -> None:
         name = names[index]
+        if outcome.interrupted:  # some of the draws are no result of these settings
+            cut_short.append(name)
+            if executor is None:
+                raise KeyboardInterrupt
+            return
         for category, text in outcome.warned:
             named = issubclass(category, TorchcalWarning)
             warned[(category, f"{_title(name)}: {text}" if named else text)] = None
@@ -131,6 +137,8 @@ def calibrate_many(
             tasks = [items[name] for name in todo]
             try:
                 run_tasks(work, tasks, executor=executor, on_result=functools.partial(take, todo))
+                if cut_short:
+                    raise KeyboardInterrupt
             except TorchcalWarning as warning:  # where warnings are errors; all results are there
                 warned[(type(warning), str(warning))] = None
             except TaskError as failure:
@@ -164,6 +172,11 @@ class _Outcome:
     result: Calibration | None
     error: BaseException | None
     warned: tuple[tuple[type[Warning], str], ...]
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether it has but a part of the draws that were asked for."""
+        return any(issubclass(category, InterruptionWarning) for category, _ in self.warned)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,7 +9,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchcal.display import PATIENCE
-from torchcal.errors import ConvergenceError, ConvergenceWarning, warn
+from torchcal.errors import InterruptionWarning, warn
 from torchcal.inference.draws import Draws
 from torchcal.inference.randomness import preserve_random_state
 from torchcal.priors import CoefficientPrior
@@ -84,14 +84,14 @@ def run_nuts(
         interrupted = True
         if not chains and len(current) >= 4:
             chains.append(transform(torch.stack(current)))
+        if not chains:
+            raise
     finally:
         bar.close()
-    if not chains:
-        raise ConvergenceError("The sampler was interrupted before it had drawn anything.")
     if interrupted:
         warn(
             f"The sampler was interrupted. It keeps {len(chains)} of {num_chains} chains with "
             f"{len(chains[0])} draws.",
-            ConvergenceWarning,
+            InterruptionWarning,
         )
     return Draws(torch.stack(chains).detach().to(device="cpu", dtype=torch.float64), divergences)

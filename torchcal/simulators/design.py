@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm.auto import tqdm
 
-from torchcal.errors import DomainError, SimulatorError
+from torchcal.errors import DomainError, SimulatorError, TorchcalWarning, warn
 from torchcal.files import check_target, replacing
 from torchcal.simulators.executor import TaskError, run_tasks
 from torchcal.simulators.points import PointCall, Value, failed_evaluation
@@ -95,6 +95,9 @@ def evaluate_points(
         SimulatorError: If an evaluation fails, named with its point, or the cache holds another function's
             values. ``.partial`` holds the evaluations so far. So does that of a KeyboardInterrupt.
         DomainError: If the cache is of other variables.
+
+    Warns:
+        TorchcalWarning: If the cache could not be written: a disk that is full ends no work.
     """
     variables = tuple(variables)
     store = _Store(variables, _open_cache(cache, variables), None if isinstance(cache, Evaluations) else cache)
@@ -122,6 +125,12 @@ def evaluate_points(
     finally:
         bar.close()
         store.write()
+    if store.unwritten is not None:
+        warn(
+            f"The evaluations could not be kept in {os.fspath(store.path or '')}: {store.unwritten}. What is made of "
+            "them is whole (save it elsewhere), but a rerun will have to evaluate them again.",
+            TorchcalWarning,
+        )
     values = np.stack([store.values[key] for key in keys])
     return Evaluations(variables, store.outputs, np.array(points), values)
 
@@ -136,6 +145,7 @@ class _Store:
         self.outputs: tuple[str, ...] | None = None
         self.values: dict[bytes, Array] = {}
         self.changed, self.written = False, time.monotonic()
+        self.unwritten: OSError | None = None
         if start is not None and len(start):
             self.outputs = start.outputs
             points = np.ascontiguousarray(start.points)
@@ -162,9 +172,16 @@ class _Store:
         return Evaluations(self.variables, self.outputs, points, values)
 
     def write(self) -> None:
-        if self.path is not None and self.changed:
+        """Write what is new; where that fails it is tried again later, and nothing is lost."""
+        if self.path is None or not self.changed:
+            return
+        self.written = time.monotonic()
+        try:
             self.evaluations().save(self.path)
-            self.changed, self.written = False, time.monotonic()
+        except OSError as error:
+            self.unwritten = error
+        else:
+            self.changed, self.unwritten = False, None
 
 
 def _open_cache(cache: str | os.PathLike[str] | Evaluations | None, variables: tuple[str, ...]) -> Evaluations | None:
@@ -204,7 +221,11 @@ def _check_same(call: PointCall, key: bytes, store: _Store, executor: Executor |
 def _attach_partial(error: BaseException, store: _Store) -> None:
     partial = store.evaluations()
     error.partial = partial  # type: ignore[attr-defined]
-    where = f"in {os.fspath(store.path)}" if store.path is not None else "as .partial of this error"
+    store.write()
+    if store.unwritten is not None:
+        where = f"as .partial of this error, as {os.fspath(store.path or '')} could not be written ({store.unwritten})"
+    else:
+        where = f"in {os.fspath(store.path)}" if store.path is not None else "as .partial of this error"
     error.add_note(f"{len(partial)} evaluations are kept {where}; pass it as cache= to go on from there.")
 
 

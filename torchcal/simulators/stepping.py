@@ -42,7 +42,9 @@ def _implicitly(simulator: Trajectories) -> Trajectories | None:
     return simulator if simulator.implicit else Trajectories(simulator.ode, simulator.recording, implicit=True)
 
 
-def settled(simulator: Trajectories, values: Tensor, allowed: Tensor, *, halvings: int = HALVINGS) -> Trajectories:
+def settled(
+    simulator: Trajectories, values: Tensor, allowed: Tensor, *, halvings: int = HALVINGS, switch: bool = True
+) -> Trajectories:
     """The same with steps so short that halving them changes no output by more than is allowed.
 
     Where halving them hardly lessens that, as of a stiff model, implicit steps are tried; where they are implicit,
@@ -54,6 +56,7 @@ def settled(simulator: Trajectories, values: Tensor, allowed: Tensor, *, halving
         values: Parameter values to look at, ``(H, d)``, physical units.
         allowed: Largest change of each output, ``(n_total,)``.
         halvings: How often steps are halved at most.
+        switch: Whether implicit steps are tried in place of explicit ones. It takes long where neither get through.
 
     Raises:
         SimulatorError: If it still changes after as many halvings.
@@ -72,7 +75,7 @@ def settled(simulator: Trajectories, values: Tensor, allowed: Tensor, *, halving
         if bool((change <= allowed).all()) and not outgrown(here.simulator, values, here.states):
             return here.simulator
         before, share = share, float((change / allowed).nan_to_num(nan=math.inf).max())
-        if number == 1 and not share < before / CONVERGING and not simulator.implicit:
+        if switch and number == 1 and not share < before / CONVERGING and not simulator.implicit:
             other = settled_implicitly(simulator, values, allowed)
             if other is not None:
                 return other
