@@ -275,3 +275,28 @@ def test_a_marginal_posterior_without_a_variance_is_told(count, told):
             num_samples=2, num_warmup=2, num_chains=2, seed=0,
         )  # fmt: skip
     assert any("no finite variance" in str(each.message) for each in caught) is told
+
+
+@pytest.mark.parametrize("calibrate", [tc.calibrate, tc.calibrate_additive])
+def test_gradients_are_taken_whatever_is_around_the_call(calibrate):
+    recording = tc.Recording(x=X, y=1 + 0.5 * X + 0.1 * np.sin(3 * X))
+    plain = calibrate(line(), recording, num_samples=0, seed=0, progress=False)
+    with torch.no_grad():
+        found = calibrate(line(), recording, num_samples=0, seed=0, progress=False)
+        assert not torch.is_grad_enabled()
+    assert found.map.objective == plain.map.objective
+    with torch.inference_mode(), pytest.raises(DomainError, match="inference_mode"):
+        calibrate(line(), recording, num_samples=0, seed=0, progress=False)
+
+
+def test_the_default_dtype_changes_nothing():
+    def fit():
+        return mode(line(), 1 + 0.5 * X + 0.1 * np.sin(3 * X)).map.alpha
+
+    single = fit()
+    torch.set_default_dtype(torch.float64)
+    try:
+        double = fit()
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert torch.equal(single, double)

@@ -3,9 +3,24 @@
 import operator
 from typing import Any
 
+import torch
+
 from torchcal.errors import DomainError
 
-__all__ = ["whole"]
+__all__ = ["outside_inference_mode", "whole"]
+
+
+def outside_inference_mode() -> None:
+    """Raise within ``torch.inference_mode()``, which takes no derivatives.
+
+    Raises:
+        DomainError: If it is on.
+    """
+    if torch.is_inference_mode_enabled():
+        raise DomainError(
+            "Expected a call outside torch.inference_mode(), which takes no derivatives. Got one within "
+            "(torch.no_grad() is allowed)."
+        )
 
 
 def whole(name: str, value: Any, minimum: int, *, also: str = "", advice: str = "") -> int:

@@ -42,11 +42,14 @@ def few_threads(numbers: int = 0) -> Iterator[None]:
 
 
 def with_few_threads(function: Callable[_P, _R]) -> Callable[_P, _R]:
-    """A function that has one thread, but where it asks for more. Warnings are told of the user's line, through it."""
+    """A function that has one thread, but where it asks for more, and derivatives, also within ``torch.no_grad()``.
+
+    Warnings are told of the user's line, through it.
+    """
 
     @functools.wraps(function)
     def inner(*args: _P.args, **options: _P.kwargs) -> _R:
-        with few_threads():
+        with few_threads(), torch.enable_grad():
             return function(*args, **options)
 
     return inner

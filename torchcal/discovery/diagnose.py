@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from typing import Any
 
-import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchcal.checks import whole
+from torchcal.checks import outside_inference_mode, whole
 from torchcal.data import Recording
 from torchcal.discovery import verify
 from torchcal.discovery.candidates import base_columns
@@ -194,11 +193,7 @@ def _interruption(search: Search) -> str:
 
 
 def _check(simulator: Any, recording: Any, candidates: Any, confidence: float) -> list[Term]:
-    if torch.is_inference_mode_enabled():
-        raise DomainError(
-            "Expected a diagnosis outside torch.inference_mode(), which takes no derivatives. Got one within "
-            "(torch.no_grad() is allowed)."
-        )
+    outside_inference_mode()
     if not isinstance(simulator, Simulator):
         raise DomainError(f"Expected a Simulator or an ODESimulator. Got {type(simulator).__name__}.")
     if not isinstance(recording, Recording):

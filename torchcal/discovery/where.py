@@ -218,7 +218,7 @@ def needed_shifts(search: Search) -> list[NeededShift]:
 def _ranks(values: Tensor) -> Tensor:
     """Ranks, equal values at the mean of theirs."""
     _, number, counts = values.unique(return_inverse=True, return_counts=True)
-    return (counts.cumsum(0) - 0.5 * (counts - 1))[number]
+    return (counts.cumsum(0) - 0.5 * (counts - 1).double())[number]
 
 
 def _by_plausibility(search: Search) -> list[Place]:

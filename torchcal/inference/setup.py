@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from torchcal import likelihoods
-from torchcal.checks import whole
+from torchcal.checks import outside_inference_mode, whole
 from torchcal.data import Recording
 from torchcal.embeddings import Embedding
 from torchcal.errors import (
@@ -109,7 +109,8 @@ def check_dtype(recording: Recording, dtype: torch.dtype) -> None:
 
 
 def check_run(num_starts: int, device: torch.device | str | None) -> None:
-    """Raise for a number of starts or a device that cannot be used."""
+    """Raise for a number of starts or a device that cannot be used, or where no derivatives are taken."""
+    outside_inference_mode()
     whole("num_starts", num_starts, 1)
     if device is None:
         return

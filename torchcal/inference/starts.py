@@ -31,9 +31,10 @@ def starting_points(problem: Problem, leading: Tensor, num_starts: int, seed: in
         points = problem.prior.sample((num_starts,))
         extra = points.shape[1] - pattern.num_alpha  # ln σ of the additive model
         is_leading = torch.cat([pattern.leading, torch.zeros(extra, dtype=torch.bool)]).to(points.device)
-        jitter = 0.1 * torch.randn(num_starts, len(leading)).to(points)
-        spread = 10 ** (2 * torch.rand(num_starts, 1).to(points) - 2)
-        normal = torch.randn(points.shape).to(points)
+        single = torch.float32  # whatever the default is: other draws would follow
+        jitter = 0.1 * torch.randn(num_starts, len(leading), dtype=single).to(points)
+        spread = 10 ** (2 * torch.rand(num_starts, 1, dtype=single).to(points) - 2)
+        normal = torch.randn(points.shape, dtype=single).to(points)
     near = torch.arange(num_starts) % 2 == 0
     anchor = leading + jitter
     anchor[0] = leading
