@@ -1,13 +1,17 @@
 """What `diagnose` makes of data without noise, numbers of other packages, and simulators or terms that misbehave."""
 
 import math
+import types
 
 import numpy as np
 import pytest
 import torch
 
 import torchcal as tc
-from torchcal.errors import DomainError, SimulatorError
+from torchcal.discovery import decision as decision_of
+from torchcal.errors import ConvergenceWarning, DomainError, SimulatorError
+
+F64 = torch.float64
 
 X = torch.linspace(0.1, 2.0, 30, dtype=torch.float64)
 AB = [tc.Parameter("a"), tc.Parameter("b")]
@@ -117,3 +121,43 @@ def test_a_rate_that_is_not_finite_is_told_with_its_run():
     heavy = tc.Term("heavy", parameters=[tc.Parameter("q")], **push)
     with pytest.raises(SimulatorError, match=r"term 'heavy' at its neutral.*Got inf.*output 'x' at time = .*, run = 1"):
         tc.diagnose(body, motion, [heavy], progress=False)
+
+
+def test_a_base_that_explains_nothing_is_told_of_where_noise_may_be_all_there_is():
+    generator = torch.Generator().manual_seed(1)
+    steps = torch.randn(120, generator=generator, dtype=F64)
+    y = [steps[0]]
+    for step in steps[1:]:
+        y.append(0.9 * y[-1] + step)
+    x = torch.linspace(0, 1, 120, dtype=F64)
+    wave = tc.Simulator(lambda x, p: p["c"] + p["a"] * torch.sin(40 * x), [tc.Parameter("c"), tc.Parameter("a")])
+    with pytest.warns(ConvergenceWarning, match="no more than a constant"):
+        d = tc.diagnose(wave, tc.Recording(x=x, y=torch.stack(y)), progress=False)
+    assert d.noise.correlation["y"] > 0.5
+    assert "no more than a constant would: before anything is called missing, or nothing" in str(d)
+
+
+def test_three_data_show_no_effect_of_any_size():
+    x = torch.tensor([0.0, 1.0, 2.0], dtype=F64)
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")], degree=1)
+    bend = tc.Term("bend", outputs={"y": lambda x, p, y: y + p["q"] * x**2}, parameters=[tc.Parameter("q")])
+    y = torch.tensor([1.0, 0.1, 3.0], dtype=F64)
+    d = tc.diagnose(line, tc.Recording(x=x, y=y), [bend], progress=False)
+    assert d.verdict == "consistent"
+    assert math.isinf(d.detection_limit[0].smallest)
+    assert "so few data" in d.detection_limit[0].note
+    known = tc.diagnose(line, tc.Recording(x=x, y=y, noise=0.1), [bend], progress=False)
+    assert math.isfinite(known.detection_limit[0].smallest)
+
+
+def test_a_name_is_tied_once_wherever_it_acts(monkeypatch):
+    monkeypatch.setattr(decision_of, "other_names", lambda search, model: [(1, "night loss", "deposition")])
+    decision = decision_of.Decision()
+    decision.tied = [["night loss"], ["deposition"]]
+    model = types.SimpleNamespace(names=("deposition",), numbers=(0,), window=None)
+    search = types.SimpleNamespace(merged={1: "its model"})
+    decision_of.tie_other_names(search, model, decision)
+    assert decision.tied == [["night loss"], ["deposition"]]
+    decision.tied = [["deposition"]]
+    decision_of.tie_other_names(search, model, decision)
+    assert decision.tied == [["deposition"], ["night loss"]]

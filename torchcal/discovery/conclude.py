@@ -31,8 +31,9 @@ from torchcal.terms import Term, extend
 
 __all__ = ["conclude"]
 
-#: RMSE of a calibrated base, in the data's spread, from which on it explains nothing.
-NO_BETTER = 0.95
+#: RMSE of a calibrated base, in the data's spread, from which on it explains nothing; and the correlation of noise from
+#: sample to sample above which all that is recorded may be that.
+NO_BETTER, CORRELATED = 0.95, 0.5
 #: Probability of what is tied from which on its noise is told.
 HALF = 0.5
 #: Power of the stated detection limits.
@@ -77,7 +78,8 @@ def conclude(
         search.examine(shown)
     base = explain.fit_record(search.base, search.structure, ())
     final = base if best is None else explain.fit_record(best.found, best.structure, best.names, best.window)
-    lost = decision.verdict == "unexplained" and _explains_nothing(search)
+    slow = not search.exact and float(search.noise.correlation.max()) > CORRELATED
+    lost = best is None and (slow or decision.verdict == "unexplained") and _explains_nothing(search)
     _warn(search, lost)
     before = _scores(search, search.base, mask)
     after = None if best is None else _scores(search, best.found, mask)

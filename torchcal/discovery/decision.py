@@ -102,7 +102,10 @@ def other_names(search: Search, model: Model) -> list[tuple[int, str, str]]:
 def tie_other_names(search: Search, model: Model, decision: Decision) -> None:
     """Add what a model could as well be called to the tied hypotheses, with its own fit where there is one."""
     for number, name, own in other_names(search, model):
-        decision.tied.append([name if term == own else term for term in model.names])
+        names = [name if term == own else term for term in model.names]
+        if any(set(names) == set(tied) for tied in decision.tied):
+            continue  # it is tied where it acts in a range, too
+        decision.tied.append(names)
         other = search.merged.get(number)
         if other is not None and len(model.numbers) == 1 and model.window is None:
             decision.tied_models.append(other)

@@ -21,6 +21,8 @@ __all__ = ["limits"]
 ROUNDS, MOST = 8, 4.0
 #: Where it is close enough, as a logarithm.
 CLOSE = 0.05
+#: Data to spare below which the size of the noise is anyone's guess.
+SPARE = 3
 
 
 def limits(search: Search, alpha: float, power: float, contained: Sequence[Term] = ()) -> Table[Limit]:
@@ -45,8 +47,9 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
     odds = math.log(PRIOR["base"] / (PRIOR["single"] / max(len(search.candidates), 1)))
     fitted = search.plain
     effects: dict[int, _Effect] = {}
+    few = {i for i, c in enumerate(search.candidates) if search.noise.open and _spare(search, c) < SPARE}
     for i, candidate in enumerate(search.candidates):
-        if screening.best[i] < 0:
+        if screening.best[i] < 0 or i in few:
             continue
         column = _typical(search, i)
         # Seen is not enough: the evidence for the term must outweigh that for the base too.
@@ -69,6 +72,7 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
         if i not in effects:
             blind = "its tangent tells nothing new: only large effects can"
             note = blind if candidate.blind else "already in the base model"
+            note = "so few data show no effect beside noise of unknown size" if i in few else note
             rows.append(Limit(candidate.name, q.name, math.inf, q.unit, power, estimate, note))
             continue
         others = [search.candidates[j].name for j in search.aliases.get(i, ())]
@@ -81,6 +85,11 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
         name = term.full(term.parameters[0].name) if term.parameters else term.frees[0]
         rows.append(Limit(term.name, name, math.inf, None, power, None, "already in the base model"))
     return Table(rows, ("term", "parameter", "smallest", "unit", "power", "estimate", "note"))
+
+
+def _spare(search: Search, candidate: Candidate) -> int:
+    """Data to spare for the noise, beside the parameters of the base and of a candidate."""
+    return search.problem.n - len(search.base.free) - len(candidate.own)
 
 
 def _typical(search: Search, i: int) -> int:

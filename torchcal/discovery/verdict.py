@@ -171,6 +171,7 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         decision.tied.append(list(model.names))
         decision.tied_models.append(model)
         tie_other_names(search, model, decision)
+        seen |= {frozenset(tied) for tied in decision.tied}
     # One alone is not sure enough, or it had been named; and where several do what something unknown there would do.
     rival = any(m.weight > best.weight - BEHIND for m in search.nameless)
     local = rival and all(model.window is not None for model in decision.tied_models)

@@ -52,7 +52,8 @@ def paragraph(d: Any) -> str:
         "unexplained": _unexplained,
     }[d.verdict](d)
     lines = [_headline(d), ""]
-    text = " ".join(part for part in [_detected(d), *parts, _set_aside(d), d.settings.get("interrupted")] if part)
+    said = [_detected(d), _lost(d), *parts, _set_aside(d), d.settings.get("interrupted")]
+    text = " ".join(part for part in said if part)
     lines += textwrap.wrap(text, 100)
     for title, rows in (("Equation", d.equations), ("Symptoms", d.symptoms), ("Not identified", d.identifiability)):
         if rows:
@@ -127,6 +128,16 @@ def _detected(d: Any) -> str:
     text += f", {noise.outliers} outlier{'s' if noise.outliers > 1 else ''} set aside" if noise.outliers else ""
     text += f". The calibrated base leaves an RMSE of {d.before.fitted.rmse:.4g}{_rmse_unit(d)}; "
     return text + f"noise alone would leave so much structure with probability {_probability(d.p_detect)}."
+
+
+def _lost(d: Any) -> str:
+    """Whether the base is one at all."""
+    if not d.settings.get("lost"):
+        return ""
+    return (
+        "The calibrated base explains no more than a constant would: before anything is called missing, or nothing, "
+        "look at its units, and give initial= or bounds to its parameters, as its best fit may not have been found."
+    )
 
 
 def _set_aside(d: Any) -> str:
@@ -395,12 +406,6 @@ def _would_tell(d: Any, terms: Sequence[str]) -> str:
 
 def _unexplained(d: Any) -> list[str]:
     parts = [where_in_words(d)]
-    if d.settings.get("lost"):
-        parts.insert(
-            0,
-            "The calibrated base explains no more than a constant would: before anything is called missing, look at "
-            "its units, and give initial= or bounds to its parameters, as its best fit may not have been found.",
-        )
     best = next((row for row in d.ranking if row.terms and row.refitted), None)
     if best is not None:
         parts.append(
