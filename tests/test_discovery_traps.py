@@ -163,6 +163,32 @@ def test_an_initial_value_that_is_the_first_sample_is_told():
     assert told >= 2
 
 
+def test_an_initial_value_that_is_wrong_is_told():
+    # An offset of the sensor does nearly what it does, and was named.
+    t = np.linspace(0.0, 8.0, 80)
+    model = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"h": u["q"] - p["k"] * s["h"]},
+        states={"h": "m"},
+        parameters=[tc.Parameter("k", low=0.0, initial=0.4)],
+    )
+    q = 0.3 + 0.2 * (np.sin(t) > 0)
+    exact = [1.0]
+    for k in range(79):
+        fine = solve_ivp(
+            lambda s, h, k=k: np.interp(s, t, q) - 0.5 * h, (t[k], t[k + 1]), [exact[-1]], rtol=1e-9, atol=1e-12
+        )
+        exact.append(fine.y[0, -1])
+    h = np.array(exact) + 0.02 * np.random.default_rng(1).standard_normal(80)
+    found = {}
+    for given in (1.0, 1.15):
+        run = tc.Run(time=t, outputs={"h": h}, inputs={"q": q}, initial={"h": given})
+        found[given] = diagnose(model, tc.Recording(runs=[run]), list(tc.terms.sensor("h", dynamic=False)))
+    assert found[1.0].verdict == "consistent"
+    assert found[1.15].verdict != "consistent"
+    rows = [row for row in found[1.15].symptoms if row.startswith("h(0) was given as 1.15 and is ")]
+    assert abs(float(rows[0].split()[7]) - 1.0) < 0.06
+
+
 def test_an_exact_initial_value_is_not_blamed_for_what_is_missing():
     t = np.linspace(0.0, 5.0, 60)
     n = solve_ivp(lambda _, n: -0.3 * n - 0.4 * n**2, (0, 5), [1.0], t_eval=t, rtol=1e-9, atol=1e-12).y[0]

@@ -12,7 +12,7 @@ from torchcal.discovery.decision import Decision
 from torchcal.discovery.embedded import embed_each, model_error_sd
 from torchcal.discovery.experiment import propose
 from torchcal.discovery.fitting import Fitted
-from torchcal.discovery.given import from_samples, held_otherwise
+from torchcal.discovery.given import begun_elsewhere, held_otherwise
 from torchcal.discovery.likeliest import settled
 from torchcal.discovery.limits import limits
 from torchcal.discovery.model import Model
@@ -91,7 +91,7 @@ def conclude(
     apart = unlike(search, left) if decision.verdict in ("consistent", "named") else []
     any_unlike = bool(apart)
     if decision.verdict != "consistent":
-        apart = [*from_samples(search), *more_than_replicates(search, left), *apart]
+        apart = [*begun_elsewhere(search), *more_than_replicates(search, left), *apart]
     if decision.verdict in ("ambiguous", "unexplained"):
         apart = [*held_otherwise(search), *apart]
     remaining, depends = 0.0 if decision.verdict == "consistent" else 1.0, ""

@@ -18,13 +18,13 @@ from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators import Trajectories
 from torchcal.simulators.layout import initial_name
 
-__all__ = ["as_good", "coarser", "from_samples", "held_otherwise"]
+__all__ = ["as_good", "begun_elsewhere", "coarser", "held_otherwise"]
 
 #: χ² of the base up to which double precision still tells log evidences apart by a hundredth.
 DIGITS = 1e14
 #: Probability by chance of what is left, from which on it is noise; and noise sd up to which an initial value that is
-#: found free is the one that was given.
-NOISE, CONFIRMED = 0.05, 0.2
+#: found free is the one that was given: of one given as the first value recorded, and of any other.
+NOISE, CONFIRMED, ELSEWHERE = 0.05, 0.2, 1.0
 #: Change of an input from sample to sample, in its sd, from which on it matters how it goes on between them.
 FAR = 0.5
 #: How inputs may go on that go on in a way that can be mistaken for it.
@@ -41,42 +41,58 @@ def coarser(base: Fitted) -> float:
     return max(1.0, math.sqrt(base.chi2 / DIGITS)) if isinstance(base.problem.recording.noise, Tensor) else 1.0
 
 
-def from_samples(search: Search) -> list[str]:
-    """Initial values that were given as the first sample recorded, in words, where noise alone is left without them."""
-    base, recording = search.base, search.problem.recording
-    bound = base.problem.simulator
-    if search.exact or search.stop.is_set() or recording.runs is None or not isinstance(bound, Trajectories):
+def begun_elsewhere(search: Search) -> list[str]:
+    """Initial values of recorded states that were given, in words, where noise alone is left without them.
+
+    Those given as the first sample, noise and all, are doubted before the others.
+    """
+    bound, runs = search.base.problem.simulator, search.problem.recording.runs
+    if search.exact or search.stop.is_set() or runs is None or not isinstance(bound, Trajectories):
         return []
     shown = [
         {state: output for output, state in bound.ode.reads.items()
-         if state in run.initial and state not in bound.ode.initial and output in run.outputs
-         and run.initial[state] == float(run.outputs[output][0])}
-        for run in recording.runs
+         if state in run.initial and state not in bound.ode.initial and output in run.outputs}
+        for run in runs
     ]  # fmt: skip
+    first = [
+        {state: output for state, output in mine.items() if run.initial[state] == float(run.outputs[output][0])}
+        for run, mine in zip(runs, shown, strict=True)
+    ]
+    if moved := _moved(search, first, CONFIRMED):
+        it, was = ("it", "was") if len(moved) == 1 else ("them", "were")
+        return [
+            f"{', '.join(moved)} {was} given as the first value recorded, noise and all: with {it} unknown (left out "
+            "of initial=) the base leaves no more than noise"
+        ]
+    return [
+        f"{full} was given as {given:.4g} and is {found:.4g} where it is unknown (left out of initial=): the base "
+        "leaves no more than noise then"
+        for full, (given, found) in ({} if first == shown else _moved(search, shown, ELSEWHERE)).items()
+    ]
+
+
+def _moved(search: Search, shown: Sequence[Mapping[str, str]], least: float) -> dict[str, tuple[float, float]]:
+    """Of the states of each run, with the outputs that show them, the initial values that move by more than so many
+    noise sd where they are free, by name: as given, and as found. None where more than noise is left then."""
+    recording = search.problem.recording
+    runs = recording.runs or ()
     taken = {
-        initial_name(state, r, len(recording.runs)): (output, r, run.initial[state])
-        for r, (run, mine) in enumerate(zip(recording.runs, shown, strict=True)) for state, output in mine.items()
+        initial_name(state, r, len(runs)): (output, r, run.initial[state])
+        for r, (run, mine) in enumerate(zip(runs, shown, strict=True)) for state, output in mine.items()
     }  # fmt: skip
     if not taken:
-        return []
+        return {}
     found = _refitted(
-        search, base, recording.without_initial([list(mine) for mine in shown]),
+        search, search.base, recording.without_initial([list(mine) for mine in shown]),
         {full: value for full, (_, _, value) in taken.items()},
     )  # fmt: skip
     if found is None or not _noise_alone(search, found):
-        return []
+        return {}
     sd = recording.split(search.noise.sd)
-    moved = [
-        full for full, (name, r, value) in taken.items()
-        if abs(found.by_name[full] - value) > CONFIRMED * float(sd[name][recording.x["run"] == r].median())  # type: ignore[index]
-    ]  # fmt: skip
-    if not moved:
-        return []
-    it, was = ("it", "was") if len(moved) == 1 else ("them", "were")
-    return [
-        f"{', '.join(moved)} {was} given as the first value recorded, noise and all: with {it} unknown (left out of "
-        "initial=) the base leaves no more than noise"
-    ]
+    return {
+        full: (value, found.by_name[full]) for full, (name, r, value) in taken.items()
+        if abs(found.by_name[full] - value) > least * float(sd[name][recording.x["run"] == r].median())  # type: ignore[index]
+    }  # fmt: skip
 
 
 def other_hold(search: Search, part: Fitted) -> Fitted | None:
