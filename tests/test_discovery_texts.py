@@ -110,7 +110,7 @@ def captured(monkeypatch, base, recording, terms):
         seen.append((search, shown))
         return locate(search, shown, **kwargs)
 
-    monkeypatch.setattr(sys.modules["torchcal.discovery.diagnose"], "locate", spy)  # of that name is a function, too
+    monkeypatch.setattr(sys.modules["torchcal.discovery.conclude"], "locate", spy)
     tc.diagnose(base, recording, terms, progress=False)
     return seen[0]
 
@@ -506,6 +506,15 @@ def test_noise_that_is_given_too_large_is_a_symptom(given, told):
     d = tc.diagnose(base, tc.Recording(x=x, y=y, noise=noise), [bend], progress=False)
     lines = [line for line in d.symptoms if "times the noise sd that was given" in line]
     assert [line.split(" is white")[0] for line in lines] == [f"the residual of {name}" for name in told]
+
+
+def test_noise_that_is_given_too_small_says_of_what():
+    x, generator = torch.linspace(-1, 1, 60, dtype=F64), torch.Generator().manual_seed(2)
+    base = tc.Simulator(lambda x, p: {"y": p["a"] * x, "z": p["b"] + 0 * x}, [tc.Parameter("a"), tc.Parameter("b")])
+    y = {"y": x + 0.01 * torch.randn(60, generator=generator, dtype=F64),
+         "z": 1 + 1.0 * torch.randn(60, generator=generator, dtype=F64)}  # fmt: skip
+    d = tc.diagnose(base, tc.Recording(x=x, y=y, noise=0.01), [], progress=False)
+    assert any(row.startswith("the fastest part of the residual of z is ") for row in d.symptoms)
 
 
 @pytest.mark.parametrize("given", [0.01, 0.5])

@@ -57,9 +57,13 @@ def symptoms(search: Search, best: Model | None) -> list[str]:
         # A misfit that is smooth on coarse spacing passes for fast: what leaves less tells more of the noise.
         leader = best or search.physical_leader
         left = base if leader is None or leader.found.chi2 > base.chi2 else leader.found
-        doubted = estimate(left.problem, left.residual, left.jacobian, search.problem.recording.noise).doubted
-        if doubted > 1:
-            rows.append(f"the residual's fastest part is {doubted:.1f} times the noise sd that was given")
+        again = estimate(left.problem, left.residual, left.jacobian, search.problem.recording.noise)
+        if again.doubted > 1:
+            outputs = search.problem.recording.outputs
+            of = f" of {outputs[int(again.sizes[:, 0].argmax())]}" if len(outputs) > 1 else ""
+            rows.append(
+                f"the fastest part of the residual{of} is {again.doubted:.1f} times the noise sd that was given"
+            )
     if search.coarser > 1:
         rows.append(
             f"the calibrated base misses the data by so many times the noise sd that was given that arithmetic cannot "

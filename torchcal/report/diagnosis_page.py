@@ -146,7 +146,7 @@ def _facts(diagnosis: Any) -> str:
         facts.append(
             (
                 "probability of so much misfit by noise alone",
-                in_digits(diagnosis.p_detect, 2) if diagnosis.p_detect else "<1e−300",
+                in_digits(diagnosis.p_detect, 2) if diagnosis.p_detect >= 0.001 else "<0.001",
             )
         )
     if _has(diagnosis, "confidence"):
