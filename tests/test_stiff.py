@@ -13,7 +13,7 @@ import torchcal as tc
 from torchcal.discovery.fitting import fit
 from torchcal.discovery.problem import Problem
 from torchcal.discovery.sharpen import sharpen
-from torchcal.errors import DomainError
+from torchcal.errors import DomainError, SimulatorError
 from torchcal.inference.summary import settings_of
 from torchcal.results.reading import _with_steps
 from torchcal.simulators import Trajectories, outgrown, settled, settled_implicitly, workable
@@ -177,6 +177,16 @@ def test_a_solution_that_is_not_stiff_has_explicit_steps():
         bound = fast().bind(FOLLOWED)
         assert not settled(bound, tensor(k)[None], ALLOWED).implicit
         assert not workable(bound, tensor(k)[None], ALLOWED).implicit
+
+
+def test_implicit_steps_are_not_tried_where_they_are_not_wanted():
+    bound, point = fast().bind(FOLLOWED), tensor(3e4)[None]
+    assert settled(bound, point, ALLOWED).implicit
+    with pytest.raises(SimulatorError, match="after 3 times"):
+        settled(bound, point, ALLOWED, halvings=3, switch=False)
+    # Steps that are implicit already stay so.
+    implicit = fast(stiff=True).bind(FOLLOWED)
+    assert settled(implicit, point, ALLOWED, halvings=3, switch=False).implicit
 
 
 def test_what_the_user_says_of_stiffness_holds():
