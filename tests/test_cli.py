@@ -2,13 +2,16 @@
 
 import importlib.metadata
 import json
+import os
 import subprocess
 import sys
 
 import pytest
+import torch
 
 import torchcal as tc
 from torchcal import cli
+from torchcal.errors import TorchcalWarning, warn
 
 PROBLEM = """
 import torch
@@ -143,6 +146,23 @@ def test_it_tells_its_version(capsys):
         cli.main(["--version"])
     assert stop.value.code == 0
     assert capsys.readouterr().out == f"torchcal {importlib.metadata.version('torchcal')}\n"
+
+
+def test_a_terminal_without_greek_letters_costs_nothing(problem):
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii"}
+    command = [sys.executable, "-m", "torchcal.cli", "calibrate", str(problem), "--quiet"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert r"E[\u03bb]" in done.stdout
+
+
+def test_a_warning_inside_an_autograd_function_is_told_of_the_users_line():
+    inner = {"__name__": "torchcal.simulators.external", "warn": warn, "Warned": TorchcalWarning}
+    exec("def forward(context, x):\n    warn('a worker died', Warned)\n    return x.clone()", inner)
+    function = type("Calling", (torch.autograd.Function,), {"forward": staticmethod(inner["forward"])})
+    with pytest.warns(TorchcalWarning) as told:
+        function.apply(torch.ones(2))
+    assert [item.filename for item in told] == [__file__]
 
 
 def test_an_interruption_ends_quietly(problem, capsys, monkeypatch):

@@ -1,6 +1,7 @@
 """Figures: what is drawn equals what was given, every axis has its unit, nothing else is touched."""
 
 import math
+import pickle
 
 import matplotlib
 import matplotlib.pyplot as plt
@@ -576,6 +577,61 @@ def test_the_legend_hides_no_curve(line):
             points = item.get_transform().transform(item.get_xydata())
             inside = (points > [box.x0, box.y0]).all(-1) & (points < [box.x1, box.y1]).all(-1)
             assert not inside.any()
+
+
+def test_the_factor_of_the_ticks_follows_the_limits_and_the_label():
+    ax = style.new_axes(None)
+    ax.plot([0, 1], [0, 2e9])
+    ax.set_xlabel("t [s]")
+    ax.set_ylabel("y [m]")
+    style.dress(ax)
+    draw = ax.figure.canvas.draw
+    draw()
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("t [s]", "y [1e9 m]")
+    ax.set_ylim(0, 2e12)
+    draw()
+    draw()
+    assert ax.get_ylabel() == "y [1e12 m]"
+    ax.set_ylabel("density of what flows out [1/Pa]")
+    draw()
+    assert ax.get_ylabel() == "density of what flows out\n[1e12/Pa]"
+    ax.set_ylabel("y")
+    style.dress(ax)
+    draw()
+    assert ax.get_ylabel() == "y [1e12]"
+    ax.set_ylim(0, 2)
+    draw()
+    assert ax.get_ylabel() == "y"
+    ax.set_ylim(101325, 101325.02)
+    ax.set_ylabel("p [Pa], ±1 sd")
+    draw()
+    assert ax.get_ylabel() == "p − 101325 [Pa], ±1 sd"
+    ax.set_ylabel("")
+    draw()
+    assert ax.get_ylabel() == ""
+    assert ax.yaxis.get_offset_text().get_text().endswith("1.01325e5")  # there is no label to tell it
+    ax.set_ylim(0, 1e9)
+    ax.set_ylabel("y [m]")
+    again = pickle.loads(pickle.dumps(ax.figure))
+    again.canvas.draw()
+    assert again.axes[0].get_ylabel() == "y [1e9 m]"
+
+
+def test_axes_that_share_their_ticks_all_tell_the_factor():
+    _, axes = plt.subplots(1, 2, sharey=True)
+    for ax in axes:
+        ax.plot([0, 1], [0, 1e9])
+        ax.set_ylabel("y [m]")
+        style.dress(ax)
+    axes[0].figure.canvas.draw()
+    assert [ax.get_ylabel() for ax in axes] == ["y [1e9 m]"] * 2
+
+
+def test_a_surface_tells_the_factor_of_its_ticks():
+    grid = torch.linspace(0, 1, 6, dtype=F64)
+    ax = plots.surface(1e-9 * grid, grid, 1e12 * (grid[:, None] + grid), names=("p", "q", "w"), units={"w": "W"})
+    ax.figure.canvas.draw()
+    assert [ax.get_xlabel(), ax.get_ylabel(), ax.get_zlabel()] == ["p [1e−9]", "q", "w [1e12 W]"]
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Figures of a diagnosis: what is drawn equals what was given, and nothing hides anything else."""
 
 import math
+import re
 from types import SimpleNamespace
 
 import matplotlib
@@ -361,7 +362,7 @@ def test_a_detailed_simulation_has_no_noise_band():
 
 def test_the_noise_band_is_as_wide_as_the_noise_of_each_datum():
     x = torch.logspace(-1, 2.5, 30, dtype=F64)
-    sd = 0.02 * x**0.6
+    sd = 0.02 * x**0.19
     recording = Recording(x={"g": x}, y={"tau": x**0.6}, noise=sd)
     model = NoiseModel({"tau": float(sd.median())}, {"tau": 0.0}, "given")
     for options in ({"noise": model}, {}, {"noise": NoiseModel({"tau": sd}, {"tau": 0.0}, "estimated")}):
@@ -372,6 +373,26 @@ def test_the_noise_band_is_as_wide_as_the_noise_of_each_datum():
     twice = Recording(x=torch.tensor([1.0, 1.0, 2.0]), y=[0.0, 0.1, 0.2], noise=[0.3, 0.4, 0.1])
     ax = plots.residual_map(twice, torch.zeros(3))  # of data at one place the root mean square
     assert ax.collections[0].get_datalim(ax.transData).y1 == pytest.approx(2 * math.sqrt((0.09 + 0.16) / 2))
+
+
+@pytest.mark.parametrize("samples", [30, 60])
+def test_residuals_are_in_units_of_a_noise_that_grows_over_decades(samples):
+    x = torch.logspace(-1, 2.5, samples, dtype=F64)
+    sd = 0.02 * x**0.6
+    recording = Recording(x={"g": x}, y={"tau": x**0.6}, noise=sd, units={"tau": "m"})
+    aside = torch.zeros(samples, dtype=torch.bool)
+    aside[3] = True
+    ax = plots.residual_map(recording, recording.y - 3 * sd, set_aside=aside)
+    assert ax.get_ylabel() == "(data − model) / noise sd, tau"
+    many = samples > 40
+    np.testing.assert_allclose(curve(ax, "base model" + ", local mean" * many).get_ydata(), 3.0)
+    np.testing.assert_allclose(curve(ax, "set aside as outliers").get_ydata(), [3.0])
+    (band,) = [item for item in ax.patches if item.get_label() == "±2 noise sd"]
+    assert (band.get_y(), band.get_height()) == (-2, 4)
+    even = plots.residual_map(recording, recording.y - 3 * sd, noise=0.1 * torch.ones(samples, dtype=F64))
+    assert even.get_ylabel() == "data − model, tau [m]"
+    recording = Recording(x={"g": x}, y={"tau": x**0.6}, noise=0.02 * x**0.19, units={"tau": "m"})
+    assert plots.residual_map(recording, recording.y).get_ylabel() == "data − model, tau [m]"
 
 
 def test_a_driver_over_decades_has_a_logarithmic_axis():
@@ -478,6 +499,29 @@ def test_the_same_terms_in_another_region_are_told_apart():
     ]
     names = [text.get_text() for text in plots.ranking(rows).get_yticklabels()]
     assert names == ["leak, h < 0.2", "leak", "leak + lag", "base model alone"]
+
+
+LONG = "heat that is lost through the wall of the "
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        [(LONG + "left chamber",), (LONG + "right chamber",), (LONG + "left chamber", "lag")],
+        [(LONG + f"{side} chamber, which nobody insulated",) for side in ("left", "right", "lower left")],
+        [(LONG + "wall of the " * n + "chamber, which nobody insulated at all",) for n in range(4)],
+        [("lag",), ("leak",)],
+    ],
+)
+def test_long_names_are_told_apart_where_they_are_shortened(names):
+    rows = [Hypothesis(terms, 9.0 - i, 0.1) for i, terms in enumerate(names)]
+    rows += [Hypothesis(names[0], 2.0, 0.1, region=f"the temperature of the outer wall {sign} 281") for sign in "<>"]
+    shown = [text.get_text() for text in plots.ranking(rows).get_yticklabels()]
+    assert len(set(shown)) == len(rows)
+    assert max(map(len, shown)) <= 48
+    limits = [Limit(terms[0], "c", 0.1, None, 0.9) for terms in dict.fromkeys(terms[:1] for terms in names)]
+    shown = [text.get_text() for text in plots.detection_limits(limits).get_yticklabels()]
+    assert len(set(shown)) == len(limits)
 
 
 # --- shift, rate -----------------------------------------------------------------------------------------
@@ -621,6 +665,32 @@ def test_nothing_is_cut_off_or_hidden(make):
             assert not overlaps(one.get_tightbbox().padded(-1.5), other.get_tightbbox().padded(-1.5))
 
 
+@pytest.mark.parametrize("factor", [1e-18, 1e11])
+def test_the_factor_of_the_ticks_is_in_the_label_and_under_no_legend(factor):
+    d = cooling()
+    unit = {name: "Pa" for name in d.recording.outputs}
+    small = Recording(x=d.recording.x, y={name: factor * y for name, y in d.recording.split(d.recording.y).items()},
+                      noise=factor * 0.1, units={**d.recording.units, **unit})  # fmt: skip
+    base = factor * d.base.prediction
+    late = torch.arange(len(small.y)) > 0.8 * len(small.y)
+    for draw in (plots.both_fits, plots.residual_map, lambda *args: plots.held_out(*args, None, late)):
+        ax = draw(small, base)
+        ax.figure.canvas.draw()
+        assert ax.yaxis.get_offset_text().get_text() == ""
+        power = re.search(r"\[1e(−?\d+) Pa\]$", ax.get_ylabel())
+        tick = ax.get_yticklabels()[-2]
+        told = float(tick.get_text().replace("−", "-")) * 10.0 ** int(power[1].replace("−", "-"))
+        assert told == pytest.approx(tick.get_position()[1], rel=1e-6)
+
+
+def test_the_factor_of_the_scores_is_in_their_label():
+    part = Score(1.0, -7.89e11, 0.0, 4)
+    axes = plots.held_out_scores(Scores(part, None, None, None))
+    axes[0].figure.canvas.draw()
+    assert axes[1].get_xlabel() == "log score [1e11 nat]"
+    assert axes[1].xaxis.get_offset_text().get_text() == ""
+
+
 def test_overview_draws_in_a_given_figure():
     figure = plt.figure(figsize=(11, 9))
     (part,) = figure.subfigures(1, 1, squeeze=False).flat
@@ -646,11 +716,11 @@ def test_values_of_a_hidden_driver_come_from_the_diagnosis():
 
 
 def test_a_dollar_in_a_name_is_no_mathematics():
-    ax = plots.ranking([Hypothesis((NASTY,), 1.0, 1.0), Hypothesis((), 0.0, 0.0)])
+    ax = plots.ranking([Hypothesis((name,), 1.0, 1.0) for name in (NASTY[25:], NASTY)])
     ax.figure.canvas.draw()
-    shown = ax.get_yticklabels()[0].get_text()
-    assert r"\$" in shown
-    assert len(shown) <= 48
+    shown = [name.get_text() for name in ax.get_yticklabels()]
+    assert r"\$" in shown[0]
+    assert max(map(len, shown)) <= 48
 
 
 @pytest.mark.parametrize("pair", [(discovery.BASE, discovery.ACCEPTED), (discovery.HELD_OUT, discovery.ACCEPTED)])

@@ -371,6 +371,7 @@ A = [tc.Parameter("a")]
     [
         ({"name": ""}, "a term's name"),
         ({"name": 3}, "a term's name"),
+        *[({"name": f"b{letter}c"}, "in one line, without control") for letter in "\n\t\r\0\x1b\x85\u2028"],
         ({"name": "n", "equation": "v"}, "equation= and rate= together"),
         ({"name": "n", "rate": RATE}, "equation= and rate= together"),
         ({"name": "n", "equation": "v", "rate": RATE, "rates": {"v": RATE}}, "one rate for 'v'"),
@@ -420,6 +421,11 @@ def test_the_same_term_twice_is_refused() -> None:
     term = BY_HAND["rate"][0]
     with pytest.raises(DomainError, match=r"drag.d.*more than once"):
         extend(body(), [term, term])
+
+
+def test_any_letters_make_a_name() -> None:
+    name = "évaporation: τ₂·x² → ∞ 水 (π/2)"
+    assert tc.Term(name, frees=("k",)).name == name
 
 
 def test_how_a_term_prints_and_what_it_calls_its_parameters() -> None:

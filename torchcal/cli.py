@@ -8,6 +8,7 @@ import argparse
 import importlib.metadata
 import importlib.util
 import inspect
+import io
 import os
 import sys
 import traceback
@@ -37,6 +38,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit status: 0, 1 after an error of torchcal's or of the problem's file, 2 for a wrong command line, 130
         after Ctrl-C.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal without ± must not cost the result
+            stream.reconfigure(errors="backslashreplace")
     given = _parser().parse_args(arguments)
     try:
         given.run(given)

@@ -4,7 +4,6 @@ Every exception says what was expected, what came, and what to do. Every warning
 trust is a category of its own, so that a caller can filter it or turn it into an error.
 """
 
-import os
 import sys
 import warnings
 
@@ -31,13 +30,14 @@ __all__ = [
     "WorkerWarning",
 ]
 
-_HERE = os.path.join(os.path.dirname(__file__), "")
+#: Packages in which nobody can do anything about a warning; torch's and Pyro's call torchcal back.
+_INNER = ("torchcal", "torch", "pyro")
 
 
 def warn(message: str, category: type[Warning]) -> None:
-    """Warn at the line outside torchcal that led here, which is where something can be done about it."""
+    """Warn at the user's line that led here, outside `_INNER`, which is where something can be done about it."""
     level, frame = 2, sys._getframe(1)
-    while frame.f_back is not None and frame.f_code.co_filename.startswith(_HERE):
+    while frame.f_back is not None and str(frame.f_globals.get("__name__")).partition(".")[0] in _INNER:
         level, frame = level + 1, frame.f_back
     warnings.warn(message, category, stacklevel=level)
 

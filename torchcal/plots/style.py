@@ -1,6 +1,7 @@
 """One look for every figure, set on the axes themselves so that ``rcParams`` stay as the user has them."""
 
 import re
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -12,8 +13,20 @@ from torchcal.errors import DomainError, ShapeError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
 
-__all__ = ["array", "dress", "label", "legend", "new_axes", "number", "per_unit", "pretty"]
+__all__ = [
+    "array",
+    "dress",
+    "label",
+    "legend",
+    "new_axes",
+    "number",
+    "per_unit",
+    "pretty",
+    "scale_in_label",
+    "wrapped",
+]
 
 # The lightness (CIE L*, in brackets) is what is left of a colour in grey: those drawn together differ by 20.
 DATA = "black"
@@ -70,11 +83,23 @@ def new_axes(ax: Any, size: tuple[float, float] = (5.0, 3.6), *, three_d: bool =
 
 
 def dress(ax: "Axes") -> None:
-    """Thin spines on two sides, small ticks."""
+    """Thin spines on two sides, small ticks, and what they are multiples of in the labels."""
     for side, spine in ax.spines.items():
         spine.set_linewidth(0.6)
         spine.set_visible(side in ("left", "bottom"))
     ax.tick_params(width=0.6, length=3, labelsize="small")
+    scale_in_label(ax.xaxis, ax.yaxis)
+
+
+def scale_in_label(*axes: "Axis") -> None:
+    """Have the factor of each axis's ticks written in its label, not in a corner where other text lies."""
+    from matplotlib.ticker import ScalarFormatter
+
+    from torchcal.plots.scales import Scaled
+
+    for axis in axes:
+        if type(axis.get_major_formatter()) is ScalarFormatter:
+            axis.set_major_formatter(Scaled())
 
 
 def legend(ax: "Axes", title: str | None = None, *, beside: bool = False) -> None:
@@ -153,6 +178,14 @@ def label(name: str, units: Mapping[str, str] | None = None, labels: Mapping[str
     shown = (labels or {}).get(name, pretty(name))
     unit = (units or {}).get(name)
     return f"{shown} [{unit}]" if unit else shown
+
+
+def wrapped(text: str) -> str:
+    """An upright axis label, in lines that a small panel has room for; units and mathematics are not broken."""
+    if len(text) <= 30 or "$" in text.replace(r"\$", ""):
+        return text
+    held = re.sub(r"\[[^\[\]]*\]", lambda unit: re.sub(r"\s", "\xa0", unit[0]), text)
+    return textwrap.fill(held, 30).replace("\xa0", " ")
 
 
 def per_unit(what: str, unit: str | None) -> str:

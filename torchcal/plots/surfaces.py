@@ -108,6 +108,7 @@ def surface(
         axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
         axis.pane.set_visible(False)
         axis._axinfo["grid"].update(linewidth=0.3, color="0.8")
+    style.scale_in_label(ax.xaxis, ax.yaxis, ax.zaxis)
     ax.view_init(elev=22, azim=-55)
     ax.set_box_aspect(None, zoom=0.9)
     if legend:

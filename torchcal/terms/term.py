@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import math
+import unicodedata
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -27,6 +28,9 @@ from torchcal.simulators import (
 __all__ = ["Term", "extend", "outer"]
 
 Function = Callable[..., Any]
+
+#: Unicode's categories of control characters and of line and paragraph separators: they would break a table's rows.
+BREAKS = ("Cc", "Zl", "Zp")
 
 
 class _Own(Values):
@@ -126,6 +130,11 @@ class Term:
     ) -> None:
         if not isinstance(name, str) or not name:
             raise DomainError(f"Expected a term's name (a non-empty string). Got {name!r}.")
+        if any(unicodedata.category(letter) in BREAKS for letter in name):
+            raise DomainError(
+                f"Expected a term's name in one line, without control characters. Got {name!r} (use spaces; "
+                "description= takes a sentence)."
+            )
         if (name,) == NONE:
             raise DomainError(f"Expected a term's name other than {name!r}, which stands for what is in no list.")
         if (equation is None) != (rate is None):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from torchcal.display import NONE, percent
 from torchcal.errors import DomainError
 from torchcal.plots import style
-from torchcal.plots.discovery.pieces import ACCEPTED, beside, draw_key, finite, join_terms, plain, signed
+from torchcal.plots.discovery.pieces import ACCEPTED, beside, draw_key, finite, signed, told_apart
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -88,8 +88,7 @@ def ranking(
             widths = [max(numbers[i], floor) if math.isfinite(numbers[i]) else 0.0 for i in places]
             ax.barh(places, widths, height=0.66, lw=0.7, label=name, zorder=3, **options)
     ax.axvline(0.0, color="0.25", lw=0.7, zorder=4)
-    names = [_name(item) for item in rows]
-    ax.set_yticks(range(len(rows)), names)
+    ax.set_yticks(range(len(rows)), told_apart([_name(item) for item in rows]))
     ax.set_ylim(len(rows) - 0.4, -0.6)
     low = min([number for number in numbers if math.isfinite(number)], default=0.0)
     ax.set_xlim(max(min(low, 0.0) * 1.05, floor), max(top, 0.01) * 1.05 if value == "log_evidence" else 1.0)
@@ -112,4 +111,4 @@ def _name(item: Any) -> str:
     region = getattr(item, "region", None)
     if not item.terms:
         return "base model alone"
-    return plain(f"{' + '.join(item.terms)}, {region}") if region else join_terms(item.terms)
+    return " + ".join(item.terms) + (f", {region}" if region else "")

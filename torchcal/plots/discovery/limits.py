@@ -8,7 +8,7 @@ import numpy as np
 
 from torchcal.errors import DomainError
 from torchcal.plots import style
-from torchcal.plots.discovery.pieces import ACCEPTED, NOISE, beside, draw_key, finite, plain
+from torchcal.plots.discovery.pieces import ACCEPTED, NOISE, beside, draw_key, finite, plain, told_apart
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -50,7 +50,9 @@ def detection_limits(limits: Iterable[Any], *, most: int = 16, ax: "Axes | None"
     ax.axvspan(low, 1.0, facecolor=NOISE, lw=0, zorder=0, label="too small to be seen in these data")
     ax.axvline(1.0, color="0.25", lw=1.0, zorder=2)
     terms = [item.term for item in rows]
-    names = [plain(item.term if terms.count(item.term) == 1 else f"{item.term}.{item.parameter}") for item in rows]
+    names = told_apart(
+        [item.term if terms.count(item.term) == 1 else f"{item.term}.{item.parameter}" for item in rows]
+    )
     for i, (item, value) in enumerate(zip(rows, ratios, strict=True)):
         if math.isfinite(value):
             place = min(max(value, low), high)

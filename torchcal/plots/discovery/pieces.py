@@ -1,7 +1,6 @@
 """What the figures of a diagnosis share: colours, axes, legends, and numbers of what they were given."""
 
 import math
-import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -23,6 +22,7 @@ HELD_OUT = "#e4e4e4"  # grey (91)
 NOISE = "#d9d9d9"  # grey (87)
 LOCATED, EDGE = style.ADDITIVE_BAND, style.ADDITIVE
 DENSE = 80  # data in one panel above which each is a dot instead of a circle
+MOST_LETTERS = 44  # of a user's text on a figure
 MOST_POINTS = 2000  # drawn in one panel; more cannot be told apart
 
 
@@ -42,7 +42,7 @@ class Look:
         """A quantity's name; "t" is time where a recording has one."""
         if name == "t" and name not in self.units and "time" in self.units:
             name = "time"
-        return self.labels.get(name, plain(name, 28))
+        return self.labels.get(name, plain(name, 28, middle=True))
 
     def unit(self, name: str) -> str | None:
         """A quantity's unit, where it has one."""
@@ -91,7 +91,7 @@ def is_log(values: np.ndarray) -> bool:
 def finish(ax: "Axes", x_label: str, y_label: str, title: str) -> None:
     """Label an axes and give it the common look."""
     ax.set_xlabel(x_label)
-    ax.set_ylabel(y_label if len(y_label) <= 30 or "$" in y_label.replace(r"\$", "") else textwrap.fill(y_label, 30))
+    ax.set_ylabel(style.wrapped(y_label))
     if title:
         ax.set_title(title, fontsize="small", loc="left")
     ax.margins(x=0.03)
@@ -161,16 +161,49 @@ def _across(names: Sequence[str], inches: float) -> int:
     return 1
 
 
-def plain(text: Any, most: int = 44) -> str:
-    """A user's text on a figure: one line, no mathematics by accident, not too long."""
+def plain(text: Any, most: int = MOST_LETTERS, *, middle: bool = False) -> str:
+    """A user's text on a figure: one line, no mathematics by accident, not too long.
+
+    Args:
+        text: Any.
+        most: Largest number of letters.
+        middle: Whether what is too much is left out of the middle: names often differ at their ends.
+    """
     text = " ".join(str(text).split())
-    text = text if len(text) <= most else text[: most - 1].rstrip() + "…"
+    if len(text) > most:
+        end = (most - 1) // 2 if middle else 0
+        text = text[: most - 1 - end].rstrip() + "…" + text[len(text) - end :].lstrip()
     return text.replace("$", r"\$")
+
+
+def told_apart(texts: Sequence[str], most: int = MOST_LETTERS) -> list[str]:
+    """Users' texts on one figure: different ones stay different where they are shortened."""
+    texts = [" ".join(text.split()) for text in texts]
+    short = [plain(text, most, middle=True) for text in texts]
+    shown: list[str] = []
+    for text, alike in zip(texts, short, strict=True):
+        others = [other for other, name in zip(texts, short, strict=True) if name == alike and other != text]
+        if others:  # they differ in the middle alone: begin shortly before that
+            place = max(_alike(text, other) for other in others)
+            head = text[: most // 4].rstrip()
+            alike = plain(f"{head}…{text[max(place - most // 4, len(head)) :]}", most)
+        shown.append(alike)
+    return [
+        name if all(text == other for other, same in zip(texts, shown, strict=True) if same == name)
+        else f"{name} ({1 + list(dict.fromkeys(texts)).index(text)})"
+        for text, name in zip(texts, shown, strict=True)
+    ]  # fmt: skip
+
+
+def _alike(first: str, second: str) -> int:
+    """How many letters two texts begin with in common."""
+    differing = (i for i, (a, b) in enumerate(zip(first, second, strict=False)) if a != b)
+    return next(differing, min(len(first), len(second)))
 
 
 def join_terms(terms: Iterable[str]) -> str:
     """A hypothesis by the names of its terms."""
-    return plain(" + ".join(str(term) for term in terms))
+    return plain(" + ".join(str(term) for term in terms), middle=True)
 
 
 def as_numbers(value: Any, what: str, length: int | None = None) -> np.ndarray:

@@ -31,6 +31,9 @@ from torchcal.plots.selection import conditions_of
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+#: Largest noise sd over the smallest, above which residuals are drawn in units of it.
+UNEVEN = 5.0
+
 
 def driver_values(recording: Recording, driver: str, fitted: Any = None) -> Tensor | None:
     """Values of a driver at the recording's conditions.
@@ -75,7 +78,8 @@ def residual_map(
 ) -> "Axes":
     """Residuals, data minus model, of both models against what the mismatch varies with.
 
-    With more than 40 data their means over neighbouring data are drawn as lines.
+    With more than 40 data their means over neighbouring data are drawn as lines. Where the noise sd varies more than
+    fivefold, residuals are divided by it: in the output's unit the smallest would all look like zero.
 
     Args:
         recording: The data.
@@ -138,6 +142,11 @@ def residual_map(
             label=located if i == 0 else "_located",
         )  # fmt: skip
     sd = _noise_of(noise, recording, output)
+    unit_of = np.ones(recording.n)
+    label = f"data − model, {look.axis(output)}"
+    if sd is not None and shown.any() and 0 < UNEVEN * sd[shown].min() < sd[shown].max():
+        unit_of, sd = np.where(sd > 0, sd, np.nan), np.ones(recording.n)
+        label = f"(data − model) / noise sd, {look.shown(output)}"
     if sd is not None and shown.any():
         band: dict[str, Any] = {"facecolor": NOISE, "lw": 0, "zorder": 1, "label": "±2 noise sd", "alpha": 0.75}
         levels, which = np.unique(x[shown], return_inverse=True)
@@ -152,7 +161,7 @@ def residual_map(
     many = len(keep) > 40
     dots = keep[thinned(len(keep))]
     for fit in fits:
-        residual = y[part] - fit.values[part]
+        residual = (y[part] - fit.values[part]) / unit_of
         ax.plot(
             x[dots], residual[dots], fit.marker, ms=2.2 if many else 4.5, mfc=fit.face if not many else fit.color,
             mec="none" if many else fit.color, mew=0.9, alpha=0.3 if many else 1.0, zorder=fit.zorder - 3,
@@ -171,9 +180,9 @@ def residual_map(
                 zorder=fit.zorder,
             )  # fmt: skip
     if aside.any():
-        residual = (y - fits[-1].values)[part]
+        residual = (y - fits[-1].values)[part] / unit_of
         ax.plot(x[aside], residual[aside], "x", ms=5, mew=1.1, color="0.25", zorder=5, label="set aside as outliers")
-    finish(ax, look.axis(driver), f"data − model, {look.axis(output)}", "")
+    finish(ax, look.axis(driver), label, "")
     if legend:
         draw_key(ax)
     return ax
