@@ -1,17 +1,19 @@
 """The command `torchcal`."""
 
+import functools
 import importlib.metadata
 import json
 import os
 import subprocess
 import sys
+import warnings
 
 import pytest
 import torch
 
 import torchcal as tc
 from torchcal import cli
-from torchcal.errors import TorchcalWarning, warn
+from torchcal.errors import InterruptionWarning, TorchcalWarning, warn
 
 PROBLEM = """
 import torch
@@ -139,6 +141,24 @@ def test_a_mistake_of_its_own_keeps_its_traceback(problem, monkeypatch):
     monkeypatch.setattr(cli, "diagnose", lambda *args, **options: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         cli.main(["diagnose", str(problem), "--quiet"])
+
+
+@pytest.mark.filterwarnings("default::torchcal.errors.InterruptionWarning")
+def test_what_was_cut_short_is_written_and_is_no_success(problem, tmp_path, monkeypatch):
+    whole = cli.calibrate
+
+    @functools.wraps(whole)
+    def cut_short(*args, **options):
+        warn("The sampler was interrupted.", InterruptionWarning)
+        return whole(*args, **options)
+
+    monkeypatch.setattr(cli, "calibrate", cut_short)
+    shown = warnings.showwarning
+    assert cli.main(["calibrate", str(problem), "--quiet", "--out", str(tmp_path / "kept.nc")]) == 130
+    assert (tmp_path / "kept.nc").exists()
+    assert warnings.showwarning is shown
+    monkeypatch.undo()
+    assert cli.main(["calibrate", str(problem), "--quiet"]) == 0
 
 
 def test_it_tells_its_version(capsys):

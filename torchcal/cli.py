@@ -12,13 +12,14 @@ import io
 import os
 import sys
 import traceback
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from torchcal.discovery import diagnose
-from torchcal.errors import DomainError, TorchcalError
+from torchcal.errors import DomainError, InterruptionWarning, TorchcalError
 from torchcal.files import check_target
 from torchcal.inference import calibrate
 from torchcal.results import AdditiveCalibration, Calibration
@@ -36,14 +37,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit status: 0, 1 after an error of torchcal's or of the problem's file, 2 for a wrong command line, 130
-        after Ctrl-C.
+        after Ctrl-C, also where what there was is kept.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal without ± must not cost the result
             stream.reconfigure(errors="backslashreplace")
     given = _parser().parse_args(arguments)
+    cut_short, shown = [], warnings.showwarning
+
+    def show(message: Any, category: type[Warning], *rest: Any) -> None:
+        cut_short.extend([message] if issubclass(category, InterruptionWarning) else [])
+        shown(message, category, *rest)
+
     try:
-        given.run(given)
+        with warnings.catch_warnings():
+            warnings.showwarning = show
+            given.run(given)
         sys.stdout.flush()
     except BrokenPipeError:  # whoever reads has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -60,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for note in getattr(error, "__notes__", ()):
             print(f"torchcal: {note}", file=sys.stderr)
         return 1
-    return 0
+    return 130 if cut_short else 0
 
 
 def _line(error: BaseException | None, path: Path | None) -> int | None:
