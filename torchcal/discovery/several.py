@@ -12,6 +12,7 @@ from torchcal.discovery.beginnings import blind_rows, is_far, make_up
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare, replaces
 from torchcal.discovery.explain import removed
 from torchcal.discovery.fitting import Fitted
+from torchcal.discovery.instruments import is_instrument
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.residual import Residual
 from torchcal.discovery.screen import screen
@@ -99,8 +100,8 @@ def refit_several(search: Search) -> None:
 def _either_way(search: Search, pairs: list[Model]) -> list[Model]:
     """Pairs, the leading ones with their terms the other way round where that is another model that does better.
 
-    An instrument shows what the physics gives, and a shunt bears what the leads drop; which of two terms on one output
-    comes first nobody says.
+    An instrument shows what the physics gives, and is not tried before that; which of two others on one output comes
+    first, as of a shunt and what the leads drop, nobody says.
     """
     best = max((m.weight for m in search.models if len(m.numbers) == 2 and m.window is None), default=0.0)
     leading = sorted((m for m in pairs if m.weight > best - FAR_BEHIND and _share(m)), key=lambda m: -m.weight)
@@ -108,6 +109,9 @@ def _either_way(search: Search, pairs: list[Model]) -> list[Model]:
     for pair in leading:
         if len(wanted) == TURNED:
             break
+        first, second = pair.candidate.terms
+        if is_instrument(pair, second) and not is_instrument(pair, first):
+            continue
         known, y = _turned(search, pair)
         if float(pair.found.whitening.vector(y - pair.found.y).square().sum()) < ANOTHER:
             continue
