@@ -90,6 +90,7 @@ def test_zero_noise_is_told_how_to_say_that_there_is_none():
     [
         pytest.param(lambda: tc.Parameter("a", low=2.0, high=1.0), DomainError, id="reversed bounds"),
         pytest.param(lambda: tc.Parameter("a", low=math.nan), DomainError, id="nan bound"),
+        pytest.param(lambda: tc.Parameter("a", unit=3), DomainError, id="unit that is a number"),
         pytest.param(lambda: tc.Parameter("a", low=0.0, transform="log"), DomainError, id="log of zero"),
         pytest.param(lambda: tc.Simulator(lambda x, p: x, [AB[0], AB[0]]), DomainError, id="named twice"),
         pytest.param(lambda: tc.likelihoods.ABC(epsilon=0.0), DomainError, id="zero epsilon"),

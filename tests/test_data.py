@@ -399,6 +399,17 @@ def test_noise_converts_to_the_unit_of_each_output():
     torch.testing.assert_close(recording.noise_sd, tensor([1e-3] * 3 + [1.0] * 3))
 
 
+def test_a_noise_sd_does_not_convert_between_logarithmic_and_linear_units():
+    quantity = pytest.importorskip("pint").UnitRegistry().Quantity
+    power = quantity([1.0, 2.0, 3.0], "dBm")
+    assert Recording(x=X, y=power, noise=quantity(0.5, "dBm")).noise_sd.tolist() == [0.5] * 3
+    assert Recording(x=X, y=power, noise=0.1, units={"y": "mW"}).noise_sd.tolist() == [0.1] * 3
+    told = r"Expected noise in a unit that converts to .*one of the two is logarithmic"
+    for y, noise, units in [(power, "dBm", {"y": "mW"}), (power, "mW", None), (quantity(Y, "mW"), "dBm", None)]:
+        with pytest.raises(RecordingError, match=told):
+            Recording(x=X, y=y, noise=quantity(0.5, noise), units=units)
+
+
 def test_units_that_do_not_convert():
     with pytest.raises(RecordingError, match=r"Expected x in a unit that converts to 'K'\. Got 'm': cannot"):
         Recording(x=Quantity(X, "m"), y=Y, units={"x": "K"})

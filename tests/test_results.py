@@ -1,19 +1,24 @@
 """Results: reading, printing, freezing, saving and loading, export."""
 
 import dataclasses
+import json
 import math
 import os
+import random
 import subprocess
 import sys
+import textwrap
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 import torchcal as tc
-from torchcal.errors import DomainError, TorchcalError
+from torchcal.errors import DomainError, MissingDependencyError, TorchcalError
 from torchcal.results import AdditiveCalibration, Calibration
+from torchcal.results.storage import CHECKSUM
 
 xarray = pytest.importorskip("xarray")
 
@@ -453,12 +458,12 @@ def test_a_file_is_written_whole_or_not_at_all(sampled, tmp_path, monkeypatch):
     path = tmp_path / "result.nc"
     path.write_text("precious")
 
-    def break_down(self, where, **options):
-        with open(where, "wb") as file:
-            file.write(b"half")
+    def break_down(self, data):
+        with open(self, "wb") as file:
+            file.write(data[: len(data) // 2])
         raise OSError("disk full")
 
-    monkeypatch.setattr(xarray.DataTree, "to_netcdf", break_down)
+    monkeypatch.setattr(Path, "write_bytes", break_down)
     with pytest.raises(OSError, match="disk full"):
         sampled.save(path)
     assert path.read_text() == "precious"
@@ -467,6 +472,181 @@ def test_a_file_is_written_whole_or_not_at_all(sampled, tmp_path, monkeypatch):
     sampled.save(path)
     assert Calibration.load(path).alpha_names == sampled.alpha_names
     assert os.listdir(tmp_path) == ["result.nc"]
+
+
+def test_a_full_disk_is_an_error_and_leaves_the_old_file(sampled, tmp_path):
+    """HDF5 itself takes the interpreter down with it."""
+    pytest.importorskip("resource")
+    path = tmp_path / "result.nc"
+    sampled.save(path)
+    before = path.read_bytes()
+    code = f"""
+        import resource
+        import torchcal as tc
+        result = tc.results.Calibration.load({str(path)!r})
+        resource.setrlimit(resource.RLIMIT_FSIZE, (3000, resource.RLIM_INFINITY))
+        try:
+            result.save({str(path)!r})
+        except OSError as error:
+            print("refused:", error.strerror)
+        print("alive", tc.results.Calibration.load({str(path)!r}).alpha_names)
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "refused: File too large" in done.stdout
+    assert "alive" in done.stdout
+    assert "Exception ignored" not in done.stderr
+    assert path.read_bytes() == before
+    assert os.listdir(tmp_path) == ["result.nc"]
+
+
+def rewrite(path, change, checked=False):
+    """A file with a change to its attributes' text or its groups, with or without its old checksum."""
+    with xarray.open_datatree(path, engine="h5netcdf") as file:
+        tree = file.load()
+        meta = json.loads(tree.attrs["torchcal"])
+        mark = tree.attrs[CHECKSUM]
+        tree = change(tree, meta) or tree
+    tree.attrs = {"torchcal": json.dumps(meta), **({CHECKSUM: mark} if checked else {})}
+    tree.to_netcdf(path, engine="h5netcdf")
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_a_file_without_a_checksum_is_read_as_well(name, request, tmp_path):
+    result = request.getfixturevalue(name)
+    result.to_datatree().to_netcdf(tmp_path / "plain.nc", engine="h5netcdf")
+    result.save(tmp_path / "checked.nc")
+    rewrite(tmp_path / "checked.nc", lambda tree, meta: None)
+    for file in ("plain.nc", "checked.nc"):
+        loaded = type(result).load(tmp_path / file)
+        same(loaded.map, result.map)
+        same(loaded.recording, result.recording)
+
+
+def test_a_changed_number_or_word_is_noticed(sampled, tmp_path):
+    def number(tree, meta):
+        tree["map"]["mean"].values[0] += 1e-9
+
+    def word(tree, meta):
+        meta["settings"]["seed"] += 1
+
+    def nothing(tree, meta):
+        pass
+
+    path = tmp_path / "result.nc"
+    for change in (number, word):
+        sampled.save(path)
+        rewrite(path, change, checked=True)
+        with pytest.raises(TorchcalError, match=r"damaged or changed since: its checksum differs \(take a whole copy"):
+            Calibration.load(path)
+    sampled.save(path)
+    rewrite(path, nothing, checked=True)
+    same(Calibration.load(path).map, sampled.map)
+
+
+def test_damage_is_told_or_does_no_harm(sampled, tmp_path):
+    path = tmp_path / "result.nc"
+    sampled.save(path)
+    whole = path.read_bytes()
+    told = []
+    for seed in range(60):
+        damage = random.Random(seed)
+        data, start = bytearray(whole), damage.randrange(len(whole) - 20)
+        data[start : start + 20] = damage.randbytes(20)
+        path.write_bytes(bytes(data))
+        try:
+            loaded = Calibration.load(path)
+        except TorchcalError as error:
+            told.append(str(error))
+        else:
+            same(loaded.map, sampled.map)
+            same(loaded.samples, sampled.samples)
+            same(loaded.recording, sampled.recording)
+            same(loaded.settings, sampled.settings)
+            assert str(loaded) == str(sampled)
+    assert len(told) > 20
+    assert all("Expected" in text and str(path) in text for text in told)
+
+
+@pytest.mark.parametrize("end", [0, 8, 100, 5000])
+def test_a_part_of_a_file_is_told(sampled, tmp_path, end):
+    path = tmp_path / "result.nc"
+    sampled.save(path)
+    path.write_bytes(path.read_bytes()[:end])
+    with pytest.raises(TorchcalError, match=r"damaged or incomplete: .*\(take a whole copy of it, or remove it"):
+        Calibration.load(path)
+
+
+@pytest.mark.parametrize("lost", ["map", "prediction", "observed_data", "constant_data"])
+@pytest.mark.parametrize("name", ["point", "additive"])
+def test_a_file_that_lacks_a_group_is_told(name, request, tmp_path, lost):
+    result = request.getfixturevalue(name)
+    path = tmp_path / "result.nc"
+    result.save(path)
+    rewrite(path, lambda tree, meta: xarray.DataTree(children={k: v for k, v in tree.children.items() if k != lost}))
+    with pytest.raises(TorchcalError, match="damaged or incomplete"):
+        type(result).load(path, simulator=SIMULATOR)
+
+
+@pytest.mark.parametrize(
+    "lost",
+    [("settings",), ("diagnostics",), ("recording",), ("kind",), ("format",)]
+    + [("settings", name) for name in ("center", "order", "units", "embedding")],
+)
+@pytest.mark.parametrize("name", ["point", "additive"])
+def test_a_file_that_lacks_a_setting_is_told(name, request, tmp_path, lost):
+    result = request.getfixturevalue(name)
+    path = tmp_path / "result.nc"
+    result.save(path)
+
+    def change(tree, meta):
+        for key in lost[:-1]:
+            meta = meta[key]
+        del meta[lost[-1]]
+
+    rewrite(path, change)
+    with pytest.raises(TorchcalError, match="damaged or incomplete: KeyError"):
+        type(result).load(path)
+
+
+@pytest.mark.parametrize("kind", [Calibration, AdditiveCalibration])
+def test_what_is_no_path_or_no_simulator_is_told(kind, sampled, additive, tmp_path):
+    (sampled if kind is Calibration else additive).save(tmp_path / "result.nc")
+    for path in (None, 3, b"result.nc"):
+        with pytest.raises(DomainError, match=r"Expected path: the name of a netCDF file\. Got (NoneType|int|bytes)"):
+            kind.load(path)
+    with pytest.raises(DomainError, match=r"Expected simulator as a torchcal\.Simulator or None\. Got int"):
+        kind.load(tmp_path / "result.nc", simulator=3)
+
+
+@pytest.mark.parametrize("package", ["xarray", "h5netcdf", "h5py"])
+def test_a_missing_package_is_told(package, sampled, tmp_path, monkeypatch):
+    sampled.save(tmp_path / "old.nc")
+    tree = sampled.to_datatree()
+    monkeypatch.setattr(type(sampled), "to_datatree", lambda self: tree)
+    monkeypatch.setitem(sys.modules, package, None)
+    told = rf"Expected {package} for trees and netCDF files\..* pip install 'torchcal\[arviz\]'"
+    with pytest.raises(MissingDependencyError, match=told):
+        sampled.save(tmp_path / "new.nc")
+    with pytest.raises(MissingDependencyError, match=told):
+        Calibration.load(tmp_path / "old.nc")
+
+    def never(x, p):
+        raise AssertionError("evaluated")
+
+    simulator = tc.Simulator(never, [tc.Parameter("a")])
+    with pytest.raises(MissingDependencyError, match=told):
+        tc.calibrate_many(simulator, [tc.Recording(x=T, y=T)], folder=tmp_path / "many")
+    assert os.listdir(tmp_path) == ["old.nc"]
+
+
+def test_conditions_keep_their_order(tmp_path):
+    simulator = tc.Simulator(lambda x, p: {"z": p["a"] * x["s"], "b": p["a"] + x["c"]}, [tc.Parameter("a")])
+    data = tc.Recording(x={"s": T, "c": T + 1}, y={"z": T + 1, "b": T**2})
+    quietly(tc.calibrate, simulator, data, num_samples=0, num_starts=4).save(tmp_path / "result.nc")
+    loaded = Calibration.load(tmp_path / "result.nc").recording
+    assert loaded.conditions == ("s", "c")
+    assert loaded.outputs == ("z", "b")
 
 
 def test_what_torchcal_did_not_write_is_refused(sampled, additive, tmp_path):

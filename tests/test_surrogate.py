@@ -33,6 +33,7 @@ from torchcal.simulators import (
     Simulator,
     build_surrogate,
 )
+from torchcal.simulators.held_out import CONSTANT, NUMBERS
 
 A, B = Parameter("a", low=1.0, high=3.0), Parameter("b", unit="K", low=-2.0, high=4.0)
 BOX = {"s": (0.0, 2.0), "t": (5.0, 6.0)}
@@ -248,6 +249,35 @@ def test_a_large_error_warns_with_the_numbers():
 
 def test_constant_output_is_no_reason_to_warn():
     assert build(lambda x, p: 0.1 + 1e6).error.relative.tolist() == [0.0]
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-170, 1e170, 1e300])
+def test_an_error_is_measured_in_any_unit(scale):
+    """Squares of such numbers are past the range of floats."""
+    found = []
+    for factor in (1.0, scale):
+        with pytest.warns(SurrogateWarning, match=r"rms \S+ \(0\.\d+ of the output's sd"):
+            step = build(lambda x, p, f=factor: f * math.copysign(1.0, p["a"] * x["s"] - 1.7), threshold=0.01)
+        found.append(step.error)
+    one, other = found
+    for name in NUMBERS:
+        torch.testing.assert_close(getattr(other, name) / scale, getattr(one, name), rtol=1e-12, atol=0)
+    torch.testing.assert_close(other.relative, one.relative, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("offset", [3e10, 1e12])
+def test_an_error_is_not_hidden_by_a_large_mean(offset):
+    """The output varies by more than its last digit, the surrogate errs by a part of that or more."""
+    with pytest.warns(SurrogateWarning, match="of the output's sd"):
+        error = build(lambda x, p: offset + 1e-3 * math.exp(-p["a"] * x["s"]), threshold=0.01).error
+    torch.testing.assert_close(error.relative, error.rms / error.sd)
+    assert float(error.relative) > 0.01
+
+
+def test_an_output_that_varies_by_its_rounding_alone_is_constant():
+    error = build(lambda x, p: 1e6 * (p["a"] * x["s"] / p["a"] / x["s"])).error
+    assert 0 < float(error.sd) <= 1e6 * CONSTANT
+    assert error.relative.tolist() == [0.0]
 
 
 def test_conditions_outside_the_box_warn_with_the_numbers():

@@ -8,6 +8,8 @@ import torch
 from pyro.infer import MCMC, NUTS
 
 import torchcal as tc
+from torchcal.errors import DomainError
+from torchcal.prediction import Moments
 
 X = torch.linspace(0.1, 1.0, 9, dtype=torch.float64)
 
@@ -73,6 +75,28 @@ def test_the_default_tolerance_respects_known_noise():
         z.append((float(slope.mean()) - 2) / float(slope.std()))
     # Four standard normal numbers: the largest is past 4 once in 4000 times; a posterior half as wide doubles them.
     assert max(abs(value) for value in z) < 8
+
+
+@pytest.mark.parametrize("kind", ["Unit", "Quantity"])
+def test_a_unit_that_is_no_text_is_told_how_to_be_one(kind):
+    unit = getattr(pytest.importorskip("pint").UnitRegistry(), kind)("m/s")
+    with pytest.raises(DomainError, match=r"unit of parameter 'v' as a string or None\. Got .*unit=str\(unit\)"):
+        tc.Parameter("v", unit=unit)
+    assert tc.Parameter("v", unit=str(unit)).unit == str(unit)
+
+
+def test_scores_refuse_units_that_a_prediction_does_not_know():
+    quantity = pytest.importorskip("pint").UnitRegistry().Quantity
+    moments = Moments(torch.tensor([1.0, 2.0]).double(), torch.ones(2).double())
+    plain = tc.scores([1.0, 2.5], moments, noise=0.1)
+    y = quantity([1000.0, 2500.0], "mm")
+    assert tc.scores(y.to("m").magnitude, moments, noise=0.1) == plain
+    for data, noise, label in [(y, 0.1, "y"), ([1.0, 2.5], quantity(100.0, "mm"), "noise"), (list(y), 0.1, "y")]:
+        with pytest.raises(DomainError, match=rf"Expected {label} as numbers.* Got a Quantity in 'millimeter' \("):
+            tc.scores(data, moments, noise=noise)
+    xarray = pytest.importorskip("xarray")
+    with pytest.raises(DomainError, match="Expected y as numbers"):
+        tc.scores(xarray.DataArray(y, dims="n"), moments)
 
 
 @pytest.mark.slow

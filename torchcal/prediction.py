@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchcal import polychaos
+from torchcal.data.arrays import unit_of
 from torchcal.errors import DomainError, ShapeError
 from torchcal.propagation import NISP
 
@@ -267,19 +268,22 @@ def scores(y: Any, moments: Moments | Prediction, *, noise: Any = None, level: f
     """RMSE, log score and coverage of predicted moments against data ``(n,)``.
 
     Args:
-        y: The data; NaN where one is missing, which counts nowhere.
+        y: The data, in the prediction's unit; NaN where one is missing, which counts nowhere.
         moments: Predicted mean and sd.
         noise: Sd of the measurement noise, one number or ``(n,)`` of any kind of array, added in square.
         level: Nominal coverage, between 0 and 1.
 
     Raises:
         ShapeError: If data, moments and noise differ in shape.
-        DomainError: If the level is not between 0 and 1, no datum is there, or a sd is not a number or zero.
+        DomainError: If the level is not between 0 and 1, no datum is there, a sd is not a number or zero, or data or
+            noise come with a unit: a prediction has none to convert to.
 
     >>> found = scores([1.0, float("nan"), 3.0], Moments(torch.zeros(3), torch.ones(3)), noise=1.0)
     >>> print(f"{found.rmse:.4f} {found.coverage}")     # √((1 + 9) / 2), and 3 is past 1.96 √2
     2.2361 0.5
     """
+    _check_plain(y, "y")
+    _check_plain(noise, "noise")
     y = torch.as_tensor(y, dtype=torch.float64)
     if y.shape != moments.mean.shape:
         raise ShapeError(f"Expected y of shape {tuple(moments.mean.shape)}, as the mean. Got {tuple(y.shape)}.")
@@ -306,6 +310,14 @@ def scores(y: Any, moments: Moments | Prediction, *, noise: Any = None, level: f
         coverage=float((z.abs() <= quantile).to(torch.float64).mean()),
         level=level,
     )
+
+
+def _check_plain(value: Any, label: str) -> None:
+    if (unit := unit_of(value)) is not None:
+        raise DomainError(
+            f"Expected {label} as numbers in the unit of the prediction, which does not know it. Got a Quantity in "
+            f"{unit!r} (convert it yourself: give {label}.to(unit).magnitude)."
+        )
 
 
 def _noise_sd(noise: Any, like: Tensor) -> Tensor:

@@ -18,8 +18,13 @@ __all__ = [
     "same_unit",
     "sample_spread",
     "to_tensor",
+    "unit_of",
     "value_range",
 ]
+
+
+#: Bend of a conversion between units, relative to its numbers, up to which it is linear but for rounding.
+LINEAR = 1e-9
 
 
 def named(given: Any, letter: str) -> dict[str, Any]:
@@ -55,6 +60,15 @@ def declared_units(units: Any, names: Sequence[str]) -> dict[str, str]:
 def is_quantity(value: Any) -> bool:
     """Whether a value has a magnitude and a unit, as pint's have."""
     return hasattr(value, "magnitude") and hasattr(value, "units")
+
+
+def unit_of(value: Any) -> str | None:
+    """The unit of a Quantity, of a DataArray that holds one, or of the first of a list of them; None without one."""
+    if isinstance(value, list | tuple) and value:
+        value = value[0]
+    elif not isinstance(value, Tensor) and not is_quantity(value) and hasattr(value, "attrs"):
+        value = getattr(value, "data", None)
+    return str(value.units) if is_quantity(value) else None
 
 
 def to_tensor(
@@ -96,6 +110,9 @@ def _convert(value: Any, unit: str, *, difference: bool) -> tuple[Any, float]:
         return value.to(unit).magnitude, 0.0
     # pint keeps differences apart as "delta_degC", and does not convert them to "degC"
     source, target = str(value.units).removeprefix("delta_"), unit.removeprefix("delta_")
+    one, two, three = (float(type(value)(number, source).to(target).magnitude) for number in (1.0, 2.0, 3.0))
+    if abs(three - 2 * two + one) > LINEAR * max(abs(one), abs(two), abs(three)):
+        raise ValueError("one of the two is logarithmic, and a difference in one has no size of its own in the other")
     zero = type(value)(0.0, source).to(target).magnitude
     return type(value)(value.magnitude, source).to(target).magnitude, float(zero)
 

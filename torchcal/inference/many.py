@@ -277,7 +277,7 @@ class _Folder:
                         f"Expected one of torchcal.{what}s beside folder=. Got {type(item).__name__}, which cannot be "
                         "read back. Leave the folder out, and keep the results yourself."
                     )
-        self.xarray = storage.xarray_module()
+        self.xarray = storage.netcdf_modules()[0]
         self.path, self.simulator = Path(folder), simulator
         self.path.mkdir(parents=True, exist_ok=True)
         bound = inspect.signature(calibrate).bind(simulator, None, **settings)

@@ -1,8 +1,9 @@
 """Results from netCDF files that `storage` wrote, held against the simulator that they are read with."""
 
+import contextlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from torchcal.prediction import AdditivePrediction, Moments, Prediction, output_
 from torchcal.propagation import NISP, PropagationCheck, RuleChoice
 from torchcal.results.diagnostics import Diagnostics, Mode, Quality
 from torchcal.results.estimate import MapEstimate
-from torchcal.results.storage import FORMAT, NAME, xarray_module
+from torchcal.results.storage import CHECKSUM, FORMAT, NAME, checksum, netcdf_modules
 from torchcal.simulators import ExternalSimulator, ODESimulator, Scaling, Simulator, Trajectories
 
 if TYPE_CHECKING:
@@ -33,36 +34,29 @@ def read_calibration(
     cls: type["Calibration"], path: str | os.PathLike[str], simulator: Simulator | None
 ) -> "Calibration":
     """Read an embedded calibration."""
+    _check_kind(simulator)
     groups, meta = _read(path, "embedded")
-    embedding = _rebuild(embeddings, meta["embedding"])
-    likelihood = _rebuild(likelihoods, meta["likelihood"])
-    recording = _recording(groups, meta)
-    propagate = _propagation(simulator, embedding, recording, meta)
-    p = groups["prediction"]
-    posterior = Moments(p["mean"], p["sd"]) if "sd_posterior" in p else None
-    stored = Prediction(
-        x=recording.x,
-        mean=p["mean"],
-        sd=p["sd"],
-        sd_model_error=p["sd_model_error"],
-        sd_posterior=p.get("sd_posterior"),
-        map=Moments(p["map_mean"], p["map_sd"]),
-        posterior=posterior,
-        mean_predictive=(
-            Moments(p["mean_predictive_mean"], p["mean_predictive_sd"]) if "mean_predictive_mean" in p else None
-        ),
-    )
-    result = cls(
-        map=_map(groups, meta),
-        samples=_samples(groups),
-        diagnostics=_diagnostics(groups, meta),
-        recording=recording,
-        embedding=embedding,
-        likelihood=likelihood,
-        propagate=propagate,
-        settings=meta["settings"],
-        stored=stored,
-    )
+    with _readable(path):
+        embedding = _rebuild(embeddings, meta["embedding"])
+        parts = _common_parts(groups, meta)
+        options = _options(meta)
+        p = groups["prediction"]
+        posterior = Moments(p["mean"], p["sd"]) if "sd_posterior" in p else None
+        parts["likelihood"] = _rebuild(likelihoods, meta["likelihood"])
+        parts["stored"] = Prediction(
+            x=parts["recording"].x,
+            mean=p["mean"],
+            sd=p["sd"],
+            sd_model_error=p["sd_model_error"],
+            sd_posterior=p.get("sd_posterior"),
+            map=Moments(p["map_mean"], p["map_sd"]),
+            posterior=posterior,
+            mean_predictive=(
+                Moments(p["mean_predictive_mean"], p["mean_predictive_sd"]) if "mean_predictive_mean" in p else None
+            ),
+        )
+    propagate = _propagation(simulator, embedding, parts["recording"], meta, options)
+    result = cls(embedding=embedding, propagate=propagate, **parts)
     if not isinstance(simulator, ExternalSimulator | ODESimulator):  # which may take hours, or other time steps
         check_simulator(result)
     return result
@@ -96,20 +90,17 @@ def read_additive(
     cls: type["AdditiveCalibration"], path: str | os.PathLike[str], simulator: Simulator | None
 ) -> "AdditiveCalibration":
     """Read a conventional calibration."""
+    _check_kind(simulator)
     groups, meta = _read(path, "additive")
-    recording = _recording(groups, meta)
-    propagate = _propagation(simulator, embeddings.PolynomialChaos(order=0), recording, meta)
-    p = groups["prediction"]
-    kinds = {k: Moments(p[f"{k}_mean"], p[f"{k}_sd"]) for k in ("push_forward", "posterior", "map")}
-    result = cls(
-        map=_map(groups, meta),
-        samples=_samples(groups),
-        diagnostics=_diagnostics(groups, meta),
-        recording=recording,
-        propagate=propagate,
-        settings=meta["settings"],
-        stored=AdditivePrediction(x=recording.x, **kinds),
-    )
+    with _readable(path):
+        parts = _common_parts(groups, meta)
+        options = _options(meta)
+        recording = parts["recording"]
+        p = groups["prediction"]
+        kinds = {k: Moments(p[f"{k}_mean"], p[f"{k}_sd"]) for k in ("push_forward", "posterior", "map")}
+        parts["stored"] = AdditivePrediction(x=recording.x, **kinds)
+    propagate = _propagation(simulator, embeddings.PolynomialChaos(order=0), recording, meta, options)
+    result = cls(propagate=propagate, **parts)
     if propagate is not None and not isinstance(simulator, ExternalSimulator | ODESimulator):
         with torch.no_grad():
             mean = propagate.mean(result.map.alpha[:-1])
@@ -118,33 +109,80 @@ def read_additive(
     return result
 
 
+def _check_kind(simulator: Any) -> None:
+    if simulator is not None and not isinstance(simulator, Simulator):
+        raise DomainError(
+            f"Expected simulator as a torchcal.Simulator or None. Got {type(simulator).__name__} (give the one that "
+            "was calibrated, or leave it out)."
+        )
+
+
+@contextlib.contextmanager
+def _readable(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Whatever goes wrong within is told of the file: damage shows in many ways."""
+    try:
+        yield
+    except Warning:  # where warnings are errors
+        raise
+    except Exception as error:
+        told = f"{type(error).__name__}: {error}"
+        raise _damaged(path, f"one that cannot be read, damaged or incomplete: {told}") from error
+
+
+def _damaged(path: str | os.PathLike[str], got: str) -> TorchcalError:
+    return TorchcalError(
+        f"Expected a netCDF file that torchcal wrote at {os.fspath(path)}. Got {got} (take a whole copy of it, or "
+        "remove it and calibrate again)."
+    )
+
+
 def _read(path: str | os.PathLike[str], kind: str) -> tuple[dict[str, dict[str, Tensor]], dict[str, Any]]:
+    if not isinstance(path, str | os.PathLike):
+        raise DomainError(f"Expected path: the name of a netCDF file. Got {type(path).__name__} (give its name).")
     if not os.path.exists(path):
         raise TorchcalError(f"Expected a netCDF file that torchcal wrote at {path}. Got none: there is no such file.")
-    try:
-        tree = xarray_module().open_datatree(os.fspath(path), engine="h5netcdf")
-    except (OSError, ValueError) as error:
-        raise TorchcalError(f"Expected a netCDF file that torchcal wrote at {path}. Got: {error}") from error
+    xarray, _, h5py = netcdf_modules()
+    with _readable(path):
+        with h5py.File(path, "r") as file:
+            dict(file.attrs)  # where these are damaged, h5netcdf cannot even close the file
+        tree = xarray.open_datatree(os.fspath(path), engine="h5netcdf")
     with tree:
         if "torchcal" not in tree.attrs:
             raise TorchcalError(f"Expected a netCDF file that torchcal wrote. {path} is none.")
-        meta = json.loads(tree.attrs["torchcal"])
-        groups = {
-            name: {
-                str(value.attrs.get(NAME, key)): torch.from_numpy(np.array(value.values, dtype=np.float64))
-                for key, value in node.data_vars.items()
+        with _readable(path):
+            meta = json.loads(tree.attrs["torchcal"])
+            found, version = meta["kind"], meta["format"]
+        if version != FORMAT:
+            raise TorchcalError(f"Expected format {FORMAT} in {path}. Got {version}.")
+        with _readable(path):
+            groups = {
+                name: {
+                    str(value.attrs.get(NAME, key)): torch.from_numpy(np.array(value.values, dtype=np.float64))
+                    for key, value in node.data_vars.items()
+                }
+                for name, node in tree.children.items()
             }
-            for name, node in tree.children.items()
-        }
-        meta["alpha_names"] = [str(v) for v in tree["map"]["coefficient"].values]
-        meta["parameter_names"] = [str(v) for v in tree["map"]["parameter"].values]
-    if meta["kind"] != kind:
+            meta["alpha_names"] = [str(v) for v in tree["map"]["coefficient"].values]
+            meta["parameter_names"] = [str(v) for v in tree["map"]["parameter"].values]
+            whole = tree.attrs.get(CHECKSUM) in (None, checksum(tree))  # files of earlier versions have none
+    if not whole:
+        raise _damaged(path, "one that was damaged or changed since: its checksum differs")
+    if found != kind:
         raise TorchcalError(
-            f"Expected an {kind} calibration in {path}. Got an {meta['kind']} one. Load it with the other class."
+            f"Expected an {kind} calibration in {path}. Got an {found} one. Load it with the other class."
         )
-    if meta["format"] != FORMAT:
-        raise TorchcalError(f"Expected format {FORMAT} in {path}. Got {meta['format']}.")
     return groups, meta
+
+
+def _common_parts(groups: Mapping[str, Any], meta: Mapping[str, Any]) -> dict[str, Any]:
+    """What results of both kinds have."""
+    return {
+        "map": _map(groups, meta),
+        "samples": _samples(groups),
+        "diagnostics": _diagnostics(groups, meta),
+        "recording": _recording(groups, meta),
+        "settings": meta["settings"],
+    }
 
 
 def _rebuild(module: Any, spec: Mapping[str, Any]) -> Any:
@@ -193,28 +231,35 @@ def _units(info: Mapping[str, Any]) -> dict[str, str]:
     return units
 
 
+def _options(meta: Mapping[str, Any]) -> dict[str, Any]:
+    """How the outputs were propagated."""
+    settings = meta["settings"]
+    for name in ("embedding", "units"):  # which a result needs to print itself
+        settings[name]
+    return {
+        "fixed": settings["fixed"],
+        "scaling": scaling_of(settings),
+        "order": settings["order"],
+        "sd_floor": settings["sd_floor"],
+        "rule": _rule(settings["rule"]) if "rule" in settings else RuleChoice("tensor", settings["gauss_nodes"]),
+    }
+
+
 def _propagation(
-    simulator: Simulator | None, embedding: embeddings.Embedding, recording: Recording, meta: Mapping[str, Any]
+    simulator: Simulator | None,
+    embedding: embeddings.Embedding,
+    recording: Recording,
+    meta: Mapping[str, Any],
+    options: Mapping[str, Any],
 ) -> NISP | None:
     if simulator is None:
         return None
-    settings = meta["settings"]
     if recording.runs is None and isinstance(simulator, ODESimulator | Trajectories):
         raise RecordingError("Expected a static simulator for a static recording. Got one in time (give the other).")
     simulator = simulator.bind(recording)
     if isinstance(simulator, Trajectories):
-        simulator = _with_steps(simulator, settings)
-    propagate = NISP(
-        simulator,
-        embedding,
-        recording.x,
-        fixed=settings["fixed"],
-        outputs=recording.outputs,
-        scaling=scaling_of(settings),
-        order=settings["order"],
-        sd_floor=settings["sd_floor"],
-        rule=_rule(settings["rule"]) if "rule" in settings else RuleChoice("tensor", settings["gauss_nodes"]),
-    )
+        simulator = _with_steps(simulator, meta["settings"])
+    propagate = NISP(simulator, embedding, recording.x, outputs=recording.outputs, **options)
     if propagate.pattern.names != tuple(meta["parameter_names"]):
         raise EmbeddingError(
             f"Expected the simulator of this calibration, with the free parameters {meta['parameter_names']}. Got "

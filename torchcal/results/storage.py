@@ -1,5 +1,8 @@
 """Results as xarray trees and netCDF files. No pickle: what cannot be written as data or text is left out."""
 
+import hashlib
+import importlib
+import io
 import json
 import os
 from collections.abc import Mapping
@@ -19,23 +22,45 @@ if TYPE_CHECKING:
     from torchcal.results.additive import AdditiveCalibration
     from torchcal.results.calibration import Calibration
 
-__all__ = ["FORMAT", "NAME", "additive_tree", "calibration_tree", "to_arviz", "write", "xarray_module"]
+__all__ = [
+    "CHECKSUM",
+    "FORMAT",
+    "NAME",
+    "additive_tree",
+    "calibration_tree",
+    "checksum",
+    "netcdf_modules",
+    "to_arviz",
+    "write",
+    "xarray_module",
+]
 
 FORMAT = 1
 
 NAME = "torchcal_name"
 """Attribute of a variable that could not be stored under its own name."""
 
+CHECKSUM = "torchcal_sha256"
+"""Attribute of a file that its contents are held against."""
+
 
 def xarray_module() -> Any:
     """xarray, or an error that says how to get it."""
+    return _optional("xarray")
+
+
+def netcdf_modules() -> tuple[Any, Any, Any]:
+    """xarray, h5netcdf and h5py, or an error that says how to get what is missing of them."""
+    return _optional("xarray"), _optional("h5netcdf"), _optional("h5py")
+
+
+def _optional(name: str) -> Any:
     try:
-        import xarray
+        return importlib.import_module(name)
     except ImportError as error:
         raise MissingDependencyError(
-            "Expected xarray for trees and netCDF files. It is not installed: pip install 'torchcal[arviz]'."
+            f"Expected {name} for trees and netCDF files. It is not installed: pip install 'torchcal[arviz]'."
         ) from error
-    return xarray
 
 
 def calibration_tree(result: "Calibration") -> Any:
@@ -92,9 +117,47 @@ def write(tree: Any, path: str | os.PathLike[str]) -> None:
 
     Raises:
         DomainError: If the folder does not exist.
+        MissingDependencyError: If a package for netCDF files is not installed.
+        OSError: If the disk is full, say.
     """
+    netcdf_modules()
     with replacing(path) as temporary:
-        tree.to_netcdf(temporary, engine="h5netcdf")
+        temporary.write_bytes(_netcdf(tree))
+
+
+def _netcdf(tree: Any) -> memoryview:
+    """A tree as the bytes of a netCDF file: HDF5 itself ends Python with a crash where a disk is full."""
+    xarray, h5netcdf, _ = netcdf_modules()
+    buffer = io.BytesIO()
+    with h5netcdf.File(buffer, "w") as file:
+        for node in tree.subtree:
+            group = file if node.path == "/" else file.create_group(node.path)
+            node.to_dataset().dump_to_store(xarray.backends.H5NetCDFStore(group))
+        file.attrs[CHECKSUM] = checksum(tree)
+    return buffer.getbuffer()
+
+
+def checksum(tree: Any) -> str:
+    """SHA-256 of a tree's variables and attributes, the same before it is written and after it is read."""
+    found = hashlib.sha256()
+    for node in sorted(tree.subtree, key=lambda node: node.path):
+        dataset = node.to_dataset()
+        parts: list[Any] = [node.path, _texts(dataset.attrs)]
+        for name, variable in sorted(dataset.variables.items()):
+            values = np.asarray(variable.values)
+            if values.dtype.kind in "biuf":
+                numbers = np.array(values, dtype="<f8")
+                numbers[np.isnan(numbers)] = np.nan  # of one kind
+                held: Any = hashlib.sha256(numbers.tobytes()).hexdigest()
+            else:
+                held = [str(value) for value in values.ravel()]
+            parts.append([name, list(variable.dims), list(values.shape), held, _texts(variable.attrs)])
+        found.update(json.dumps(parts).encode())
+    return found.hexdigest()
+
+
+def _texts(attributes: Mapping[str, Any]) -> list[tuple[str, str]]:
+    return sorted((name, str(value)) for name, value in attributes.items() if name != CHECKSUM)
 
 
 def _dataset(values: Mapping[str, tuple[Any, Tensor]]) -> Any:

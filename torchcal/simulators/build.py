@@ -20,7 +20,7 @@ from torchcal.polychaos._checks import limit_rows
 from torchcal.simulators.design import Evaluations, evaluate_points
 from torchcal.simulators.executor import check_executor
 from torchcal.simulators.external import ExternalSimulator
-from torchcal.simulators.held_out import HeldOutError
+from torchcal.simulators.held_out import HeldOutError, mean_and_sd, root_mean_square
 from torchcal.simulators.parameter import Parameter, Scaling
 from torchcal.simulators.points import PointCall, describe_point
 from torchcal.simulators.static import Conditions, Simulator, check_parameters
@@ -156,13 +156,14 @@ def build_surrogate(
     psi = polychaos.evaluate(polychaos.LEGENDRE, surrogate.indices, random)
     error = (coefficients @ psi.T - held_out).abs()
     points = torch.cat([x_random, p_random], dim=-1)
+    mean, sd = mean_and_sd(held_out)
     measured = HeldOutError(
         num=holdout,
         outputs=found or ("y",),
         max_abs=error.amax(1),
-        rms=error.square().mean(1).sqrt(),
-        mean=held_out.mean(1),
-        sd=held_out.std(1),
+        rms=root_mean_square(error),
+        mean=mean,
+        sd=sd,
         worst=tuple(dict(zip(labels, points[int(i)].tolist(), strict=True)) for i in error.argmax(1)),
     )
     if bool((measured.relative > threshold).any()):

@@ -5,7 +5,10 @@ import dataclasses
 import torch
 from torch import Tensor
 
-__all__ = ["NUMBERS", "HeldOutError"]
+__all__ = ["NUMBERS", "HeldOutError", "mean_and_sd", "root_mean_square"]
+
+CONSTANT = torch.finfo(torch.float64).eps
+"""Sd, relative to the mean, up to which an output is one number but for its rounding: a few operations leave half."""
 
 NUMBERS = ("max_abs", "rms", "mean", "sd")
 """The tensors of a `HeldOutError`."""
@@ -35,9 +38,10 @@ class HeldOutError:
 
     @property
     def relative(self) -> Tensor:
-        """rms over sd, ``(outputs,)``; 0 where the rms is no more than rounding."""
+        """rms over sd, ``(outputs,)``; 0 where the rms is rounding of the sd, or of the mean of a constant output."""
+        constant = self.sd <= CONSTANT * self.mean.abs()
         # Sums over some thousand points of one size leave about a hundred epsilon.
-        rounding = self.rms <= 1e-13 * (self.mean.abs() + self.sd)
+        rounding = self.rms <= 1e-13 * torch.where(constant, self.mean.abs() + self.sd, self.sd)
         return torch.where(rounding, 0.0, self.rms / self.sd)
 
     def __str__(self) -> str:
@@ -49,3 +53,24 @@ class HeldOutError:
                 f"largest {self.max_abs[i]:.3g} at {point}"
             )
         return "\n".join(lines)
+
+
+def root_mean_square(values: Tensor) -> Tensor:
+    """Of every row of ``(outputs, m)``, whose squares may be past the range of numbers: ``(outputs,)``."""
+    scale = _scale(values)
+    return (values / scale).square().mean(1).sqrt() * scale[:, 0]
+
+
+def mean_and_sd(values: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and sample sd of every row of ``(outputs, m)``, likewise."""
+    scale = _scale(values)
+    scaled = values / scale
+    sd = (scaled - scaled[:, :1]).std(1)  # zero where all are equal, whatever their mean is rounded to
+    return scaled.mean(1) * scale[:, 0], sd * scale[:, 0]
+
+
+def _scale(values: Tensor) -> Tensor:
+    """The power of two below each row's largest size, by which numbers are divided without rounding."""
+    size = values.abs().amax(1, keepdim=True)
+    exponent = (torch.frexp(size).exponent.to(torch.float64) - 1).clamp_min(-1022)
+    return torch.where(size > 0, torch.exp2(exponent), 1.0)

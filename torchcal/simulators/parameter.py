@@ -65,7 +65,8 @@ class Parameter:
         per_run: Whether each run of a recording has a value of its own.
 
     Raises:
-        DomainError: If a number is not finite, the bounds are reversed, or a guess lies outside them.
+        DomainError: If a number is not finite, the bounds are reversed, a guess lies outside them, or the unit is no
+            text.
 
     >>> Parameter("E", unit="cal/mol", low=36315.5, high=56954.0).name
     'E'
@@ -83,6 +84,11 @@ class Parameter:
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
             raise DomainError(f"Expected a parameter name (a non-empty string). Got {self.name!r}.")
+        if self.unit is not None and not isinstance(self.unit, str):
+            raise DomainError(
+                f"Expected unit of parameter {self.name!r} as a string or None. Got {type(self.unit).__name__} "
+                f"{str(self.unit)!r} (give its text, say unit=str(unit))."
+            )
         for field in ("low", "high", "initial", "neutral"):
             value = getattr(self, field)
             if value is None:
