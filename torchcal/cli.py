@@ -45,9 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = _parser().parse_args(arguments)
     cut_short, shown = [], warnings.showwarning
 
-    def show(message: Any, category: type[Warning], *rest: Any) -> None:
+    def show(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
         cut_short.extend([message] if issubclass(category, InterruptionWarning) else [])
-        shown(message, category, *rest)
+        shown(message, category, *where, **more)
 
     try:
         with warnings.catch_warnings():
