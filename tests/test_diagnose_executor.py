@@ -17,7 +17,7 @@ import torchcal as tc
 from torchcal.discovery.refits import Refit
 from torchcal.discovery.search import Search
 from torchcal.discovery.stop import Stop
-from torchcal.errors import ConvergenceWarning, DomainError
+from torchcal.errors import DomainError, InterruptionWarning
 from torchcal.simulators import Trajectories
 
 F64 = torch.float64
@@ -231,7 +231,7 @@ def test_an_interrupted_diagnosis_keeps_its_refits_and_names_nothing(motion, her
     seen = interrupt_after(monkeypatch, 1)
     with (
         ThreadPoolExecutor(1) if threads else nullcontext() as pool,
-        pytest.warns(ConvergenceWarning, match="interrupted. It keeps 1 refitted"),
+        pytest.warns(InterruptionWarning, match="interrupted. It keeps 1 refitted"),
     ):
         d = diagnose(motion, executor=pool)
     assert len(seen) == 2
@@ -249,7 +249,7 @@ def test_an_interrupted_diagnosis_keeps_its_refits_and_names_nothing(motion, her
 
 def test_an_interruption_before_any_refit_leaves_the_screening(motion, monkeypatch):
     interrupt_after(monkeypatch, 0)
-    with pytest.warns(ConvergenceWarning, match="It keeps 0 refitted"):
+    with pytest.warns(InterruptionWarning, match="It keeps 0 refitted"):
         d = diagnose(motion)
     assert d.verdict == "unexplained"
     assert {row.terms for row in d.ranking if not row.refitted} >= {("bias force",), ("cubic stiffness",)}
@@ -261,7 +261,7 @@ def test_an_interruption_before_any_refit_leaves_the_screening(motion, monkeypat
 def test_an_interruption_among_pairs_names_no_single_term_as_missing(motion, monkeypatch):
     terms = [term for term in tc.terms.mechanics() if term.name in ("cubic stiffness", "bias force", "linear drag")]
     interrupt_after(monkeypatch, 2)
-    with pytest.warns(ConvergenceWarning, match="It keeps 2 refitted"):
+    with pytest.warns(InterruptionWarning, match="It keeps 2 refitted"):
         d = diagnose(motion, terms)
     assert d.settings["interrupted"] == (
         "The search was interrupted before all their combinations and ranges had been compared."
@@ -287,7 +287,7 @@ def test_an_interruption_outside_of_refits_keeps_what_there_is(motion, monkeypat
         return work(search)
 
     monkeypatch.setattr(Search, place, interrupted)
-    with pytest.warns(ConvergenceWarning, match="It keeps 0 refitted"):
+    with pytest.warns(InterruptionWarning, match="It keeps 0 refitted"):
         d = diagnose(motion)
     assert d.verdict == "unexplained"
     assert d.settings["interrupted"].endswith("before cubic stiffness, bias force had been refitted.")

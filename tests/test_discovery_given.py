@@ -135,7 +135,7 @@ def test_another_hold_for_each_run():
         twin.with_hold(["zero", "zero"])
 
 
-@pytest.mark.parametrize("sd", [1e-7, 1e-9, 1e-12])
+@pytest.mark.parametrize("sd", [1e-7, 1e-9, 1e-160])
 def test_a_noise_too_small_for_the_arithmetic_is_taken_as_large_as_it_must_be(sd: float) -> None:
     # χ² of 1e18 has no digits left for what one explanation is better than another by.
     x = torch.linspace(0, 5, 40, dtype=torch.float64)
@@ -146,7 +146,9 @@ def test_a_noise_too_small_for_the_arithmetic_is_taken_as_large_as_it_must_be(sd
         tc.Term("bend", outputs={"y": lambda x, p, y: y + p["q"] * x**2}, parameters=[tc.Parameter("q")]),
         tc.Term("wave", outputs={"y": lambda x, p, y: y + p["w"] * torch.sin(x)}, parameters=[tc.Parameter("w")]),
     ]
-    d = tc.diagnose(line, tc.Recording(x=x, y=y, noise=sd), terms, progress=False)
+    recording = tc.Recording(x=x, y=y, noise=sd)
+    d = tc.diagnose(line, recording, terms, progress=False)
+    assert d.recording is recording
     assert d.terms == ["bend"]
     assert any("arithmetic" in text for text in d.symptoms)
     assert not any("smaller one" in text for text in d.symptoms)

@@ -261,3 +261,21 @@ def test_a_pair_listed_in_the_wrong_order_does_not_lose_to_one_that_looks_like_i
         assert row.terms == ("current", "shunt")
         chi2.append(row.log_evidence)
     assert abs(chi2[0] - chi2[1]) < 0.1
+
+
+def test_the_order_of_the_list_does_not_decide_where_nothing_else_fits():
+    # By the first order the pair is far behind; and what clips comes before what is not read from the output.
+    x = torch.linspace(0.1, 4, 80, dtype=F64)
+    y = 1.3 * x / (1 + 0.3 * 1.3 * x) + 2.4 * (-x).exp()
+    y = y + 0.01 * torch.randn(80, generator=torch.Generator().manual_seed(0), dtype=F64)
+    base = tc.Simulator(lambda x, p: p["a"] * x, [tc.Parameter("a", initial=1.0, low=0.1, high=5.0)])
+
+    def seen(name: str, function: object, **limits: float) -> tc.Term:
+        return tc.Term(name, outputs={"y": function}, parameters=[tc.Parameter("q", **limits)])
+
+    clip = seen("clip", lambda x, p, y: y / (1 + p["q"] * y), low=0.0, high=2.0)
+    leak = seen("leak", lambda x, p, y: y + p["q"] * torch.exp(-x) * 3)
+    wave = seen("wave", lambda x, p, y: y + p["q"] * x.sqrt() * torch.cos(2 * x))
+    for terms in ([clip, leak, wave], [leak, clip, wave]):
+        d = tc.diagnose(base, tc.Recording(x=x, y=y, noise=0.01), terms, progress=False)
+        assert set(d.terms) == {"clip", "leak"}, d.verdict

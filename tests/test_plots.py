@@ -660,3 +660,34 @@ def test_contours_hold_their_share_of_the_draws():
     _, axes = plt.subplots()
     path = axes.contour(x, y, z, [height]).get_paths()[0]
     assert path.contains_points(draws).mean() == pytest.approx(0.9, abs=0.015)
+
+
+def test_a_factor_leaves_the_label_with_its_ticks():
+    figure, ax = plt.subplots()
+    ax.plot([0, 1, 2], [0, 1e9, 3e9])
+    ax.set_ylabel("y [m]")
+    style.dress(ax)
+    figure.canvas.draw()
+    assert ax.get_ylabel() == "y [1e9 m]"
+    ax.set_ylabel(ax.get_ylabel().replace("y", "Y"))  # set anew from what is there
+    figure.canvas.draw()
+    assert ax.get_ylabel() == "Y [1e9 m]"
+    ax.set_yscale("log")
+    figure.canvas.draw()
+    assert ax.get_ylabel() == "Y [m]"
+    ax.set_yscale("linear")
+    style.dress(ax)
+    figure.canvas.draw()
+    assert ax.get_ylabel() == "Y [1e9 m]"
+    plt.close(figure)
+
+
+def test_an_axis_without_a_label_keeps_the_corner_of_the_one_it_shares_ticks_with():
+    figure, (bare, told) = plt.subplots(1, 2, sharey=True)
+    told.plot([0, 1], [0, 3e7])
+    told.set_ylabel("k [1 / second]")
+    style.dress(told)
+    figure.canvas.draw()
+    assert told.get_ylabel() == "k [1e7/second]"
+    assert bare.yaxis.get_major_formatter().get_offset() == "1e7"
+    plt.close(figure)

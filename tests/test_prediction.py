@@ -354,3 +354,10 @@ def test_scores_refuse_what_has_no_score():
         scores(y, Moments(y, y), level=2.0)
     with pytest.raises(DomainError, match="sd > 0"):
         scores(y, Moments(y, 0 * y))
+
+
+def test_masked_data_count_nowhere():
+    moments = Moments(torch.zeros(3), torch.ones(3))
+    masked = np.ma.array([1.0, 999.0, 3.0], mask=[False, True, False])
+    assert scores(masked, moments).rmse == pytest.approx(5**0.5)
+    assert scores(np.array([1.0, 2.0, 3.0], dtype=">f8"), moments).rmse == pytest.approx((14 / 3) ** 0.5)

@@ -119,6 +119,7 @@ def _calibrate(given: argparse.Namespace) -> None:
     if given.out is not None:
         check_target(given.out)
     options = _options(problem, "calibrate_options", calibrate, given, target_ess=given.target_ess)
+    warnings.simplefilter("always", InterruptionWarning)  # by which the status is known, whatever the file filters
     result = calibrate(problem.simulator, problem.recording, **options)
     if given.out is not None:
         result.save(given.out)
@@ -131,6 +132,7 @@ def _diagnose(given: argparse.Namespace) -> None:
         if path is not None:
             check_target(path)
     options = _options(problem, "diagnose_options", diagnose, given)
+    warnings.simplefilter("always", InterruptionWarning)
     result = diagnose(problem.simulator, problem.recording, getattr(problem, "candidates", ()), **options)
     if given.report is not None:
         result.report(given.report)

@@ -90,7 +90,7 @@ class ConvergenceWarning(TorchcalWarning):
     """Optimiser starts disagree, or R-hat, effective sample size or divergences are past their thresholds."""
 
 
-class InterruptionWarning(ConvergenceWarning):
+class InterruptionWarning(TorchcalWarning):
     """Ctrl-C ended a calculation early; what there was is kept."""
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchcal import polychaos
-from torchcal.data.arrays import unit_of
+from torchcal.data.arrays import to_tensor, unit_of
 from torchcal.errors import DomainError, ShapeError
 from torchcal.propagation import NISP
 
@@ -284,7 +284,7 @@ def scores(y: Any, moments: Moments | Prediction, *, noise: Any = None, level: f
     """
     _check_plain(y, "y")
     _check_plain(noise, "noise")
-    y = torch.as_tensor(y, dtype=torch.float64)
+    y, _ = to_tensor(y, "y", None)
     if y.shape != moments.mean.shape:
         raise ShapeError(f"Expected y of shape {tuple(moments.mean.shape)}, as the mean. Got {tuple(y.shape)}.")
     if not 0 < level < 1:
@@ -323,7 +323,7 @@ def _check_plain(value: Any, label: str) -> None:
 def _noise_sd(noise: Any, like: Tensor) -> Tensor:
     """The sd of the noise as a float64 tensor that spreads over the data."""
     try:
-        value = torch.as_tensor(noise, dtype=torch.float64)
+        value, _ = to_tensor(noise, "noise", None)
     except (TypeError, ValueError, RuntimeError) as error:
         raise DomainError(f"Expected noise as one number or {tuple(like.shape)} of them. Got {noise!r}.") from error
     if value.ndim and value.shape != like.shape:

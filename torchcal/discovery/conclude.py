@@ -4,6 +4,7 @@ import dataclasses
 import math
 import time
 
+import torch
 from torch import Tensor
 
 from torchcal.data import Recording
@@ -31,9 +32,10 @@ from torchcal.terms import Term, extend
 
 __all__ = ["conclude"]
 
-#: RMSE of a calibrated base, in the data's spread, from which on it explains nothing; and the correlation of noise from
-#: sample to sample above which all that is recorded may be that.
-NO_BETTER, CORRELATED = 0.95, 0.5
+#: RMSE of a calibrated base, in the data's spread, from which on it explains nothing.
+NO_BETTER = 0.95
+#: Share of χ² by which a fit must be worse than a constant's to be so.
+WORSE = 1e-3
 #: Probability of what is tied from which on its noise is told.
 HALF = 0.5
 #: Power of the stated detection limits.
@@ -78,8 +80,8 @@ def conclude(
         search.examine(shown)
     base = explain.fit_record(search.base, search.structure, ())
     final = base if best is None else explain.fit_record(best.found, best.structure, best.names, best.window)
-    slow = not search.exact and float(search.noise.correlation.max()) > CORRELATED
-    lost = best is None and (slow or decision.verdict == "unexplained") and _explains_nothing(search)
+    lost = decision.verdict == "unexplained" and _explains_nothing(search)
+    lost = lost or (best is None and _worse_than_constant(search))
     _warn(search, lost)
     before = _scores(search, search.base, mask)
     after = None if best is None else _scores(search, best.found, mask)
@@ -202,6 +204,16 @@ def _improved(simulator: Simulator, best: Model) -> Simulator:
 def _explains_nothing(search: Search) -> bool:
     """Whether the calibrated base explains no more than a constant would."""
     return _size(search) > NO_BETTER and not _is_constant(search)
+
+
+def _worse_than_constant(search: Search) -> bool:
+    """Whether a constant of each output fits better than the calibrated base: never where the base holds constants."""
+    found = search.base
+    outputs = found.problem.output_of
+    columns = found.whitening(torch.stack([(outputs == k).double() for k in outputs.unique()], dim=-1))
+    y = found.whitening.vector(found.problem.y)
+    left = y - columns @ torch.linalg.lstsq(columns, y[:, None]).solution[:, 0]
+    return found.chi2 > (1 + WORSE) * float(left.square().sum())
 
 
 def _is_constant(search: Search) -> bool:

@@ -16,7 +16,7 @@ from torchcal.discovery.candidates import base_columns
 from torchcal.discovery.conclude import conclude
 from torchcal.discovery.decision import Decision
 from torchcal.discovery.fitting import Fitted, starts
-from torchcal.discovery.given import coarser
+from torchcal.discovery.given import resolved, told_apart
 from torchcal.discovery.nameless import refit_nameless
 from torchcal.discovery.own_noise import explains
 from torchcal.discovery.problem import Problem
@@ -98,7 +98,7 @@ def diagnose(
     check_executor(executor, diagnose)
     given = terms
     terms = [term for term in given if not _contains(simulator, term)]
-    problem = Problem.of(simulator, recording).keeping(recording.observed_once)
+    problem = Problem.of(simulator, resolved(recording)).keeping(recording.observed_once)
     try:
         free, held = base_columns(problem, fixed)
     except EmbeddingError as error:  # which says of the same that it cannot be embedded
@@ -133,10 +133,9 @@ def diagnose(
         with search.stop.listening():
             tick("calibrate the base")
             search.calibrate_base()
-            if (times := coarser(search.base)) > 1 and isinstance(recording.noise, Tensor):
-                recording = recording.with_noise(times * recording.noise)
-                problem = dataclasses.replace(problem, recording=recording)
-                search = dataclasses.replace(search, problem=problem, coarser=times)
+            if (noise := told_apart(search.base)) is not None and isinstance(recording.noise, Tensor):
+                problem = dataclasses.replace(problem, recording=recording.with_noise(noise))
+                search = dataclasses.replace(search, problem=problem, coarser=float((noise / recording.noise).max()))
                 search.calibrate_base()
             if holdout is not None and mask is not None:
                 verify.check_left(search.base, mask)

@@ -14,14 +14,17 @@ from torchcal.discovery.model import Model
 from torchcal.discovery.residual import Residual
 from torchcal.discovery.search import Search
 from torchcal.discovery.structure import analyse
+from torchcal.display import placed
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators import Trajectories
 from torchcal.simulators.layout import initial_name
 
-__all__ = ["as_good", "begun_elsewhere", "coarser", "held_otherwise"]
+__all__ = ["as_good", "begun_elsewhere", "held_otherwise", "resolved", "told_apart"]
 
 #: χ² of the base up to which double precision still tells log evidences apart by a hundredth.
 DIGITS = 1e14
+#: Smallest noise sd that is gone by at first, in the output's spread.
+SMALLEST = 1e-12
 #: Probability by chance of what is left, from which on it is noise; and noise sd up to which an initial value that is
 #: found free is the one that was given: of one given as the first value recorded, and of any other.
 NOISE, CONFIRMED, ELSEWHERE = 0.05, 0.2, 1.0
@@ -36,9 +39,18 @@ STAYS = 0.5
 TOLD, AS_MUCH, CLEARLY = 10.0, 0.5, 3.0
 
 
-def coarser(base: Fitted) -> float:
-    """How many times as large a noise that was given must be taken for evidences to be told apart; 1 if it may stay."""
-    return max(1.0, math.sqrt(base.chi2 / DIGITS)) if isinstance(base.problem.recording.noise, Tensor) else 1.0
+def resolved(recording: Recording) -> Recording:
+    """The recording with a given noise that is not so small that squares of residuals overflow."""
+    least = SMALLEST * recording.spread
+    if not isinstance(recording.noise, Tensor) or bool((recording.noise >= least).all()):
+        return recording
+    return recording.with_noise(torch.maximum(recording.noise, least))
+
+
+def told_apart(base: Fitted) -> Tensor | None:
+    """The sd ``(n_total,)`` that a given noise must be taken for where evidences cannot be told apart with it."""
+    noise = base.problem.recording.noise
+    return math.sqrt(base.chi2 / DIGITS) * noise if isinstance(noise, Tensor) and base.chi2 > DIGITS else None
 
 
 def begun_elsewhere(search: Search) -> list[str]:
@@ -65,8 +77,8 @@ def begun_elsewhere(search: Search) -> list[str]:
             "of initial=) the base leaves no more than noise"
         ]
     return [
-        f"{full} was given as {given:.4g} and is {found:.4g} where it is unknown (left out of initial=): the base "
-        "leaves no more than noise then"
+        f"{full} was given as {placed(given, abs(found - given))} and is {placed(found, abs(found - given))} where it "
+        "is unknown (left out of initial=): the base leaves no more than noise then"
         for full, (given, found) in ({} if first == shown else _moved(search, shown, ELSEWHERE)).items()
     ]
 

@@ -35,8 +35,8 @@ ALL = 0.99999
 FROM_LINEAR, FROM_FAR, NEARLY_SAME = 8, 3, 0.999
 #: Log weight behind the leading pair down to which that is tried, and for how many pairs.
 CLOSE, AGAIN = 5.0, 3
-#: Log weight behind the leading pair down to which pairs are tried the other way round, how many at most, and the
-#: change of χ² from which on that is another model.
+#: Log weight behind a leading pair that leaves noise, down to which pairs are tried the other way round; how many at
+#: most; and the change of χ² from which on that is another model.
 FAR_BEHIND, TURNED, ANOTHER = 30.0, 6, 1.0
 #: Correlation of two tangents from which on a candidate is tried in the other's place beside the leading pair's.
 ALIKE = 0.9
@@ -100,17 +100,23 @@ def refit_several(search: Search) -> None:
 def _either_way(search: Search, pairs: list[Model]) -> list[Model]:
     """Pairs, the leading ones with their terms the other way round where that is another model that does better.
 
-    An instrument shows what the physics gives, and is not tried before that; which of two others on one output comes
-    first, as of a shunt and what the leads drop, nobody says.
+    An instrument shows what the physics gives; which of two others on one output comes first, as of a shunt and what
+    the leads drop, nobody says. Where the best leaves more than noise, pairs are tried however far they are behind, and
+    instruments before the physics too.
     """
-    best = max((m.weight for m in search.models if len(m.numbers) == 2 and m.window is None), default=0.0)
-    leading = sorted((m for m in pairs if m.weight > best - FAR_BEHIND and _share(m)), key=lambda m: -m.weight)
+    every = [m for m in search.models if len(m.numbers) == 2 and m.window is None]
+    if not every:
+        return pairs
+    best = max(every, key=lambda m: m.weight)
+    whole = search.examine(best).p_value >= PLAINLY_WHITE
+    least = best.weight - FAR_BEHIND if whole else -math.inf
+    leading = sorted((m for m in pairs if m.weight > least and _share(m)), key=lambda m: -m.weight)
     wanted: list[tuple[Model, Hypothetical]] = []
     for pair in leading:
         if len(wanted) == TURNED:
             break
         first, second = pair.candidate.terms
-        if is_instrument(pair, second) and not is_instrument(pair, first):
+        if whole and is_instrument(pair, second) and not is_instrument(pair, first):
             continue
         known, y = _turned(search, pair)
         if float(pair.found.whitening.vector(y - pair.found.y).square().sum()) < ANOTHER:

@@ -321,7 +321,7 @@ class _Folder:
         try:
             with self.xarray.open_datatree(path, engine="h5netcdf") as tree:
                 kept = json.loads(tree.attrs["torchcal_inputs"])
-        except (OSError, ValueError, KeyError) as error:
+        except Exception as error:  # damage shows in many ways
             raise DomainError(
                 f"Expected a result that calibrate_many wrote in {path}. Got another file: {error}. Remove it, or "
                 "give another folder."

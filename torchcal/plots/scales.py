@@ -25,15 +25,25 @@ class Scaled(ScalarFormatter):
         for axis in self._axes():
             text = axis.label.get_text()
             own, written = self._labels.get(axis, ("", ""))
-            own = own if text == written else text
+            if text != written:  # it was set anew, perhaps from what was written here
+                own = _without_factor(text)
             new = self._scaled(own, axis.axis_name == "y") if own and len(locs) else own
             self._labels[axis] = own, new
             if new != text:
                 axis.label.set_text(new)
 
     def get_offset(self) -> str:
-        """What stands in the corner: nothing where a label tells it."""
-        return "" if any(own for own, _ in self._labels.values()) else super().get_offset()
+        """What stands in the corner: nothing where labels tell it."""
+        told = [own for axis, (own, _) in self._labels.items() if axis.get_visible()]
+        return "" if told and all(told) else super().get_offset()
+
+    def let_go(self, axes: Any) -> None:
+        """Give labels back to axes that have another formatter by now, as a logarithmic scale brings one."""
+        for axis in (axes.xaxis, axes.yaxis):
+            own, written = self._labels.get(axis, ("", ""))
+            if written and axis.get_major_formatter() is not self and axis.label.get_text() == written:
+                axis.label.set_text(own)
+                del self._labels[axis]
 
     def _axes(self) -> list[Any]:
         """The axis, and those that share its ticks."""
@@ -71,8 +81,19 @@ def with_factor(text: str, power: int) -> str:
     if place is None:
         return f"{text} [{factor}]"
     unit = place[1]
-    inside = factor if unit == "1" else f"{factor}/{unit[2:]}" if unit.startswith("1/") else f"{factor} {unit}"
+    per = re.match(r"1\s*/\s*", unit)
+    inside = factor if unit == "1" else f"{factor}/{unit[per.end() :]}" if per else f"{factor} {unit}"
     return text[: place.start(1)] + inside + text[place.end(1) :]
+
+
+def _without_factor(text: str) -> str:
+    """A label without the factor that `with_factor` has written.
+
+    >>> _without_factor(with_factor("k [1/s]", 9)), _without_factor(with_factor("y [m]", -9))
+    ('k [1/s]', 'y [m]')
+    """
+    text = re.sub(r"(?<=\[)1e−?\d+/", "1/", text)
+    return re.sub(r"(?<=\[)1e−?\d+ (?=\S)| \[1e−?\d+\]", "", text)
 
 
 def _bracket(text: str) -> re.Match[str] | None:

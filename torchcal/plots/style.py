@@ -1,5 +1,6 @@
 """One look for every figure, set on the axes themselves so that ``rcParams`` stay as the user has them."""
 
+import functools
 import re
 import textwrap
 from collections.abc import Mapping, Sequence
@@ -99,7 +100,10 @@ def scale_in_label(*axes: "Axis") -> None:
 
     for axis in axes:
         if type(axis.get_major_formatter()) is ScalarFormatter:
-            axis.set_major_formatter(Scaled())
+            formatter = Scaled()
+            axis.set_major_formatter(formatter)
+            for event in ("xlim_changed", "ylim_changed"):  # a partial object is held; a method would be forgotten
+                axis.axes.callbacks.connect(event, functools.partial(Scaled.let_go, formatter))
 
 
 def legend(ax: "Axes", title: str | None = None, *, beside: bool = False) -> None:
@@ -182,7 +186,7 @@ def label(name: str, units: Mapping[str, str] | None = None, labels: Mapping[str
 
 def wrapped(text: str) -> str:
     """An upright axis label, in lines that a small panel has room for; units and mathematics are not broken."""
-    if len(text) <= 30 or "$" in text.replace(r"\$", ""):
+    if len(text) <= 30 or "\n" in text or "$" in text.replace(r"\$", ""):
         return text
     held = re.sub(r"\[[^\[\]]*\]", lambda unit: re.sub(r"\s", "\xa0", unit[0]), text)
     return textwrap.fill(held, 30).replace("\xa0", " ")

@@ -126,11 +126,15 @@ def evaluate_points(
         bar.close()
         store.write()
     if store.unwritten is not None:
-        warn(
+        text = (
             f"The evaluations could not be kept in {os.fspath(store.path or '')}: {store.unwritten}. What is made of "
-            "them is whole (save it elsewhere), but a rerun will have to evaluate them again.",
-            TorchcalWarning,
+            "them is whole (save it elsewhere), but a rerun will have to evaluate them again."
         )
+        try:
+            warn(text, TorchcalWarning)
+        except TorchcalWarning as warning:  # where warnings are errors
+            _attach_partial(warning, store)
+            raise
     values = np.stack([store.values[key] for key in keys])
     return Evaluations(variables, store.outputs, np.array(points), values)
 
@@ -145,7 +149,7 @@ class _Store:
         self.outputs: tuple[str, ...] | None = None
         self.values: dict[bytes, Array] = {}
         self.changed, self.written = False, time.monotonic()
-        self.unwritten: OSError | None = None
+        self.unwritten: Exception | None = None
         if start is not None and len(start):
             self.outputs = start.outputs
             points = np.ascontiguousarray(start.points)
@@ -178,7 +182,7 @@ class _Store:
         self.written = time.monotonic()
         try:
             self.evaluations().save(self.path)
-        except OSError as error:
+        except (OSError, DomainError) as error:  # the folder may have gone, too
             self.unwritten = error
         else:
             self.changed, self.unwritten = False, None
@@ -188,8 +192,8 @@ def _open_cache(cache: str | os.PathLike[str] | Evaluations | None, variables: t
     if cache is None:
         return None
     if not isinstance(cache, Evaluations):
-        check_target(cache)
-        if not Path(cache).exists():
+        if not (isinstance(cache, str | os.PathLike) and Path(cache).is_file()):  # a whole one is but read
+            check_target(cache)
             return None
         cache = Evaluations.load(cache)
     if cache.variables != variables:
