@@ -118,7 +118,10 @@ def _either_way(search: Search, pairs: list[Model]) -> list[Model]:
         first, second = pair.candidate.terms
         if whole and is_instrument(pair, second) and not is_instrument(pair, first):
             continue
-        known, y = _turned(search, pair)
+        try:
+            known, y = _turned(search, pair)
+        except (SimulatorError, DomainError):  # not every function bears what another one gives
+            continue
         if float(pair.found.whitening.vector(y - pair.found.y).square().sum()) < ANOTHER:
             continue
         one = _hypothetical(search, pair.numbers, pair.log_prior, None, order=_order(search, pair)[::-1])
