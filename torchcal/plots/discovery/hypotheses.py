@@ -1,6 +1,8 @@
 """The ranking of the hypotheses."""
 
 import math
+import re
+import textwrap
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +13,9 @@ from torchcal.plots.discovery.pieces import ACCEPTED, beside, draw_key, finite, 
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+#: Letters of a hypothesis on one line; longer ones have two.
+LINE = 40
 
 
 def ranking(
@@ -88,7 +93,8 @@ def ranking(
             widths = [max(numbers[i], floor) if math.isfinite(numbers[i]) else 0.0 for i in places]
             ax.barh(places, widths, height=0.66, lw=0.7, label=name, zorder=3, **options)
     ax.axvline(0.0, color="0.25", lw=0.7, zorder=4)
-    ax.set_yticks(range(len(rows)), told_apart([_name(item) for item in rows]))
+    names = told_apart([_name(item) for item in rows], 2 * LINE - 6)
+    ax.set_yticks(range(len(rows)), [_in_lines(name) for name in names], linespacing=1.0)
     ax.set_ylim(len(rows) - 0.4, -0.6)
     low = min([number for number in numbers if math.isfinite(number)], default=0.0)
     ax.set_xlim(max(min(low, 0.0) * 1.05, floor), max(top, 0.01) * 1.05 if value == "log_evidence" else 1.0)
@@ -101,6 +107,9 @@ def ranking(
     ax.set_xlabel(shown + (f"\n({left_out} weaker ones not shown)" if left_out else ""))
     style.dress(ax)
     ax.tick_params(axis="y", length=0)
+    for tick in ax.get_yticklabels():
+        if "\n" in tick.get_text():
+            tick.set_fontsize("x-small")
     if legend and len(set(kinds)) > 1:
         draw_key(ax, right=True)
     return ax
@@ -112,3 +121,14 @@ def _name(item: Any) -> str:
     if not item.terms:
         return "base model alone"
     return " + ".join(item.terms) + (f", {region}" if region else "")
+
+
+def _in_lines(name: str) -> str:
+    """A name on one line or two, broken between terms where that will do."""
+    if len(name) <= LINE:
+        return name
+    between = [place.end() - 1 for place in re.finditer(r" \+ ", name)]
+    place = min(between, key=lambda at: max(at, len(name) - at), default=0)
+    if place and max(place, len(name) - place) <= LINE + 2:
+        return f"{name[:place]}\n{name[place + 1 :]}"
+    return textwrap.fill(name, LINE)
