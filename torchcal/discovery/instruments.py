@@ -19,7 +19,7 @@ from torchcal.discovery.search import Search
 from torchcal.simulators import Values
 from torchcal.terms import Term, extend
 
-__all__ = ["is_instrument", "no_instrument", "only_instruments", "unnatural"]
+__all__ = ["no_instrument", "only_instruments", "unnatural", "which_instruments"]
 
 #: Noise sd by which an instrument's reading must fall while the true value rises to be no instrument's: a hard limit is
 #: one. And the least sd, in the data's spread.
@@ -105,21 +105,25 @@ def unnatural(model: Model) -> str:
 
 def only_instruments(model: Model) -> bool:
     """Whether all that a model adds is instruments."""
-    return all(is_instrument(model, term) for term in model.candidate.terms)
+    return all(which_instruments(model))
 
 
-def is_instrument(model: Model, term: Term) -> bool:
-    """Whether a term of a model shows a true value otherwise, and reads nothing else but what has a memory of its own,
-    or counts from the first sample."""
-    if not term.outputs or term.shifts or term.frees or not set(term.rates) <= set(term.states):
-        return False
-    if term.states or term.elapsed:
-        return True
+def which_instruments(model: Model) -> list[bool]:
+    """Which terms of a model show a true value otherwise, and read nothing else but what has a memory of its own, or
+    counts from the first sample."""
     problem = model.found.problem
     drivers = problem.drivers_at_data(model.found.values[None], model.found.warm)
     p = problem.parameters_at_data(model.found.values)
-    readings = [_Reading(problem, term, function, drivers, p) for function in term.outputs.values()]
-    return all(reading.works and reading.is_of_value() for reading in readings)
+
+    def is_one(term: Term) -> bool:
+        if not term.outputs or term.shifts or term.frees or not set(term.rates) <= set(term.states):
+            return False
+        if term.states or term.elapsed:
+            return True
+        readings = (_Reading(problem, term, function, drivers, p) for function in term.outputs.values())
+        return all(reading.works and reading.is_of_value() for reading in readings)
+
+    return [is_one(term) for term in model.candidate.terms]
 
 
 def no_instrument(search: Search, model: Model) -> str:

@@ -12,7 +12,7 @@ from torchcal.discovery.beginnings import blind_rows, is_far, make_up
 from torchcal.discovery.candidates import Candidate, drivers_scale, prepare, replaces
 from torchcal.discovery.explain import removed
 from torchcal.discovery.fitting import Fitted
-from torchcal.discovery.instruments import is_instrument
+from torchcal.discovery.instruments import which_instruments
 from torchcal.discovery.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.residual import Residual
 from torchcal.discovery.screen import screen
@@ -115,8 +115,7 @@ def _either_way(search: Search, pairs: list[Model]) -> list[Model]:
     for pair in leading:
         if len(wanted) == TURNED:
             break
-        first, second = pair.candidate.terms
-        if whole and is_instrument(pair, second) and not is_instrument(pair, first):
+        if whole and which_instruments(pair) == [False, True]:
             continue
         try:
             known, y = _turned(search, pair)

@@ -32,7 +32,6 @@ __all__ = [
     "netcdf_modules",
     "to_arviz",
     "write",
-    "xarray_module",
 ]
 
 FORMAT = 1
@@ -42,11 +41,6 @@ NAME = "torchcal_name"
 
 CHECKSUM = "torchcal_sha256"
 """Attribute of a file that its contents are held against."""
-
-
-def xarray_module() -> Any:
-    """xarray, or an error that says how to get it."""
-    return _optional("xarray")
 
 
 def netcdf_modules() -> tuple[Any, Any, Any]:
@@ -161,7 +155,7 @@ def _texts(attributes: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _dataset(values: Mapping[str, tuple[Any, Tensor]]) -> Any:
-    return xarray_module().Dataset({name: (dims, value.numpy()) for name, (dims, value) in values.items()})
+    return _optional("xarray").Dataset({name: (dims, value.numpy()) for name, (dims, value) in values.items()})
 
 
 def _named_dataset(dimension: str, values: Mapping[str, Tensor]) -> Any:
@@ -172,11 +166,11 @@ def _named_dataset(dimension: str, values: Mapping[str, Tensor]) -> Any:
         while key == dimension or key in variables or (key != name and key in values):
             key += "_"
         variables[key] = (dimension, value.numpy(), {} if key == name else {NAME: name})
-    return xarray_module().Dataset(variables)
+    return _optional("xarray").Dataset(variables)
 
 
 def _common_groups(result: Any) -> dict[str, Any]:
-    xarray = xarray_module()
+    xarray = _optional("xarray")
     estimate = result.map
     groups: dict[str, Any] = {}
     if result.samples is not None:
@@ -238,7 +232,7 @@ def _tree(groups: dict[str, Any], result: Any, extra: Mapping[str, Any]) -> Any:
             "runs": None if recording.runs is None else [_run_fields(run) for run in recording.runs],
         },
     }
-    tree = xarray_module().DataTree.from_dict({f"/{name}": group for name, group in groups.items()})
+    tree = _optional("xarray").DataTree.from_dict({f"/{name}": group for name, group in groups.items()})
     tree.attrs["torchcal"] = json.dumps(meta)
     return tree
 
