@@ -14,9 +14,9 @@ import pytest
 import torch
 
 import torchcal as tc
-from torchcal.discovery.refits import Refit
-from torchcal.discovery.search import Search
-from torchcal.discovery.stop import Stop
+from torchcal.discovery.fits.refits import Refit
+from torchcal.discovery.fits.stop import Stop
+from torchcal.discovery.hypotheses.search import Search
 from torchcal.errors import DomainError, InterruptionWarning
 from torchcal.simulators import Trajectories
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import torchcal as tc
+from torchcal.discovery.hypotheses.verify import within
 from torchcal.discovery.records import (
     Estimate,
     Experiment,
@@ -24,7 +25,6 @@ from torchcal.discovery.records import (
     Scores,
     Table,
 )
-from torchcal.discovery.verify import within
 from torchcal.simulators import Trajectories
 from torchcal.terms import extend
 
@@ -721,7 +721,7 @@ def test_a_threshold_that_the_rest_of_the_data_tells_is_no_reason_to_refuse_a_ho
 
 
 def test_a_name_that_predicts_worse_is_withdrawn(monkeypatch):
-    from torchcal.discovery import verify
+    from torchcal.discovery.hypotheses import verify
 
     monkeypatch.setattr(verify, "compare", lambda *args: (-2.0, 0.5))
     body, motion, library = pushed(0.08)
@@ -737,7 +737,7 @@ def test_a_name_that_predicts_worse_is_withdrawn(monkeypatch):
 
 
 def test_a_best_explanation_that_is_not_probable_enough_is_no_name(monkeypatch, tmp_path):
-    monkeypatch.setattr("torchcal.discovery.verdict.SURE", 0.999)
+    monkeypatch.setattr("torchcal.discovery.verdicts.verdict.SURE", 0.999)
     body, _, x = spring(named(tc.terms.mechanics(), "bias force"), seed=21, **{"bias force__b": 0.3})
     d = quiet(body, tc.Recording(runs=[run_of(x)], noise=0.02), named(tc.terms.mechanics(), "bias force"))
     assert d.verdict == "ambiguous"

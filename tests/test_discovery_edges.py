@@ -8,9 +8,10 @@ import pytest
 import torch
 
 import torchcal as tc
-from torchcal.discovery import verify, where
-from torchcal.discovery.candidates import _shape_points, sized
-from torchcal.discovery.problem import Problem
+from torchcal.discovery.findings import where
+from torchcal.discovery.fits.candidates import _shape_points, sized
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.hypotheses import verify
 from torchcal.errors import DomainError, SimulatorError
 
 F64 = torch.float64

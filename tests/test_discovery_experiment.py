@@ -6,8 +6,8 @@ import pytest
 import torch
 
 import torchcal as tc
-from torchcal.discovery import conditions, experiment
-from torchcal.discovery.problem import Problem
+from torchcal.discovery.findings import conditions, experiment
+from torchcal.discovery.fits.problem import Problem
 from torchcal.simulators import Trajectories
 
 F64 = torch.float64

@@ -9,14 +9,14 @@ import torch
 from scipy.integrate import solve_ivp
 
 import torchcal as tc
-from torchcal.discovery import search as search_module
-from torchcal.discovery.base import calibrate_base
-from torchcal.discovery.candidates import drivers_scale, prepare
-from torchcal.discovery.decision import Decision
-from torchcal.discovery.problem import Problem
-from torchcal.discovery.search import Search
-from torchcal.discovery.sharpen import accurate, sharpen
-from torchcal.discovery.verdict import _second
+from torchcal.discovery.fits.candidates import drivers_scale, prepare
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.fits.sharpen import accurate, sharpen
+from torchcal.discovery.hypotheses import search as search_module
+from torchcal.discovery.hypotheses.base import calibrate_base
+from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.verdicts.decision import Decision
+from torchcal.discovery.verdicts.verdict import _second
 from torchcal.simulators.steps import Steps
 
 F64 = torch.float64

@@ -7,11 +7,11 @@ import pytest
 import torch
 
 import torchcal as tc
-from torchcal.discovery.base import calibrate_base
-from torchcal.discovery.fitting import fit, refit, starts
-from torchcal.discovery.noise import GRID, Noise
-from torchcal.discovery.problem import Problem
-from torchcal.discovery.residual import Residual, _noise_draws
+from torchcal.discovery.fits.fitting import fit, refit, starts
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.hypotheses.base import calibrate_base
+from torchcal.discovery.misfit.noise import GRID, Noise
+from torchcal.discovery.misfit.residual import Residual, _noise_draws
 
 F64 = torch.float64
 

@@ -1,12 +1,13 @@
 """Inputs that were recorded at samples and held from one to the next, or not: what they do between is a guess."""
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
 
 import torchcal as tc
-from torchcal.discovery import given
+from torchcal.discovery.verdicts import given
 from torchcal.errors import DomainError
 
 N, STEP = 150, 0.1
@@ -136,7 +137,7 @@ def test_another_hold_for_each_run():
 
 
 @pytest.mark.parametrize("sd", [1e-7, 1e-9, 1e-160])
-def test_a_noise_too_small_for_the_arithmetic_is_taken_as_large_as_it_must_be(sd: float) -> None:
+def test_a_noise_too_small_for_the_arithmetic_is_taken_as_large_as_it_must_be(sd: float, tmp_path: Path) -> None:
     # χ² of 1e18 has no digits left for what one explanation is better than another by.
     x = torch.linspace(0, 5, 40, dtype=torch.float64)
     generator = torch.Generator().manual_seed(0)
@@ -153,6 +154,9 @@ def test_a_noise_too_small_for_the_arithmetic_is_taken_as_large_as_it_must_be(sd
     assert any("arithmetic" in text for text in d.symptoms)
     assert not any("smaller one" in text for text in d.symptoms)
     assert d.noise.sd["y"] > sd
+    assert d.noise.enlarged == pytest.approx(d.noise.sd["y"] / sd)
+    d.report(tmp_path / "report.html")
+    assert "times as large, since arithmetic cannot weigh it" in (tmp_path / "report.html").read_text("utf-8")
     assert 0.1 * given.DIGITS < d.base.chi2 < 1.01 * given.DIGITS  # less what is set aside
 
 

@@ -9,10 +9,10 @@ from scipy import stats
 from scipy.linalg import toeplitz
 
 import torchcal as tc
-from torchcal.discovery.base import calibrate_base
-from torchcal.discovery.likeliest import Tangents, alone, log_likelihood, settled, with_unknown
-from torchcal.discovery.noise import GRID
-from torchcal.discovery.problem import Problem
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.hypotheses.base import calibrate_base
+from torchcal.discovery.misfit.likeliest import Tangents, alone, log_likelihood, settled, with_unknown
+from torchcal.discovery.misfit.noise import GRID
 
 F64 = torch.float64
 TERMS = ("cubic drag", "quadratic drag", "Coulomb friction", "cubic stiffness")

@@ -8,11 +8,11 @@ import pytest
 import torch
 
 import torchcal as tc
-from torchcal.discovery.channels import Channel
-from torchcal.discovery.lines import Lines
-from torchcal.discovery.local import Span
-from torchcal.discovery.problem import Problem
-from torchcal.discovery.screen import _cuts
+from torchcal.discovery.fits.local import Span
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.hypotheses.screen import _cuts
+from torchcal.discovery.misfit.channels import Channel
+from torchcal.discovery.misfit.lines import Lines
 
 F64 = torch.float64
 

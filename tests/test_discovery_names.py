@@ -6,9 +6,11 @@ import torch
 from scipy.integrate import solve_ivp
 
 import torchcal as tc
-from torchcal.discovery import candidates, doubts, outliers
-from torchcal.discovery.problem import Problem
-from torchcal.discovery.search import Search
+from torchcal.discovery.fits import candidates
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.misfit import outliers
+from torchcal.discovery.verdicts import doubts
 from torchcal.errors import ConvergenceWarning
 
 F64 = torch.float64

@@ -10,12 +10,12 @@ import pytest
 import torch
 
 import torchcal as tc
-from torchcal.discovery.base import calibrate_base
-from torchcal.discovery.fitting import fit
-from torchcal.discovery.noise import Noise, estimate
-from torchcal.discovery.outliers import lone, spikes
-from torchcal.discovery.problem import Problem
-from torchcal.discovery.search import Search
+from torchcal.discovery.fits.fitting import fit
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.hypotheses.base import calibrate_base
+from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.misfit.noise import Noise, estimate
+from torchcal.discovery.misfit.outliers import lone, spikes
 
 F64 = torch.float64
 

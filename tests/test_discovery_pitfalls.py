@@ -12,10 +12,11 @@ import torch
 from scipy.integrate import solve_ivp
 
 import torchcal as tc
-from torchcal.discovery import conditions, rounds
-from torchcal.discovery.fitting import starts
-from torchcal.discovery.problem import Problem
-from torchcal.discovery.words import paragraph
+from torchcal.discovery import rounds
+from torchcal.discovery.findings import conditions
+from torchcal.discovery.findings.words import paragraph
+from torchcal.discovery.fits.fitting import starts
+from torchcal.discovery.fits.problem import Problem
 
 F64 = torch.float64
 

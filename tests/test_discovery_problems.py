@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import torchcal as tc
-from torchcal.discovery import decision as decision_of
+from torchcal.discovery.verdicts import decision as decision_of
 from torchcal.errors import ConvergenceWarning, DomainError, SimulatorError
 
 F64 = torch.float64

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 import torchcal as tc
-from torchcal.discovery import instruments
-from torchcal.discovery.fitting import fit
-from torchcal.discovery.outliers import spikes
-from torchcal.discovery.problem import Problem
+from torchcal.discovery.fits.fitting import fit
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.misfit.outliers import spikes
+from torchcal.discovery.verdicts import instruments
 from torchcal.errors import ConvergenceWarning
 
 F64 = torch.float64

@@ -7,10 +7,10 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 import torchcal as tc
-from torchcal.discovery.curves import MOST_CURVES, smooth_columns, spread
-from torchcal.discovery.fitting import fit
-from torchcal.discovery.outliers import spikes
-from torchcal.discovery.problem import Problem
+from torchcal.discovery.fits.fitting import fit
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.misfit.curves import MOST_CURVES, smooth_columns, spread
+from torchcal.discovery.misfit.outliers import spikes
 
 F64 = torch.float64
 

@@ -8,9 +8,9 @@ import torch
 from scipy.integrate import solve_ivp
 
 import torchcal as tc
-from torchcal.discovery.problem import Problem
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.rounds import settle
-from torchcal.discovery.search import Search
 from torchcal.discovery.several import _one_fewer, _refit_sets, refit_several
 from torchcal.discovery.windows import _rivals
 
@@ -73,7 +73,7 @@ def test_everything_is_weighed_by_the_noise_that_is_found_later(monkeypatch):
     search = searched(["square", "twice the square", "wave"])
     before = {(w.candidate, w.driver, w.low, w.high): w.z for w in search.local}
     louder = dataclasses.replace(search.noise, sd=1.2 * search.noise.sd)
-    monkeypatch.setattr("torchcal.discovery.search.suited", lambda *given: louder)
+    monkeypatch.setattr("torchcal.discovery.hypotheses.search.suited", lambda *given: louder)
     search.reweigh()
     search.merge()
     assert search.aliases == {0: [1]}

@@ -12,13 +12,15 @@ import pytest
 import torch
 
 import torchcal as tc
-from torchcal.discovery import doubts, explain, local, symptoms, where, words
-from torchcal.discovery import where_in_words as where_text
-from torchcal.discovery.channels import Channel
-from torchcal.discovery.places import Place
-from torchcal.discovery.problem import Problem
+from torchcal.discovery.findings import symptoms, where, words
+from torchcal.discovery.findings import where_in_words as where_text
+from torchcal.discovery.findings.where_in_words import where_in_words
+from torchcal.discovery.fits import local
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.misfit.channels import Channel
+from torchcal.discovery.misfit.places import Place
 from torchcal.discovery.records import Estimate, Experiment, Hypothesis, Limit, Location, Table
-from torchcal.discovery.where_in_words import where_in_words
+from torchcal.discovery.verdicts import doubts, explain
 from torchcal.report import diagnosis_page
 
 F64 = torch.float64

@@ -8,7 +8,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 import torchcal as tc
-from torchcal.discovery import verdict
+from torchcal.discovery.verdicts import verdict
 from torchcal.display import NONE
 
 F64 = torch.float64

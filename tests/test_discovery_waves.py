@@ -10,12 +10,12 @@ from scipy.integrate import solve_ivp
 
 import torchcal as tc
 from torchcal import plots
-from torchcal.discovery.channels import channels
-from torchcal.discovery.places import Change, evidence_of
-from torchcal.discovery.problem import Problem
-from torchcal.discovery.search import Search
-from torchcal.discovery.waves import MOST_RUNS, Waves, _frequencies, _waves
-from torchcal.discovery.where import _larger_than_all
+from torchcal.discovery.findings.where import _larger_than_all
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.misfit.channels import channels
+from torchcal.discovery.misfit.places import Change, evidence_of
+from torchcal.discovery.misfit.waves import MOST_RUNS, Waves, _frequencies, _waves
 
 F64 = torch.float64
 

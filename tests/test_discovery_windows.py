@@ -12,12 +12,12 @@ import torch
 from scipy.integrate import solve_ivp
 
 import torchcal as tc
-from torchcal.discovery.doubts import CLEARLY, doubt
-from torchcal.discovery.local import Span, localised
+from torchcal.discovery.fits.local import Span, localised
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.hypotheses.screen import Window, windows_of
+from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.nameless import _elsewhere, _where_possible, refit_nameless
-from torchcal.discovery.problem import Problem
-from torchcal.discovery.screen import Window, windows_of
-from torchcal.discovery.search import Search
+from torchcal.discovery.verdicts.doubts import CLEARLY, doubt
 from torchcal.discovery.windows import _beyond_the_edge
 from torchcal.errors import SimulatorError
 from torchcal.terms import extend

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import torchcal as tc
-from torchcal.discovery.as_json import plain
+from torchcal.discovery.findings.as_json import plain
 from torchcal.errors import DomainError
 from torchcal.files import check_target, replacing
 

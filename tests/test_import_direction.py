@@ -38,6 +38,8 @@ ROOMS = (
     "discovery",
     "cli",
 )
+DISCOVERY = ("records", "fits", "misfit", "hypotheses", "verdicts", "findings")
+"""The rooms within discovery, likewise; what lies beside them is the search itself, and imports from all of them."""
 PYRO_ROOMS = {"priors", "models", "inference"}
 OPTIONAL = {"arviz", "cantera", "dask", "distributed", "h5netcdf", "pandas", "pint", "scipy", "xarray"}
 
@@ -101,6 +103,14 @@ def imports(source: str, module: str) -> Iterator[Import]:
     yield from visit(ast.parse(source), True)
 
 
+def below(module: str, target: str) -> bool:
+    """Whether a room within discovery would import from one below it, or from beside them."""
+    mine, its = ([*name.split("."), "", ""][1:3] for name in (module, target))
+    if mine[0] != "discovery" or its[0] != "discovery" or mine[1] not in DISCOVERY:
+        return False
+    return its[1] not in DISCOVERY or DISCOVERY.index(its[1]) > DISCOVERY.index(mine[1])
+
+
 def violations(source: str, module: str) -> list[str]:
     """What the imports of `module` do against the rules, one sentence each."""
     room = room_of(module)
@@ -118,6 +128,8 @@ def violations(source: str, module: str) -> list[str]:
                 )
             elif ROOMS.index(target) > ROOMS.index(room):
                 found.append(f"{where}: {room} imports {item.target}, but {target} stands below {room}")
+            elif below(module, item.target):
+                found.append(f"{where} imports {item.target}, which stands below it in discovery")
         if top == "pyro" and room not in PYRO_ROOMS:
             found.append(f"{where} imports {item.target}; Pyro is for {sorted(PYRO_ROOMS)} alone")
         if top in OPTIONAL and item.eager:
@@ -154,6 +166,11 @@ def test_importing_torchcal_imports_no_optional_package():
         ("torchcal.polychaos.__init__", "from .basis import Basis\nfrom torchcal.polychaos import rules", 0),
         ("torchcal.polychaos.basis", "from ..errors import DomainError\nfrom . import rules", 0),
         ("torchcal.polychaos.basis", "from ..embeddings import Gaussian", 1),
+        ("torchcal.discovery.fits.fitting", "from torchcal.discovery.records import Table", 0),
+        ("torchcal.discovery.fits.fitting", "from torchcal.discovery.misfit.noise import Noise", 1),
+        ("torchcal.discovery.misfit.noise", "from ..verdicts import verdict", 1),
+        ("torchcal.discovery.findings.words", "from torchcal.discovery.windows import refit_windows", 1),
+        ("torchcal.discovery.windows", "from torchcal.discovery.findings.words import say", 0),
         ("torchcal.nowhere", "import math", 1),
         ("torchcal.models", "import pyro\nfrom pyro.infer import NUTS", 0),
         ("torchcal.likelihoods", "def f():\n    from pyro import sample", 1),

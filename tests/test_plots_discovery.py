@@ -12,7 +12,7 @@ import torch
 
 from torchcal import plots
 from torchcal.data import Recording, Run
-from torchcal.discovery import local
+from torchcal.discovery.fits import local
 from torchcal.discovery.records import (
     Estimate,
     Experiment,

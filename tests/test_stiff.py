@@ -10,9 +10,9 @@ import torch
 from scipy.integrate import solve_ivp
 
 import torchcal as tc
-from torchcal.discovery.fitting import fit
-from torchcal.discovery.problem import Problem
-from torchcal.discovery.sharpen import sharpen
+from torchcal.discovery.fits.fitting import fit
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.fits.sharpen import sharpen
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.inference.summary import settings_of
 from torchcal.results.reading import _with_steps

@@ -8,7 +8,7 @@ from typing import ParamSpec, TypeVar
 
 import torch
 
-__all__ = ["SHARED", "few_threads", "with_few_threads"]
+__all__ = ["SHARED", "few_threads", "with_torch_settings"]
 
 #: Numbers of which each thread has so many or more: with fewer it waits longer for the others than it computes.
 SHARED = 2**18
@@ -41,7 +41,7 @@ def few_threads(numbers: int = 0) -> Iterator[None]:
             _GIVEN.__dict__.pop("count", None)
 
 
-def with_few_threads(function: Callable[_P, _R]) -> Callable[_P, _R]:
+def with_torch_settings(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """A function that has one thread, but where it asks for more, and derivatives, also within ``torch.no_grad()``.
 
     Warnings are told of the user's line, through it.

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.concealed.workers import run_all
-from torchcal.discovery.as_json import plain
+from torchcal.discovery.findings.as_json import plain
 
 NUMBER = r"[-+0-9.einfa]+"
 REGION = re.compile(rf"^\s*(?:(?P<low>{NUMBER}) < )?(?P<driver>.+?)(?: (?P<sign>[<>]) (?P<end>{NUMBER}))?\s*$")

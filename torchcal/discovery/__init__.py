@@ -1,7 +1,8 @@
 """Discovery: detect a mismatch, locate it, name it, model it, prove it."""
 
 from torchcal.discovery.diagnose import diagnose
-from torchcal.discovery.embedded import Embedded
+from torchcal.discovery.findings.result import Diagnosis
+from torchcal.discovery.misfit.embedded import Embedded
 from torchcal.discovery.records import (
     Estimate,
     Experiment,
@@ -16,7 +17,6 @@ from torchcal.discovery.records import (
     Scores,
     Table,
 )
-from torchcal.discovery.result import Diagnosis
 
 __all__ = [
     "Diagnosis",

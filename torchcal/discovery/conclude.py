@@ -4,74 +4,83 @@ import dataclasses
 import math
 import time
 
-import torch
 from torch import Tensor
 
 from torchcal.data import Recording
-from torchcal.discovery import explain, verify
-from torchcal.discovery.decision import Decision
-from torchcal.discovery.embedded import embed_each, model_error_sd
-from torchcal.discovery.experiment import propose
-from torchcal.discovery.fitting import Fitted
-from torchcal.discovery.given import begun_elsewhere, held_otherwise
-from torchcal.discovery.likeliest import settled
-from torchcal.discovery.limits import limits
-from torchcal.discovery.model import Model
-from torchcal.discovery.noise import Noise
-from torchcal.discovery.own_noise import beside
-from torchcal.discovery.ranking import ranking
+from torchcal.discovery.findings.experiment import propose
+from torchcal.discovery.findings.limits import limits
+from torchcal.discovery.findings.ranking import ranking
+from torchcal.discovery.findings.result import Diagnosis
+from torchcal.discovery.findings.symptoms import more_than_replicates, symptoms, unlike
+from torchcal.discovery.findings.where import locate, missing_rate, needed_shifts
+from torchcal.discovery.fits.fitting import Fitted
+from torchcal.discovery.hypotheses import verify
+from torchcal.discovery.hypotheses.model import Model
+from torchcal.discovery.hypotheses.own_noise import beside
+from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.misfit.embedded import embed_each, model_error_sd
+from torchcal.discovery.misfit.likeliest import settled
+from torchcal.discovery.misfit.noise import Noise
 from torchcal.discovery.records import Scores, Table
-from torchcal.discovery.result import Diagnosis
-from torchcal.discovery.search import Search
-from torchcal.discovery.symptoms import more_than_replicates, symptoms, unlike
-from torchcal.discovery.verdict import PLAINLY_WHITE
-from torchcal.discovery.where import locate, missing_rate, needed_shifts
+from torchcal.discovery.verdicts import explain
+from torchcal.discovery.verdicts.decision import Decision
+from torchcal.discovery.verdicts.given import begun_elsewhere, held_otherwise
+from torchcal.discovery.verdicts.lost import is_lost, misfit_in_spreads
+from torchcal.discovery.verdicts.verdict import PLAINLY_WHITE
 from torchcal.errors import ConvergenceWarning, warn
 from torchcal.simulators import Parameter, Simulator, Trajectories, is_value_of
 from torchcal.terms import Term, extend
 
-__all__ = ["conclude"]
+__all__ = ["Asked", "conclude"]
 
-#: RMSE of a calibrated base, in the data's spread, from which on it explains nothing.
-NO_BETTER = 0.95
-#: Share of χ² by which a fit must be worse than a constant's to be so.
-WORSE = 1e-3
 #: Probability of what is tied from which on its noise is told.
 HALF = 0.5
 #: Power of the stated detection limits.
 POWER = 0.95
 
 
+@dataclasses.dataclass(frozen=True)
+class Asked:
+    """What the user asked.
+
+    Args:
+        simulator: The base model.
+        recording: The data.
+        terms: All that were given, those that the simulator holds already too.
+        confidence: As in `diagnose`.
+        seed: As in `diagnose`.
+        begun: When, by ``time.perf_counter``.
+    """
+
+    simulator: Simulator
+    recording: Recording
+    terms: list[Term]
+    confidence: float
+    seed: int
+    begun: float
+
+
 def conclude(
     search: Search,
     decision: Decision,
-    simulator: Simulator,
-    recording: Recording,
     mask: Tensor | None,
-    confidence: float,
-    begun: float,
-    terms: list[Term],
-    seed: int,
-    suspect: tuple[str, ...],
-    interrupted: str,
+    asked: Asked,
+    *,
+    suspect: tuple[str, ...] = (),
+    interrupted: str = "",
 ) -> Diagnosis:
     """The diagnosis of a search that has ended.
 
     Args:
         search: With its models; estimates of noise are still made for those that are told.
         decision: The verdict on them.
-        simulator: The user's.
-        recording: The data.
-        mask: Which are held out, or None.
-        confidence: As in `diagnose`.
-        begun: When it began, by ``time.perf_counter``.
-        terms: All that were given, those that the simulator holds already too.
-        seed: As in `diagnose`.
+        mask: Which data are held out, or None.
+        asked: By the user.
         suspect: Terms that may explain what was set aside as outliers.
         interrupted: In words, or empty.
     """
     best = decision.best
-    contained = [term for term in terms if all(term is not one for one in search.terms)]
+    contained = [term for term in asked.terms if all(term is not one for one in search.terms)]
     told = [best] if best is not None else decision.tied_models if decision.none + decision.base < HALF else []
     if told and (noise := beside(search, told[0])) is not search.noise:
         search.take(noise, told)  # what is told of them rests on the noise beside them
@@ -80,15 +89,11 @@ def conclude(
         search.examine(shown)
     base = explain.fit_record(search.base, search.structure, ())
     final = base if best is None else explain.fit_record(best.found, best.structure, best.names, best.window)
-    lost = decision.verdict == "unexplained" and _explains_nothing(search)
-    lost = lost or (best is None and _worse_than_constant(search))
+    lost = is_lost(search, decision)
     _warn(search, lost)
     before = _scores(search, search.base, mask)
     after = None if best is None else _scores(search, best.found, mask)
-    if best is None:
-        improved: Simulator = simulator
-    else:
-        improved = _improved(simulator, best)
+    improved = asked.simulator if best is None else _improved(asked.simulator, best)
     left = search.base if best is None else best.found
     apart = unlike(search, left) if decision.verdict in ("consistent", "named") else []
     any_unlike = bool(apart)
@@ -115,13 +120,15 @@ def conclude(
         if decision.verdict == "consistent"
         else locate(search, shown, named=best is not None),
         ranking=ranking(search, decision, mask),
-        detection_limit=limits(search, 1.0 - confidence, POWER, contained),
+        detection_limit=limits(search, 1.0 - asked.confidence, POWER, contained),
         remaining=remaining,
         before=before,
         after=after,
         improved=improved,
         symptoms=[*apart, *symptoms(search, best)],
-        noise=_told_noise(search, decision, 1.0 - confidence).record(search.problem),
+        noise=dataclasses.replace(
+            _told_noise(search, decision, 1.0 - asked.confidence).record(search.problem), enlarged=search.coarser
+        ),
         base=base,
         final=final,
         embedded=Table(
@@ -139,15 +146,15 @@ def conclude(
             for term in contained
             if not term.parameters
         ],
-        recording=recording,
-        simulator=simulator,
+        recording=asked.recording,
+        simulator=asked.simulator,
         held_out=mask,
-        set_aside=recording.observed_once & ~search.problem.keep,
+        set_aside=asked.recording.observed_once & ~search.problem.keep,
         p_detect=search.p_detect,
-        confidence=confidence,
-        library=[term.name for term in terms],
+        confidence=asked.confidence,
+        library=[term.name for term in asked.terms],
         settings={
-            "seed": seed,
+            "seed": asked.seed,
             "withdrawn": decision.withdrawn,
             "doubt": decision.doubt,
             "depends": depends,
@@ -160,7 +167,7 @@ def conclude(
             "region": None if best is None else best.where,
             "solver": _solver(search.problem.simulator),
         },
-        seconds=time.perf_counter() - begun,
+        seconds=time.perf_counter() - asked.begun,
         drivers=search.drivers(),
     )
 
@@ -201,40 +208,6 @@ def _improved(simulator: Simulator, best: Model) -> Simulator:
     return improved
 
 
-def _explains_nothing(search: Search) -> bool:
-    """Whether the calibrated base explains no more than a constant would."""
-    return _size(search) > NO_BETTER and not _is_constant(search)
-
-
-def _worse_than_constant(search: Search) -> bool:
-    """Whether a constant of each output fits better than the calibrated base: never where the base holds constants."""
-    found = search.base
-    outputs = found.problem.output_of
-    columns = found.whitening(torch.stack([(outputs == k).double() for k in outputs.unique()], dim=-1))
-    y = found.whitening.vector(found.problem.y)
-    left = y - columns @ torch.linalg.lstsq(columns, y[:, None]).solution[:, 0]
-    return found.chi2 > (1 + WORSE) * float(left.square().sum())
-
-
-def _is_constant(search: Search) -> bool:
-    """Whether the calibrated base is the mean of each output, as one is that has no more to say."""
-    found, recording = search.base, search.problem.recording
-    weight = found.whitening.sd.square().reciprocal()
-    for k in found.problem.output_of.unique():
-        mine = found.problem.output_of == k
-        mean = float((weight[mine] * found.problem.y[mine]).sum() / weight[mine].sum())
-        spread = recording.spread[found.problem.index[mine]]
-        if bool(((found.y[mine] - mean).abs() > (1 - NO_BETTER) * spread).any()):
-            return False
-    return True
-
-
-def _size(search: Search) -> float:
-    """RMSE of the calibrated base, in the spread of the data."""
-    found = search.base
-    return float((found.residual / search.problem.recording.spread[found.problem.index]).square().mean().sqrt())
-
-
 def _warn(search: Search, lost: bool) -> None:
     if search.base.agreeing < 0.2:
         warn(
@@ -244,8 +217,9 @@ def _warn(search: Search, lost: bool) -> None:
         )
     if lost:
         warn(
-            f"The calibrated base explains no more than a constant would (its RMSE is {_size(search):.2g} of the "
-            "data's spread). Check the units and the simulator, and give initial= or bounds to its parameters.",
+            "The calibrated base explains no more than a constant would (its RMSE is "
+            f"{misfit_in_spreads(search):.2g} of the data's spread). Check the units and the simulator, and give "
+            "initial= or bounds to its parameters.",
             ConvergenceWarning,
         )
 

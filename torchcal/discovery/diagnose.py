@@ -11,32 +11,32 @@ from tqdm.auto import tqdm
 
 from torchcal.checks import outside_inference_mode, whole
 from torchcal.data import Recording
-from torchcal.discovery import verify
-from torchcal.discovery.candidates import base_columns
-from torchcal.discovery.conclude import conclude
-from torchcal.discovery.decision import Decision
-from torchcal.discovery.fitting import Fitted, starts
-from torchcal.discovery.given import resolved, told_apart
+from torchcal.discovery.conclude import Asked, conclude
+from torchcal.discovery.findings.result import Diagnosis
+from torchcal.discovery.fits.candidates import base_columns
+from torchcal.discovery.fits.fitting import Fitted, starts
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.fits.trial import check_repeats
+from torchcal.discovery.hypotheses import verify
+from torchcal.discovery.hypotheses.own_noise import explains
+from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.nameless import refit_nameless
-from torchcal.discovery.own_noise import explains
-from torchcal.discovery.problem import Problem
-from torchcal.discovery.result import Diagnosis
 from torchcal.discovery.rounds import settle, with_all, with_explained, without_others
-from torchcal.discovery.search import Search
 from torchcal.discovery.several import refit_several
-from torchcal.discovery.trial import check_repeats
-from torchcal.discovery.verdict import decide
+from torchcal.discovery.verdicts.decision import Decision
+from torchcal.discovery.verdicts.given import resolved, told_apart
+from torchcal.discovery.verdicts.verdict import decide
 from torchcal.display import NONE
 from torchcal.errors import DomainError, EmbeddingError, InterruptionWarning, RecordingError, warn
 from torchcal.simulators import ODESimulator, Simulator, is_value_of
 from torchcal.simulators.executor import check_executor
 from torchcal.terms import Term, extend
-from torchcal.threads import with_few_threads
+from torchcal.threads import with_torch_settings
 
 __all__ = ["diagnose"]
 
 
-@with_few_threads
+@with_torch_settings
 def diagnose(
     simulator: Simulator,
     recording: Recording,
@@ -63,9 +63,9 @@ def diagnose(
             a candidate frees them.
         recording: The data; of a `Recording(runs=...)` for an `ODESimulator`.
         candidates: Terms that might have been left out. A later term replaces an earlier one of the same name.
-        holdout: None to hold out the last quarter (see `torchcal.discovery.verify.choose`), or blocks within where the
-            rest leaves the base, or what is named, too open to predict it; False for nothing, a share, or a bool array,
-            True where held out.
+        holdout: None to hold out the last quarter of every run, the upper quarter of one condition, or of several the
+            quarter of the data farthest from their centre; or blocks within where the rest leaves the base, or what is
+            named, too open to predict it. False for nothing, a share, or a bool array, True where held out.
         fixed: Values of parameters that are not calibrated.
         confidence: 1 minus the probability of calling noise a mismatch: above 0.5, and at most 0.998, as a thousand
             simulated residuals tell no more.
@@ -92,11 +92,11 @@ def diagnose(
             Ctrl-C, the diagnosis keeps the refits that have ended: it names nothing, and says what it has not refitted.
     """
     begun = time.perf_counter()
-    terms = _check(simulator, recording, candidates, confidence)
+    given = _check(simulator, recording, candidates, confidence)
     max_terms, num_starts = whole("max_terms", max_terms, 1), whole("num_starts", num_starts, 1)
     seed = whole("seed", seed, 0)
     check_executor(executor, diagnose)
-    given = terms
+    asked = Asked(simulator, recording, given, confidence, seed, begun)
     terms = [term for term in given if not _contains(simulator, term)]
     problem = Problem.of(simulator, resolved(recording)).keeping(recording.observed_once)
     try:
@@ -162,9 +162,7 @@ def diagnose(
             interrupted = _interruption(search)
             if interrupted:
                 _hold_back(search, decision)
-            return conclude(
-                search, decision, simulator, recording, mask, confidence, begun, given, seed, suspect, interrupted
-            )
+            return conclude(search, decision, mask, asked, suspect=suspect, interrupted=interrupted)
     finally:
         bar.close()
 

@@ -17,9 +17,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchcal.discovery.candidates import Candidate, prepare
-from torchcal.discovery.channels import channels
-from torchcal.discovery.local import (
+from torchcal.discovery.fits.candidates import Candidate, prepare
+from torchcal.discovery.fits.local import (
     EDGE,
     ENDS,
     WIDTH_OF_EDGE,
@@ -30,10 +29,11 @@ from torchcal.discovery.local import (
     localised,
     multiplied,
 )
-from torchcal.discovery.model import PRIOR, Hypothetical, Model
-from torchcal.discovery.own_noise import likeliest_alone
-from torchcal.discovery.search import BETTER, Search
-from torchcal.discovery.verdict import PLAINLY_WHITE
+from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
+from torchcal.discovery.hypotheses.own_noise import likeliest_alone
+from torchcal.discovery.hypotheses.search import BETTER, Search
+from torchcal.discovery.misfit.channels import channels
+from torchcal.discovery.verdicts.verdict import PLAINLY_WHITE
 from torchcal.discovery.windows import long_enough, stepped
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators import Parameter, Trajectories, is_value_of

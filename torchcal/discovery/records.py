@@ -122,6 +122,7 @@ class NoiseModel:
         range: Smallest and largest sd by output, where it varies.
         memory: Where runs are sampled unevenly, whether correlated noise forgets with ``"time"``, the correlation being
             that over the usual gap, or with every ``"sample"``; else empty.
+        enlarged: How many times as large as given noise was taken that no arithmetic can weigh; else 1.
     """
 
     sd: dict[str, float]
@@ -131,6 +132,7 @@ class NoiseModel:
     quantisation: dict[str, float] = dataclasses.field(default_factory=dict)
     range: dict[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
     memory: str = ""
+    enlarged: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,11 +6,11 @@ from typing import Any
 
 import torch
 
-from torchcal.discovery.base import MOST
-from torchcal.discovery.fitting import refit
-from torchcal.discovery.likeliest import log_normal
-from torchcal.discovery.model import Model
-from torchcal.discovery.own_noise import (
+from torchcal.discovery.fits.fitting import refit
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.hypotheses.base import MOST
+from torchcal.discovery.hypotheses.model import Model
+from torchcal.discovery.hypotheses.own_noise import (
     EXPLAINED,
     explains,
     fits_by_chance,
@@ -23,12 +23,12 @@ from torchcal.discovery.own_noise import (
     outliers_alone,
     pairs_by_chance,
 )
-from torchcal.discovery.problem import Problem
-from torchcal.discovery.residual import Residual
-from torchcal.discovery.search import Search
+from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.hypotheses.singles import refit_singles
+from torchcal.discovery.misfit.likeliest import log_normal
+from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.several import refit_several, scores_beside
-from torchcal.discovery.singles import refit_singles
-from torchcal.discovery.verdict import WHITE, base_alone
+from torchcal.discovery.verdicts.verdict import WHITE, base_alone
 from torchcal.discovery.windows import refit_local
 
 __all__ = ["settle", "with_all", "with_explained", "without_others"]

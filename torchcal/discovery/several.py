@@ -8,16 +8,16 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchcal.discovery.beginnings import blind_rows, is_far, make_up
-from torchcal.discovery.candidates import Candidate, drivers_scale, prepare, replaces
-from torchcal.discovery.explain import removed
-from torchcal.discovery.fitting import Fitted
-from torchcal.discovery.instruments import which_instruments
-from torchcal.discovery.model import PRIOR, Hypothetical, Model
-from torchcal.discovery.residual import Residual
-from torchcal.discovery.screen import screen
-from torchcal.discovery.search import BETTER, Search
-from torchcal.discovery.verdict import PLAINLY_WHITE
+from torchcal.discovery.fits.candidates import Candidate, drivers_scale, prepare, replaces
+from torchcal.discovery.fits.fitting import Fitted
+from torchcal.discovery.hypotheses.beginnings import blind_rows, is_far, make_up
+from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
+from torchcal.discovery.hypotheses.screen import screen
+from torchcal.discovery.hypotheses.search import BETTER, Search
+from torchcal.discovery.misfit.residual import Residual
+from torchcal.discovery.verdicts.explain import removed
+from torchcal.discovery.verdicts.instruments import which_instruments
+from torchcal.discovery.verdicts.verdict import PLAINLY_WHITE
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.terms import extend
 

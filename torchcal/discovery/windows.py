@@ -7,14 +7,14 @@ from collections.abc import Sequence
 
 import torch
 
-from torchcal.discovery.candidates import prepare
-from torchcal.discovery.channels import responses
-from torchcal.discovery.local import EDGE, ENDS, SHORT, WIDTH_OF_EDGE, WIDTHS, Span, beyond, is_window, localised
-from torchcal.discovery.model import PRIOR, Hypothetical, Model
-from torchcal.discovery.residual import Residual
-from torchcal.discovery.screen import Window, windows_of
-from torchcal.discovery.search import Search
-from torchcal.discovery.verdict import PLAINLY_WHITE
+from torchcal.discovery.fits.candidates import prepare
+from torchcal.discovery.fits.local import EDGE, ENDS, SHORT, WIDTH_OF_EDGE, WIDTHS, Span, beyond, is_window, localised
+from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
+from torchcal.discovery.hypotheses.screen import Window, windows_of
+from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.misfit.channels import responses
+from torchcal.discovery.misfit.residual import Residual
+from torchcal.discovery.verdicts.verdict import PLAINLY_WHITE
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators import Trajectories
 

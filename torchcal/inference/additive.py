@@ -19,12 +19,12 @@ from torchcal.priors import CoefficientPrior, Flat
 from torchcal.propagation import NISP
 from torchcal.results import AdditiveCalibration, MapEstimate, sigma_unit
 from torchcal.simulators import Simulator
-from torchcal.threads import few_threads, with_few_threads
+from torchcal.threads import few_threads, with_torch_settings
 
 __all__ = ["calibrate_additive"]
 
 
-@with_few_threads
+@with_torch_settings
 def calibrate_additive(
     simulator: Simulator,
     recording: Recording,

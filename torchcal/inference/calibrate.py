@@ -37,12 +37,12 @@ from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results import Calibration, MapEstimate
 from torchcal.results.in_time import check_nodes_in_time
 from torchcal.simulators import Scaling, Simulator, Trajectories, settled
-from torchcal.threads import few_threads, with_few_threads
+from torchcal.threads import few_threads, with_torch_settings
 
 __all__ = ["calibrate"]
 
 
-@with_few_threads
+@with_torch_settings
 def calibrate(
     simulator: Simulator,
     recording: Recording,

@@ -193,7 +193,7 @@ def _noise_of(noise: Any, recording: Recording, output: str) -> np.ndarray | Non
     source = getattr(noise, "source", None)
     given = recording.noise_sd
     if (noise is None or source == "given") and given is not None:
-        return given.cpu().numpy()[places_of(recording, output)]
+        return given.cpu().numpy()[places_of(recording, output)] * getattr(noise, "enlarged", 1.0)
     if noise is None or source == "none":  # a detailed simulation: what it counts as noise is no one's
         return None
     sd = getattr(noise, "sd", noise)

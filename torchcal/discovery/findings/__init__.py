@@ -1,0 +1,1 @@
+"""Findings: what a diagnosis tells, as records, tables, words and experiments."""

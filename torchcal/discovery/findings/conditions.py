@@ -1,0 +1,248 @@
+"""The experiments that are tried in thought: first what is close to the recording, then what is bolder."""
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchcal.data import Recording, Run
+from torchcal.discovery.fits.fitting import Fitted
+from torchcal.display import between, placed
+from torchcal.simulators import Trajectories
+
+__all__ = ["Option", "bolder", "denser", "simple"]
+
+#: Below which no temperature goes, by unit.
+ABSOLUTE_ZERO = {"degC": -273.15, "°C": -273.15, "degF": -459.67, "°F": -459.67}
+#: Multiples of initial states and inputs, those that are bolder, and that of one state alone.
+MULTIPLES, BOLD, ALONE = (2.0, 0.5, 3.0), (5.0,), 3.0
+#: How far beyond its range a condition goes, in the width of that, and how far in a bolder experiment.
+BEYOND, FAR_BEYOND = 0.5, 1.5
+#: Bolder experiments on a static recording at most, those that move one condition first.
+MOST = 60
+#: Share of its largest value up to which a state begins at nothing, of which a multiple is nothing too.
+NOTHING = 0.01
+
+Option = tuple[str, Recording, dict[str, Any]]
+"""An experiment in words, a recording of it without data, and its conditions as `Experiment` holds them."""
+
+
+def simple(model: Fitted) -> list[Option]:
+    """Experiments close to the recording.
+
+    Runs are repeated with other initial states, stronger or weaker inputs, both, or for longer; static conditions are
+    gathered in a third of their range, or moved just beyond it.
+    """
+    recording = model.problem.recording
+    if not model.problem.in_time:
+        return _static(recording)
+    begin, _, mirrored = _states(model)
+    ask = _ask(recording, begin)
+    options = [_run(recording, "the first run again" + ask, begin)]
+    options += _elsewhere(recording, begin, (*MULTIPLES, -1.0) if mirrored else MULTIPLES)
+    options += _stronger(recording, begin, ask, MULTIPLES)
+    options.append(_run(recording, f"a run three times as long as the first{ask}", begin, copies=3))
+    if any(begin.values()):
+        text = "a run that starts from 2 times the initial states and is twice as long"
+        options.append(_run(recording, text, _times(begin, 2.0), copies=2))
+    return options
+
+
+def bolder(model: Fitted) -> list[Option]:
+    """Experiments farther from the recording, or less simple to do, for where the simple ones tell too little.
+
+    Runs begin with one state alone elsewhere, or with all far off; inputs are much stronger, steady, faster or slower.
+    Static conditions are moved far beyond their range, or two of them together.
+    """
+    recording = model.problem.recording
+    if not model.problem.in_time:
+        return _static_bolder(recording)
+    begin, largest, _ = _states(model)
+    ask = _ask(recording, begin)
+    options = _elsewhere(recording, begin, BOLD)
+    for name, value in begin.items():
+        others = _ask(recording, [one for one in begin if one != name])
+        at_rest = abs(value) <= NOTHING * abs(largest[name])
+        if at_rest and largest[name]:
+            text = f"a run that starts from {name} = {largest[name]:.3g}, all else as in the first{others}"
+            options.append(_run(recording, text, {**begin, name: float(f"{largest[name]:.3g}")}))
+        elif not at_rest and len(begin) > 1:  # of one state alone this is a multiple of all initial states
+            text = f"a run that starts from {ALONE:g} times the initial {name} of the first, all else as there{others}"
+            options.append(_run(recording, text, {**begin, name: ALONE * value}))
+    options += _stronger(recording, begin, ask, BOLD)
+    if _runs(recording)[0].inputs:
+        options.append(_run(recording, f"a run with the inputs held at their largest{ask}", begin, change=_steady))
+        for factor, text in ((2.0, "twice as slowly"), (0.5, "twice as fast")):
+            options.append(_run(recording, f"a run with the inputs of the first {text}{ask}", begin, slower=factor))
+    return options
+
+
+def denser(option: Option, recording: Recording, times: int) -> Option:
+    """The same with more samples: in time between the others, else of the same conditions."""
+    description, _, conditions = option
+    if "x" in conditions:
+        x = {name: values.repeat_interleave(times) for name, values in conditions["x"].items()}
+        return f"{description}, each {times} times", _blank(recording, x), {"x": x}
+    run = _blank_run(recording, conditions)
+    place = torch.arange((len(run.time) - 1) * times + 1, dtype=torch.float64) / times
+    left = place.long().clamp(max=len(run.time) - 2)
+    time = run.time[left] + (place - left) * run.time.diff()[left]
+    dense = {"time": time, "initial": conditions["initial"], "inputs": run.inputs_at(time)}
+    text = f"{description}, sampled {times} times as densely"
+    return text, Recording(runs=[_blank_run(recording, dense)]), dense
+
+
+def _runs(recording: Recording) -> tuple[Run, ...]:
+    return tuple(recording.runs or ())
+
+
+def _states(model: Fitted) -> tuple[dict[str, float], dict[str, float], bool]:
+    """Of every state that an experiment may choose: where the first run begins, its value of the largest size in any
+    run, and whether all of them may be mirrored."""
+    bound = model.problem.simulator
+    if not isinstance(bound, Trajectories):
+        return {}, {}, False
+    states = bound.solve(model.values[None], model.warm)[0]
+    places = {name: i for i, name in enumerate(bound.ode.states) if name not in bound.ode.initial}
+    begin = {name: float(states[0, 0, i]) for name, i in places.items()}
+    along = {name: states[..., i].flatten() for name, i in places.items()}
+    largest = {name: float(values[int(values.abs().argmax())]) for name, values in along.items()}
+    # Only what has had either sign is mirrored: an absolute temperature or an amount cannot be.
+    mirrored = bool(along) and all(bool((v < 0).any() and (v > 0).any()) for v in along.values())
+    return begin, largest, mirrored
+
+
+def _ask(recording: Recording, begin: Iterable[str]) -> str:
+    """What has to be known that the first run did not tell."""
+    unsaid = [name for name in begin if name not in _runs(recording)[0].initial]
+    return f", with initial {', '.join(unsaid)} known from elsewhere" if unsaid else ""
+
+
+def _times(values: Mapping[str, float], factor: float) -> dict[str, float]:
+    return {name: factor * value for name, value in values.items()}
+
+
+def _elsewhere(recording: Recording, begin: dict[str, float], factors: tuple[float, ...]) -> list[Option]:
+    """Runs from multiples of the initial states; none where all of these are 0."""
+    text = "a run that starts from {:g} times the initial states of the first"
+    able = factors if any(begin.values()) else ()
+    return [_run(recording, text.format(factor), _times(begin, factor)) for factor in able]
+
+
+def _stronger(recording: Recording, begin: dict[str, float], ask: str, factors: tuple[float, ...]) -> list[Option]:
+    """Runs with inputs of other sizes, and with inputs and initial states of other sizes."""
+    if not _runs(recording)[0].inputs:
+        return []
+    options = [
+        _run(recording, f"a run with {factor:g} times the inputs of the first{ask}", begin, change=_by(factor))
+        for factor in factors
+    ]
+    for factor in factors if any(begin.values()) else ():
+        text = f"a run with {factor:g} times the inputs and initial states of the first"
+        options.append(_run(recording, text, _times(begin, factor), change=_by(factor)))
+    return options
+
+
+def _by(factor: float) -> Callable[[Tensor], Tensor]:
+    return lambda values: factor * values
+
+
+def _steady(values: Tensor) -> Tensor:
+    return torch.full_like(values, float(values[int(values.abs().argmax())]))
+
+
+def _run(
+    recording: Recording,
+    text: str,
+    initial: Mapping[str, float],
+    *,
+    change: Callable[[Tensor], Tensor] | None = None,
+    copies: int = 1,
+    slower: float = 1.0,
+) -> Option:
+    """The first run with other initial states, changed inputs, several times in a row, or at another pace."""
+    first = _runs(recording)[0]
+    span = first.time[-1] - first.time[0]
+    step = span / (len(first.time) - 1)
+    time = torch.cat([first.time + k * (span + step) for k in range(copies)])
+    time = time[0] + slower * (time - time[0])
+    inputs = {k: (values if change is None else change(values)).repeat(copies) for k, values in first.inputs.items()}
+    conditions = {"time": time, "initial": dict(initial), "inputs": inputs}
+    return text, Recording(runs=[_blank_run(recording, conditions)]), conditions
+
+
+def _blank_run(recording: Recording, conditions: Mapping[str, Any]) -> Run:
+    blank = {name: torch.zeros(len(conditions["time"]), dtype=torch.float64) for name in recording.outputs}
+    return Run(outputs=blank, hold=_runs(recording)[0].hold, **{**conditions, "inputs": conditions["inputs"] or None})
+
+
+def _conditions(recording: Recording) -> dict[str, Tensor]:
+    return recording.x if isinstance(recording.x, dict) else {"x": recording.x}
+
+
+def _static(recording: Recording) -> list[Option]:
+    x = _conditions(recording)
+    found = [_moved(recording, "the same conditions again", {})]
+    for name, values in x.items():
+        cuts = values.quantile(torch.tensor([0.0, 1 / 3, 2 / 3, 1.0], dtype=values.dtype)).tolist()
+        thirds = [(a, b) for a, b in itertools.pairwise(cuts) if b > a]
+        for text, ends in zip(between(thirds, "and"), thirds, strict=True):
+            found.append(_moved(recording, f"conditions with {name} between {text}", {name: ends}))
+    for name in x:
+        for text, ends in _outside(recording, name, BEYOND):
+            found.append(_moved(recording, f"conditions with {name} {text}", {name: ends}))
+    return found
+
+
+def _static_bolder(recording: Recording) -> list[Option]:
+    found = []
+    names = list(_conditions(recording))
+    for name in names:
+        for text, ends in _outside(recording, name, FAR_BEYOND):
+            found.append(_moved(recording, f"conditions with {name} {text}", {name: ends}))
+    for one, other in itertools.combinations(names, 2):
+        corners = itertools.product(_outside(recording, one, BEYOND), _outside(recording, other, BEYOND))
+        for (first, ends), (second, others) in corners:
+            text = f"conditions with {one} {first}, and {other} {second}"
+            found.append(_moved(recording, text, {one: ends, other: others}))
+    return found[:MOST]
+
+
+def _outside(recording: Recording, name: str, share: float) -> list[tuple[str, tuple[float, float]]]:
+    """The ranges above and, where there is one, below that of a condition."""
+    values = _conditions(recording)[name]
+    low, high = float(values.min()), float(values.max())
+    width = high - low
+    if not width:  # one value tells nothing of how far others may be
+        return []
+    above = high + share * width
+    found = [(f"above the recorded range, to {placed(above, width)}", (high, above))]
+    # Of what spans decades a share of the width is below nothing; a factor is as far on their scale.
+    below = low / (1 + 4 * share) if 0 < low < share * width else low - share * width
+    below = max(below, ABSOLUTE_ZERO.get(recording.units.get(name, ""), -math.inf))
+    if (below >= 0 or low < 0) and below < low:
+        found.append((f"below the recorded range, to {placed(below, width)}", (below, low)))
+    return found
+
+
+def _moved(recording: Recording, text: str, ranges: Mapping[str, tuple[float, float]]) -> Option:
+    """As many conditions, those named evenly over new ranges, the second of two in an order that crosses the first."""
+    x = {name: values.clone() for name, values in _conditions(recording).items()}
+    for k, (name, (first, last)) in enumerate(ranges.items()):
+        along = torch.linspace(first, last, recording.n, dtype=torch.float64)
+        x[name] = along if k == 0 else along[_crossed(recording.n)]
+    return text, _blank(recording, x), {"x": x}
+
+
+def _crossed(n: int) -> Tensor:
+    """An order of n places that runs through them many times, so that it goes with no other order."""
+    return (torch.arange(n, dtype=torch.float64) * (math.sqrt(5) - 1) / 2).frac().argsort()
+
+
+def _blank(recording: Recording, x: dict[str, Tensor]) -> Recording:
+    n = len(next(iter(x.values())))
+    zeros = {name: torch.zeros(n, dtype=torch.float64) for name in recording.outputs}
+    return Recording(x=x if isinstance(recording.x, dict) else x["x"], y=zeros)

@@ -1,0 +1,270 @@
+"""Which new condition would tell tied hypotheses apart: where their predictions differ most after refitting."""
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcal.data import Recording
+from torchcal.discovery.findings.conditions import Option, bolder, denser, simple
+from torchcal.discovery.fits.fitting import Fitted
+from torchcal.discovery.fits.problem import Problem, Whitening
+from torchcal.discovery.hypotheses.model import Model
+from torchcal.discovery.misfit.noise import Noise
+from torchcal.discovery.records import Experiment
+from torchcal.errors import TorchcalError
+from torchcal.simulators import Trajectories, settled
+
+__all__ = ["propose"]
+
+#: Distance in noise sd below which more samples are asked for, how many times as many at first, and at last, and the
+#: number of samples up to which these are more than at first.
+ENOUGH, DENSER, DENSEST, MANY = 6.0, 4, 16, 1000
+#: Distance beyond which a milder experiment is as good: models are not right far from what was recorded.
+PLENTY = 12.0
+#: Models that are told apart at most.
+MOST = 8
+#: Distance below which an experiment tells nothing apart.
+LEAST = 2.0
+#: How much larger the distance must be for a less simple experiment.
+WORTH = 1.01
+#: Solver error, in noise sd, up to which a model bears an experiment, with steps of its kind halved so often at most.
+SETTLED, HALVINGS = 0.1, 3
+#: How many times the largest reading no experiment shall make an output.
+FAR = 100.0
+
+Pair = tuple[Model, Model]
+
+
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """An experiment in thought, and the predicted distance of each pair of models."""
+
+    option: Option
+    distances: list[float]
+
+    def nearest(self, told: Sequence[bool]) -> float:
+        """The smallest distance of the pairs that any experiment tells apart."""
+        return min(distance for distance, clear in zip(self.distances, told, strict=True) if clear)
+
+    def worth(self, told: Sequence[bool]) -> float:
+        """The same, but that more than `PLENTY` is worth no more."""
+        return min(self.nearest(told), PLENTY)
+
+
+def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
+    """The experiment, of those tried in thought, that separates the two nearest of the models most, those aside that
+    none of them tells apart; the first, and mildest, of those that separate them by `PLENTY`.
+
+    Simple experiments come first (`conditions.simple`). Where none of these would separate the models well, with more
+    samples either, `conditions.bolder` ones are tried too. The best is asked for with more samples where it takes them.
+    The predicted distance is what is left after every model's parameters have been fitted to old and new data together
+    (linearised). None where no experiment separates them by `LEAST` noise sd. What one of the models does not bear (an
+    orbit that falls into its star) is no experiment.
+    """
+    models = models[:MOST]
+    # One with a term more than another predicts what that one does, and is told from it by its cost alone.
+    pairs = [(a, b) for a, b in itertools.combinations(models, 2) if not (_holds(a, b) or _holds(b, a))]
+    if not pairs:
+        return None
+    thought = _Thought(models, pairs, noise)
+    thought.consider(simple(models[0].found))
+    found = thought.best()
+    if found is None or found.separation < ENOUGH:
+        thought.consider(bolder(models[0].found))
+        found = thought.best()
+    return found
+
+
+class _Thought:
+    """Experiments in thought that are to tell pairs of models apart."""
+
+    def __init__(self, models: Sequence[Model], pairs: Sequence[Pair], noise: Noise) -> None:
+        self.models, self.pairs, self.noise = models, pairs, noise
+        self.recording = models[0].found.problem.recording
+        self.tried: list[Tried] = []
+        self._borne: dict[Tried, bool] = {}
+
+    def consider(self, options: Sequence[Option]) -> None:
+        """Work out what each would tell, until one tells plenty."""
+        for option in options:
+            if (found := _separations(self.pairs, option[1], self.noise)) is None:
+                continue
+            self.tried.append(Tried(option, found))
+            if min(found) >= PLENTY and self._bears(self.tried[-1]):
+                break
+
+    def best(self) -> Experiment | None:
+        """The best of those considered, with as many samples as it takes."""
+        tried, hopeless = list(self.tried), set[int]()
+        while tried:
+            told = [
+                k not in hopeless and max(one.distances[k] * _times(one.option[1])[-1] ** 0.5 for one in tried) >= LEAST
+                for k in range(len(self.pairs))
+            ]
+            best = _best(tried, told)
+            if best is None:
+                break
+            if not self._bears(best):
+                tried = [one for one in tried if one is not best]
+                continue
+            best = self._sampled(best, told)
+            if best.nearest(told) < LEAST:
+                hopeless.add(min((k for k, clear in enumerate(told) if clear), key=best.distances.__getitem__))
+                continue
+            description, _, conditions = best.option
+            untold = [(_called(a), _called(b)) for (a, b), clear in zip(self.pairs, told, strict=True) if not clear]
+            return Experiment(description, best.nearest(told), conditions, untold)
+        return None
+
+    def _sampled(self, best: Tried, told: Sequence[bool]) -> Tried:
+        """With more samples, as far as it takes them."""
+        plain = best.option
+        for times in _times(plain[1]):
+            if best.nearest(told) >= ENOUGH:
+                break
+            option = denser(plain, self.recording, times)
+            found = _separations(self.pairs, option[1], self.noise)
+            best = best if found is None else _best([best, Tried(option, found)], told) or best
+        return best
+
+    def _bears(self, one: Tried) -> bool:
+        if one not in self._borne:
+            self._borne[one] = _bearable(self.models, one.option[1], self.noise)
+        return self._borne[one]
+
+
+def _times(recording: Recording) -> list[int]:
+    """How many times as many samples are asked for, in turn."""
+    return sorted({DENSER, max(DENSER, min(DENSEST, MANY // recording.n))})
+
+
+def _called(model: Model) -> str:
+    """A model's terms, and where they act."""
+    return " with ".join(model.names) + (f" where {model.where}" if model.where else "")
+
+
+def _bearable(models: Sequence[Model], recording: Recording, noise: Noise) -> bool:
+    """Whether the models' solutions in time settle there when steps are halved a few times, and do not blow up."""
+    for model in models:
+        simulator = model.found.problem.simulator
+        if isinstance(simulator, Trajectories):
+            bound, values = _there(model.found, simulator, recording)
+            try:
+                there = settled(bound, values, SETTLED * _sd(recording, noise), halvings=HALVINGS, switch=False)
+            except TorchcalError:
+                return False
+            if not bool(torch.isfinite(there.outputs_of(values, there.solve(values))).all()):
+                return False
+    return True
+
+
+def _holds(model: Model, other: Model) -> bool:
+    """Whether a model has all that another one has, and more."""
+    return set(other.names) < set(model.names) and other.window is None and model.window is None
+
+
+def _best(tried: Sequence[Tried], told: Sequence[bool]) -> Tried | None:
+    """The experiment that tells the nearest of the pairs that can be told best; an earlier one where they are alike."""
+    best: Tried | None = None
+    for one in tried if any(told) else ():
+        if best is None or one.worth(told) >= WORTH * best.worth(told):
+            best = one
+    return best
+
+
+def _separations(pairs: Sequence[Pair], recording: Recording, noise: Noise) -> list[float] | None:
+    """Distance of the models of each pair at new conditions, in noise sd; None where a model cannot predict them."""
+    models = list(dict.fromkeys(model for pair in pairs for model in pair))
+    predictions, slopes = [], []
+    for model in models:
+        try:
+            y, jacobian = _predict(model.found, recording)
+        except TorchcalError:
+            return None
+        if not bool(torch.isfinite(y).all() and torch.isfinite(jacobian).all()) or _explodes(model, y, noise):
+            return None
+        predictions.append(y)
+        slopes.append(jacobian)
+    white = _whitening(models[0].found.problem, recording, noise)
+    predictions, slopes = [white.vector(y) for y in predictions], [white(jacobian) for jacobian in slopes]
+    distances = []
+    for a, b in ((models.index(one), models.index(other)) for one, other in pairs):
+        gap = predictions[a] - predictions[b]
+        # Either model may move its parameters, as far as the old data allow.
+        rows, targets = [], []
+        width = slopes[a].shape[1] + slopes[b].shape[1]
+        rows.append(torch.cat([slopes[a], -slopes[b]], dim=1))
+        targets.append(gap)
+        first = 0
+        for k in (a, b):
+            old = models[k].found.whitening(models[k].found.jacobian)
+            block = torch.zeros(len(old), width, dtype=torch.float64)
+            block[:, first : first + old.shape[1]] = old
+            first += old.shape[1]
+            rows.append(block)
+            targets.append(torch.zeros(len(old), dtype=torch.float64))
+        design, target = torch.cat(rows), torch.cat(targets)
+        size = design.norm(dim=0).clamp_min(1e-300)
+        solution = torch.linalg.lstsq(design / size, -target, driver="gelsd").solution
+        distances.append(float((design / size @ solution + target).norm()))
+    return distances
+
+
+def _explodes(model: Model, y: Tensor, noise: Noise) -> bool:
+    """Whether any output goes far beyond all that was recorded: no model is right there."""
+    recording = model.found.problem.recording
+    largest = torch.stack([recording.y.abs(), recording.spread, noise.sd]).nan_to_num(nan=0.0).amax(0)
+    outputs = len(recording.outputs)
+    pairs = zip(largest.chunk(outputs), y.chunk(outputs), strict=True)
+    return any(float(new.abs().max()) > FAR * float(old.max()) for old, new in pairs)
+
+
+def _whitening(problem: Problem, recording: Recording, noise: Noise) -> Whitening:
+    """Of noise at new conditions, which has the memory of that of the recording, however close samples are."""
+    correlation = noise.correlation
+    if problem.recording.runs and recording.runs and not problem.by_sample:
+        usual = [float(runs[0].time.diff().median()) for runs in (recording.runs, problem.recording.runs)]
+        correlation = correlation ** (usual[0] / usual[1])
+    new = dataclasses.replace(Problem.of(problem.simulator, recording), by_sample=problem.by_sample)
+    return new.whitening(_sd(recording, noise), correlation)
+
+
+def _sd(recording: Recording, noise: Noise) -> Tensor:
+    """Of each new datum, as of the median datum of its output, ``(n_total,)``."""
+    outputs = len(recording.outputs)
+    per_output = torch.stack([part[torch.isfinite(part)].median() for part in noise.sd.chunk(outputs)])
+    return per_output.repeat_interleave(recording.n)
+
+
+def _there(found: Fitted, simulator: Trajectories, recording: Recording) -> tuple[Trajectories, Tensor]:
+    """A model at new runs, and its values; initial states are the experimenter's now: known, given in the runs."""
+    bound = simulator.bind(recording)
+    shared = {name: i for i, name in enumerate(simulator.names)}
+    return bound, torch.tensor([[_value(found, shared, name) for name in bound.names]], dtype=torch.float64)
+
+
+def _predict(found: Fitted, recording: Recording) -> tuple[Tensor, Tensor]:
+    simulator = found.problem.simulator
+    if isinstance(simulator, Trajectories):
+        bound, values = _there(found, simulator, recording)
+        shared = {name: i for i, name in enumerate(simulator.names)}
+        columns = [i for i, name in enumerate(bound.names) if name in shared and shared[name] in found.free]
+        result = bound.linearise(bound.x, values, recording.outputs, columns)
+        jacobian = torch.zeros(result.y.shape[-1], len(found.free), dtype=torch.float64)
+        for k, i in enumerate(columns):
+            jacobian[:, found.free.index(shared[bound.names[i]])] = result.jacobian[0, :, k]
+        return result.y[0], jacobian
+    result = simulator.linearise(recording.x, found.values[None], recording.outputs, found.free)
+    return result.y[0], result.jacobian[0]
+
+
+def _value(found: Fitted, shared: dict[str, int], name: str) -> float:
+    if name in shared:
+        return float(found.values[shared[name]])
+    plain = name.split("[")[0]
+    alike = [i for other, i in shared.items() if other.split("[")[0] == plain]
+    return float(torch.stack([found.values[i] for i in alike]).mean()) if alike else 0.0

@@ -1,0 +1,297 @@
+"""Where the mismatch sits: the places that the search found, and what a name acts on before them."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.hypotheses.model import Model
+from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.misfit.places import Place
+from torchcal.discovery.records import Location, MissingRate, NeededShift, Table
+from torchcal.discovery.verdicts.explain import removed
+from torchcal.errors import TorchcalError
+from torchcal.simulators import is_value_of
+from torchcal.terms import Term
+
+__all__ = ["locate", "missing_rate", "needed_shifts"]
+
+#: Shares of the evidence for an output, and for a parameter of several equations, that count beside an equation's.
+OUTPUT_SHARE, SEVERAL_SHARE = 0.8, 0.9
+#: Sd beyond a bound from which on a parameter is not within it.
+SURELY = 2.0
+#: A span begins where the estimated change exceeds this share of its largest magnitude.
+SPAN_LEVEL = 0.3
+#: Share of the points up to which a gap between spans is none, nor a span beside wider ones.
+SLIVER = 0.02
+#: Log evidence from which on a place is listed, and how many are.
+LEAST_EVIDENCE, LISTED = 2.0, 8
+
+
+def _extent(values: Tensor) -> float:
+    """How far the values of a driver extend."""
+    return float(values.max() - values.min())
+
+
+def _spans(place: Place) -> tuple[tuple[float, float], ...]:
+    """Ranges of the driver where the change is large; of an oscillation all of it."""
+    values = place.channel.drivers[place.driver]
+    if place.period is not None:
+        return ((float(values.min()), float(values.max())),)
+    return _ranges(values, place.profile)
+
+
+def _ranges(values: Tensor, change: Tensor) -> tuple[tuple[float, float], ...]:
+    """Ranges of some values where a change at them is large."""
+    order = values.argsort(stable=True)
+    along, size = values[order], change[order].abs()
+    high = size >= SPAN_LEVEL * float(size.max())
+    least = SLIVER * len(along)
+    found: list[list[int]] = []
+    for k in high.nonzero()[:, 0].tolist():
+        if found and k - found[-1][1] - 1 <= least:
+            found[-1][1] = k
+        else:
+            found.append([k, k])
+    wide = [span for span in found if span[1] - span[0] + 1 > least]
+    return tuple((float(along[low]), float(along[high])) for low, high in (wide or found)[:6])
+
+
+def locate(search: Search, best: Model | None, *, named: bool = False) -> Table[Location]:
+    """Where the mismatch sits; a local term says it best, and of a name what it acts on comes first.
+
+    Args:
+        search: The finished one.
+        best: The accepted model, or the likeliest of those that are tied; None where there is none.
+        named: Whether it is accepted.
+    """
+    rows = []
+    local = best if best is not None and best.window is not None else None
+    if not named and search.unnamed is not None:  # likelier than all that has a name, and says better where
+        local = search.unnamed
+    if local is not None and local.window is not None:
+        w = local.window
+        drivers = search.drivers()[w.driver]
+        low = w.low if math.isfinite(w.low) else float(drivers.min())
+        high = w.high if math.isfinite(w.high) else float(drivers.max())
+        kind, target = _acts_on(local)
+        share, evidence, extent = removed(search, local), local.log_evidence, _extent(drivers)
+        rows.append(Location(kind, target, w.driver, ((low, high),), share, evidence, extent=extent))
+    sensor = best is not None and _acts_on(best)[0] == "output"  # then it has been shown to be the output
+    places = [
+        place
+        for place in (search.structure.places if sensor else _by_plausibility(search))
+        if place.evidence >= LEAST_EVIDENCE
+    ]
+    if named and best is not None and best.window is None:
+        own, reads = _own_places(search, best), _reads(best)
+        places.sort(key=lambda place: _rank(place, own, reads))
+        if not places or (places[0].channel.kind, places[0].channel.target) not in own:
+            rows.append(_contributed(search, best, [place.driver for place in places]))
+    seen: set[tuple[str, str]] = set()
+    told = {(row.kind, row.target, row.driver) for row in rows}
+    for place in places:
+        key = (place.channel.kind, place.channel.target)
+        if key in seen or (*key, place.driver) in told:
+            continue
+        seen.add(key)
+        extent = _extent(place.channel.drivers[place.driver])
+        rows.append(Location(*key, place.driver, _spans(place), place.share, place.evidence, place.period, extent))
+        if len(seen) >= LISTED:
+            break
+    return Table(rows[:LISTED], ("kind", "target", "driver", "spans", "share", "evidence"))
+
+
+def _own_places(search: Search, model: Model) -> set[tuple[str, str]]:
+    """Kinds and targets of what a model's terms act on; of a parameter that is no place, the equations it acts in."""
+    known = {(place.channel.kind, place.channel.target) for place in search.structure.places}
+    outputs = search.problem.recording.outputs
+    inside = [] if model.structure is None else [c for c in model.structure.channels if c.kind == "parameter"]
+    own: set[tuple[str, str]] = set()
+    for term in model.candidate.terms:
+        if _is_rate(term):
+            own |= {("equation", name) for name in _equations(term)}
+        elif term.outputs:
+            own |= {("output", name if name in outputs else outputs[0]) for name in term.outputs}  # no name is y
+        else:
+            for name in (*term.shifts, *term.frees):
+                mine = {key for key in known if key[0] == "parameter" and is_value_of(key[1], name)}
+                acted = {("equation", state) for c in inside if is_value_of(c.target, name) for state in c.rates}
+                own |= mine or acted
+    return own
+
+
+def _rank(place: Place, own: set[tuple[str, str]], reads: set[str]) -> int:
+    """Where a name acts and by what it does so comes first, then where it acts."""
+    return 2 if (place.channel.kind, place.channel.target) not in own else int(place.driver not in reads)
+
+
+class _Noting(dict[str, Tensor]):
+    """Drivers by name; those that were looked up are noted."""
+
+    def __init__(self, drivers: dict[str, Tensor]) -> None:
+        super().__init__(drivers)
+        self.noted: set[str] = set()
+
+    def __getitem__(self, name: str) -> Tensor:
+        self.noted.add(name)
+        return super().__getitem__(name)
+
+
+def _reads(model: Model) -> set[str]:
+    """The drivers that what a model adds is a function of, as far as its functions can be asked."""
+    found = model.found
+    problem = found.problem
+    if not isinstance(problem.recording.x, dict):
+        return set()
+    drivers = problem.drivers_at_data(found.values[None], found.warm)
+    p = problem.parameters_at_data(found.values)
+    read: set[str] = set()
+    for term in model.candidate.terms:
+        noting = _Noting(drivers)
+        given = problem.arguments(noting, term.own(p))
+        noting.noted.clear()  # the time that every function is given is read by none yet
+        try:
+            for function in (*term.rates.values(), *term.shifts.values()):
+                term.call(function, *given)
+            for function in term.outputs.values():
+                term.call(function, *given, found.y)
+        except TorchcalError:  # not every function works on a row of data, and this is but for words
+            pass
+        read |= noting.noted
+    return read
+
+
+def _contributed(search: Search, model: Model, drivers: Sequence[str]) -> Location:
+    """What a model moves that the base could not, along the first of some drivers: where no place stands for its term.
+    """
+    found = model.found
+    change = found.y - search.base.y
+    size = (change / search.noise.sd[found.problem.index]).abs().nan_to_num(nan=0.0, posinf=0.0)
+    at_data = found.problem.drivers_at_data(found.values[None], found.warm)
+    driver = next((name for name in drivers if name in at_data), next(iter(at_data)))
+    values, which = at_data[driver].unique(return_inverse=True)
+    largest = torch.zeros_like(values).scatter_reduce(0, which, size.to(values), "amax")
+    kind, target = _acts_on(model)
+    spans, share, evidence = _ranges(values, largest), removed(search, model), model.log_evidence
+    return Location(kind, target, driver, spans, share, evidence, extent=_extent(values))
+
+
+def _acts_on(model: Model) -> tuple[str, str]:
+    term = model.candidate.terms[0]
+    if _is_rate(term):
+        return "equation", _equations(term)[0]
+    if term.outputs:
+        return "output", next(iter(term.outputs))
+    return "parameter", next(iter([*term.shifts, *term.frees]))
+
+
+def _is_rate(term: Term) -> bool:
+    """Whether a term acts by rates: those of its own hidden states alone are how its shifts or outputs come about."""
+    return any(name not in term.states for name in term.rates) or not (term.outputs or term.shifts or term.frees)
+
+
+def _equations(term: Term) -> list[str]:
+    """Those that a term acts on, of the base's own states where there are any."""
+    return [name for name in term.rates if name not in term.states] or list(term.rates)
+
+
+def needed_shifts(search: Search) -> list[NeededShift]:
+    """The shift of each parameter against the driver that it varies with most."""
+    rows: dict[str, Place] = {}
+    for place in search.structure.places:
+        if place.channel.kind == "parameter" and place.channel.target not in rows and place.evidence > 0:
+            rows[place.channel.target] = place
+    result = []
+    for name, place in rows.items():
+        values = place.channel.drivers[place.driver]
+        order = values.argsort(stable=True)
+        pick = order[torch.linspace(0, len(order) - 1, min(60, len(order))).round().long().unique()]
+        a, b = values[pick], place.profile[pick]
+        ranks = torch.stack([_ranks(a), _ranks(b)])
+        correlation = float(torch.corrcoef(ranks)[0, 1].nan_to_num()) if len(pick) > 2 else 0.0
+        result.append(NeededShift(name, place.channel.unit, place.driver, a, b, place.sd[pick], correlation))
+    return result[:6]
+
+
+def _ranks(values: Tensor) -> Tensor:
+    """Ranks, equal values at the mean of theirs."""
+    _, number, counts = values.unique(return_inverse=True, return_counts=True)
+    return (counts.cumsum(0) - 0.5 * (counts - 1).double())[number]
+
+
+def _by_plausibility(search: Search) -> list[Place]:
+    """Places by falling evidence, where it counts in full in time only for one equation.
+
+    A change of an output can copy whatever any equation does to that output, and instruments err in simple ways: but a
+    fast ripple is no wave of a rate that would be larger than all else there. A parameter that acts in several
+    equations moves them together.
+    """
+    def weight(place: Place) -> float:
+        return place.evidence * (_plausible(search, place) if search.problem.in_time else 1.0)
+
+    return sorted(search.structure.places, key=lambda place: -weight(place))
+
+
+def _plausible(search: Search, place: Place) -> float:
+    """Share of the evidence for a place in time that counts."""
+    if place.channel.kind == "output":
+        return OUTPUT_SHARE
+    if place.period is not None and _larger_than_all(search, place):
+        return OUTPUT_SHARE**2
+    return SEVERAL_SHARE if len(place.channel.rates) > 1 else 1.0
+
+
+def _larger_than_all(search: Search, place: Place) -> bool:
+    """Whether a change is larger than the base's own rate in an equation that it acts in."""
+    usual = {c.target: c.usual for c in search.structure.channels if c.kind == "equation"}
+    ones = torch.ones_like(place.profile)
+    acts = place.channel.rates if place.channel.kind == "parameter" else {place.channel.target: ones}
+    return any(float((place.profile * by).abs().max()) > usual.get(name, math.inf) for name, by in acts.items())
+
+
+def _possible(search: Search, place: Place) -> bool:
+    """Whether a parameter stays within its bounds, wherever its shift is told."""
+    parameters = {q.name: (q, value) for q, value in
+                  zip(search.base.problem.parameters, search.base.values.tolist(), strict=True)}  # fmt: skip
+    parameter, value = parameters[place.channel.target]
+    low = -math.inf if parameter.low is None else parameter.low
+    high = math.inf if parameter.high is None else parameter.high
+    moved, open_by = value + place.profile, SURELY * place.sd
+    return not bool(((moved + open_by < low) | (moved - open_by > high)).any())
+
+
+def _first_unnamed(search: Search, places: list[Place]) -> list[Place]:
+    """Places with that of the likeliest change that has no name first, where there is one."""
+    unnamed = search.unnamed
+    if unnamed is None or unnamed.window is None:
+        return places
+    there = (*_acts_on(unnamed), unnamed.window.driver)
+    return sorted(places, key=lambda place: (place.channel.kind, place.channel.target, place.driver) != there)
+
+
+def missing_rate(search: Search) -> MissingRate | None:
+    """The best unknown change, smooth or a wave, of one equation, output or parameter.
+
+    A parameter that changes in time and acts in one equation is a missing rate of that equation, in one run: what it
+    does to the rate depends on the states too, which differ between runs at the same time.
+    """
+    for place in _first_unnamed(search, _by_plausibility(search)):
+        channel = place.channel
+        if place.evidence <= 0:
+            continue
+        kind, target, unit, size = channel.kind, channel.target, channel.unit, torch.ones_like(place.profile)
+        if kind == "parameter" and search.problem.in_time:
+            if not channel.rates or not _possible(search, place):
+                continue
+            if place.driver == "t" and len(channel.rates) == 1 and len(search.problem.recording.runs or ()) == 1:
+                kind = "equation"
+                target, size = next(iter(channel.rates.items()))
+                unit = next((c.unit for c in search.structure.channels if (c.kind, c.target) == (kind, target)), None)
+        values, rate, sd = channel.drivers[place.driver], place.profile * size, place.sd * size.abs()
+        order = values.argsort(stable=True)
+        return MissingRate(
+            kind, target, place.driver, values[order], rate[order], sd[order], unit, channel.time, rate
+        )
+    return None

@@ -1,0 +1,95 @@
+"""Where the mismatch sits, in words."""
+
+import math
+from typing import Any
+
+from torchcal.discovery.fits.local import Span
+from torchcal.discovery.misfit.channels import RUN
+from torchcal.display import between, percent, up_to
+
+__all__ = ["share_in_words", "where_in_words"]
+
+#: Log evidence below the best place's down to which another one is told beside it.
+CLOSE = 3.0
+#: Share of a driver's range from which on spans say nothing.
+EVERYWHERE = 0.9
+
+
+def share_in_words(share: float) -> str:
+    """A share in a sentence."""
+    return percent(share) if math.isfinite(share) else "an unknown share"
+
+
+def where_in_words(d: Any) -> str:
+    """Where the mismatch sits, what it varies with, and which parameter would have to move."""
+    if not d.where:
+        return ""
+    place = d.where[0]
+    spans = ", ".join(between(place.spans[:3], "to", place.extent))
+    everywhere = _everywhere(d, place)
+    if place.driver == RUN:
+        largest = "" if everywhere else f" (largest in {spans}, counted from 0)"
+        advice = "" if d.terms else " What differs between the runs and was not recorded looks like this."
+        if not d.terms and place.kind == "parameter":
+            advice = " With per_run=True that parameter would take it up."
+        return (
+            f"The mismatch sits in the {place.kind} {place.target} and differs from run to run{largest}: one change "
+            f"for each run {_does(place)}.{advice}{_embedded(d)}"
+        )
+    largest = "" if everywhere else f" (largest at {spans})"
+    if place.period is not None:
+        return (
+            f"The mismatch sits in the {place.kind} {place.target} and oscillates with {place.driver} (period "
+            f"{place.period:.3g}): a wave there {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
+        )
+    return (
+        f"The mismatch sits in the {place.kind} {place.target} and varies with {place.driver}{largest}: a smooth "
+        f"change there {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
+    )
+
+
+def _does(place: Any) -> str:
+    """What a change does."""
+    if place.share <= 0:
+        return "takes up what has structure in it, though it is no larger than noise"
+    return f"removes {share_in_words(place.share)} of the misfit beyond noise"
+
+
+def _everywhere(d: Any, place: Any) -> bool:
+    """Whether a place's spans are all of its driver's range, or nearly: they say nothing then."""
+    if place.driver == RUN:
+        runs = range(len(d.recording.runs or ()))
+        return all(any(round(low) <= run <= round(high) for low, high in place.spans) for run in runs)
+    span = _span(d, place)
+    if span is None:
+        return False
+    return span.high <= span.low or sum(max(span.share(*ends), 0.0) for ends in place.spans) >= EVERYWHERE
+
+
+def _span(d: Any, place: Any) -> Span | None:
+    """The range of a place's driver; None where it is not known."""
+    values = d.drivers.get(place.driver)
+    own = place.driver.removesuffix(" itself")
+    if values is None and own in d.recording.outputs:
+        values = d.recording.split(d.base.prediction)[own]
+    return None if values is None or not bool(values.isfinite().all()) else Span.of(values)
+
+
+def _elsewhere(d: Any) -> str:
+    """Where else a change would remove about as much; a name says where it is."""
+    if d.terms:
+        return ""
+    first = d.where[0]
+    close = [place for place in d.where[1:] if place.evidence > first.evidence - CLOSE and place.driver != RUN]
+    other = next((place for place in close if (place.kind, place.target) != (first.kind, first.target)), None)
+    return "" if other is None else f", and one of the {other.kind} {other.target} with {other.driver} about as much"
+
+
+def _embedded(d: Any) -> str:
+    if len(d.embedded) < 2 or d.embedded[0].sd <= 0:
+        return ""
+    first, second = d.embedded[:2]
+    return (
+        f" Model error embedded in one parameter at a time is likeliest in {first.parameter} (sd {first.sd:.3g}; "
+        f"{up_to(first.log_likelihood - second.log_likelihood)} in log-likelihood before {second.parameter})."
+    )

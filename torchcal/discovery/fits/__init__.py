@@ -1,0 +1,1 @@
+"""Fits: a model and a recording as a least-squares problem, and its solution."""

@@ -1,0 +1,371 @@
+"""Least squares on the trajectories: Levenberg–Marquardt from several starts at once, within physical bounds."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.fits.problem import Problem, Whitening
+from torchcal.simulators import Solution, Trajectories
+
+__all__ = ["Fitted", "fit", "follow_slopes", "refit", "starts", "weighed"]
+
+#: Relative change of χ² below which a fit has converged.
+TOLERANCE = 1e-7
+MAX_STEPS = 60
+#: Change of χ², in the residual's variance but at most in that of the noise, below which so many steps lead nowhere, of
+#: which so many at least were not taken back.
+CREEPING, STEPS, TAKEN = 0.02, 20, 5
+#: More steps of the best alone, where it has not converged in those: along a bent valley they are short.
+FINISH = 240
+#: Samples that the slope at the beginning is taken from.
+SLOPES = (12, 5, 24, 48)
+#: How many times longer or shorter than 1 a run must be for rates to be guessed from it.
+LONG = 30.0
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """The best of several fits.
+
+    Attributes:
+        problem: What was fitted.
+        whitening: Of its residuals.
+        values: Parameters ``(P,)``, physical units.
+        free: Places of those that were fitted.
+        y: Fitted outputs at the used data, ``(n,)``.
+        jacobian: ∂y/∂λ of the free ones there, ``(n, free)``.
+        chi2: ‖W (y − f)‖².
+        at_bound: Which of the free ones lie on a bound that they want to cross, bool ``(free,)``.
+        warm: Warm start.
+        agreeing: Share of the starts that came to this χ².
+        ends: Where every start ended, ``(H, P)``.
+        ends_chi2: With which χ², ``(H,)``.
+    """
+
+    problem: Problem
+    whitening: Whitening
+    values: Tensor
+    free: list[int]
+    y: Tensor
+    jacobian: Tensor
+    chi2: float
+    at_bound: Tensor
+    warm: Solution | None
+    agreeing: float = 1.0
+    ends: Tensor | None = None
+    ends_chi2: Tensor | None = None
+
+    @property
+    def residual(self) -> Tensor:
+        """``y − f`` at the used data."""
+        return self.problem.y - self.y
+
+    @property
+    def met(self) -> Tensor:
+        """Which data it meets to a millionth of their spread, bool ``(n,)``: what it leaves of them is rounding."""
+        return self.residual.abs() <= 1e-6 * self.problem.recording.spread[self.problem.index]
+
+    def covariance(self) -> Tensor:
+        """Of the free parameters, ``(free, free)``; directions without information get a huge variance."""
+        j = self.whitening(self.jacobian)
+        scale = j.square().sum(0).sqrt()
+        scale = torch.where(scale > 0, scale, torch.ones_like(scale))
+        values, vectors = torch.linalg.eigh((j / scale).T @ (j / scale))
+        inverse = 1.0 / values.clamp_min(max([1e-300, *(1e-13 * values).tolist()]))
+        return (vectors * inverse) @ vectors.T / (scale[:, None] * scale)
+
+    @property
+    def by_name(self) -> dict[str, float]:
+        """Values of all parameters, free or not."""
+        return dict(zip([q.name for q in self.problem.parameters], self.values.tolist(), strict=True))
+
+    @property
+    def stuck(self) -> list[str]:
+        """Names of the free parameters on a bound that they want to cross."""
+        parameters = self.problem.parameters
+        return [parameters[i].name for i, at in zip(self.free, self.at_bound.tolist(), strict=True) if at]
+
+    def sd(self) -> Tensor:
+        """Standard deviations ``(P,)``; 0 for those held."""
+        found = torch.zeros_like(self.values)
+        found[self.free] = self.covariance().diagonal().clamp_min(0).sqrt()
+        return found
+
+
+def starts(problem: Problem, count: int, seed: int, fixed: dict[int, float] | None = None) -> Tensor:
+    """Starting values ``(count, P)``: first guesses, then ever wilder ones within the bounds.
+
+    Of runs that are far from 1 long, in whatever unit, every second start guesses positive parameters of which nothing
+    is known as rates: about 1 over the length.
+    """
+    length = max((float(run.time[-1] - run.time[0]) for run in problem.recording.runs or ()), default=1.0)
+    rate = torch.ones(count, dtype=torch.float64)
+    if not 1 / LONG < length < LONG:
+        rate[1::2] = 1.0 / length
+    generator = torch.Generator().manual_seed(seed)
+    columns = []
+    spread = torch.linspace(0.0, 1.0, count, dtype=torch.float64) if count > 1 else torch.zeros(1, dtype=torch.float64)
+    for i, q in enumerate(problem.parameters):
+        noise = torch.randn(count, generator=generator, dtype=torch.float64) * spread
+        unit = torch.rand(count, generator=generator, dtype=torch.float64)
+        positive = q.transform == "log" or (q.low is not None and q.low >= 0)
+        if fixed is not None and i in fixed:
+            columns.append(torch.full((count,), fixed[i], dtype=torch.float64))
+            continue
+        if q.initial is not None and q.initial != 0:
+            guess = q.initial * noise.exp() if positive else q.initial + abs(q.initial) * noise
+        elif q.low is not None and q.high is not None:
+            at = 0.5 + (unit - 0.5) * spread if q.initial is None else spread * unit * 0.2
+            base = q.low if q.initial is None else q.initial
+            width = q.high - q.low
+            guess = base + at * width
+            if q.transform == "log":
+                guess = q.low * (q.high / q.low) ** at
+        elif positive:
+            guess = (1.5 * noise).exp() * rate + (q.low or 0.0)
+        else:
+            guess = (q.initial or 0.0) + noise
+        low = -torch.inf if q.low is None else q.low
+        high = torch.inf if q.high is None else q.high
+        columns.append(guess.clamp(low, high))
+    return torch.stack(columns, dim=-1)
+
+
+def follow_slopes(problem: Problem, begin: Tensor) -> Tensor:
+    """Unknown initial states moved so that observed states begin with the slope that was recorded.
+
+    An unobserved velocity, say, is then the recorded position's slope, whatever the other parameters are. The slope is
+    that of a parabola through the first samples, more or fewer of them from start to start.
+    """
+    bound = problem.simulator
+    if not isinstance(bound, Trajectories) or not bound.initial_names:
+        return begin
+    names = list(bound.ode.states)
+    targets: list[tuple[int, int, Tensor, float]] = []
+    for r, run in enumerate(bound.runs):
+        for name, y in run.outputs.items():
+            state = bound.ode.reads.get(name)
+            if state is None or name not in problem.recording.outputs:
+                continue
+            every = (~torch.isnan(y)).nonzero()[:, 0]
+            if len(every) < 4:
+                continue
+            slopes = []
+            for count in SLOPES:  # few samples are noisy, many are bent
+                seen = every[:count]
+                t = run.time[seen] - run.time[seen[0]]
+                design = torch.stack([torch.ones_like(t), t, t.square()], dim=-1)
+                slopes.append(torch.linalg.lstsq(design, y[seen][:, None]).solution[1, 0])
+            seen = every[: SLOPES[0]]
+            length = float(run.time[seen[-1]] - run.time[seen[0]])
+            scale = float((y[seen] - y[seen].mean()).abs().max()) / max(length, 1e-300)
+            each = torch.stack(slopes)[torch.arange(len(begin)) % len(SLOPES)]
+            targets.append((r, names.index(state), each, max(scale, 1e-12)))
+    if not targets:
+        return begin
+    places = [i for i, q in enumerate(problem.parameters) if q.name in bound.initial_names and q.initial is None]
+    if not places:
+        return begin
+    values = begin.clone()
+    for _ in range(3):
+        with torch.enable_grad():
+            leaf = values[:, places].clone().requires_grad_(True)
+            full = values.clone()
+            full[:, places] = leaf
+            rates = bound.slopes(full, bound.layout.start(full))
+            left = torch.stack([(rates[:, r, i] - slope) / scale for r, i, slope, scale in targets], dim=-1)
+            rows = [torch.autograd.grad(left[:, k].sum(), leaf, retain_graph=True, allow_unused=True)[0]
+                    if left.requires_grad else None for k in range(left.shape[1])]  # fmt: skip
+        jacobian = torch.stack([torch.zeros_like(leaf) if row is None else row for row in rows], dim=-2)
+        sound = torch.isfinite(jacobian).flatten(1).all(-1) & torch.isfinite(left).all(-1)
+        jacobian = torch.where(sound[:, None, None], jacobian, torch.zeros_like(jacobian))
+        left = torch.nan_to_num(left.detach(), nan=0.0, posinf=0.0, neginf=0.0)
+        change = torch.linalg.pinv(jacobian, rtol=1e-6) @ left.detach().unsqueeze(-1)
+        moved = values[:, places] - change[..., 0]
+        good = torch.isfinite(moved).all(-1)
+        values[good] = values[good].index_copy(1, torch.tensor(places), moved[good])
+    low, high = problem.limits()
+    return values.clamp(low, high)
+
+
+def fit(
+    problem: Problem,
+    whitening: Whitening,
+    begin: Tensor,
+    free: list[int],
+    *,
+    warm: Solution | None = None,
+    data: Tensor | None = None,
+    max_steps: int = MAX_STEPS,
+    finish: int = FINISH,
+) -> Fitted | None:
+    """Minimise χ² over the free parameters from every row of ``begin`` (H, P); None where no start works.
+
+    Marquardt's scaling makes it independent of units. A parameter on a bound that the gradient pushes outward is held
+    for the step. Parameters with ``transform="log"`` are stepped in their logarithm. With ``data`` (H, n) every start
+    is fitted to data of its own, and ``ends_chi2`` tells how well. A start ends where it has converged, or creeps.
+    Where the best has done neither after ``max_steps`` it goes on alone for at most ``finish`` more.
+    """
+    low, high = problem.limits()
+    low, high = low[free], high[free]
+    log = torch.tensor([problem.parameters[i].transform == "log" for i in free])
+    target = whitening.vector(problem.y if data is None else data)
+    values = begin.clone()
+    values[:, free] = values[:, free].clamp(low, high)
+
+    def evaluate(
+        points: Tensor, target: Tensor, warm: Solution | None, march: bool = True
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Solution | None]:
+        y, jacobian, warm = problem.evaluate(points, free, warm, march=march)
+        residual = target - whitening.vector(y)
+        chi2 = residual.square().sum(-1)
+        bad = ~torch.isfinite(chi2) | ~torch.isfinite(jacobian).flatten(1).all(-1)
+        return y, jacobian, residual, torch.where(bad, torch.full_like(chi2, torch.inf), chi2), warm
+
+    y, jacobian, residual, chi2, warm = evaluate(values, target, warm)
+    alive = torch.isfinite(chi2)
+    if not bool(alive.any()):
+        return None
+    if not bool(alive.all()):  # infinite trajectories would poison the batch
+        values, y, jacobian, residual, chi2 = (t[alive] for t in (values, y, jacobian, residual, chi2))
+        warm = None if warm is None else warm.rows(alive)
+        if data is not None:
+            target, data = target[alive], data[alive]
+    damping = torch.full_like(chi2, 1e-3)
+    size = torch.zeros(len(values), len(free), dtype=torch.float64)
+    done = torch.zeros(len(values), dtype=torch.bool)
+    lost = torch.zeros(len(values), dtype=torch.long)
+    eager = torch.full_like(chi2, 0.2)
+    passed, taken = [chi2.clone()], [torch.zeros_like(chi2)]
+    for _ in range(max_steps):
+        if not free:
+            break
+        slope = whitening(jacobian)
+        if bool(log.any()):
+            slope = torch.where(log, slope * values[:, None, free], slope)
+        gradient = (slope.transpose(-1, -2) @ residual.unsqueeze(-1))[..., 0]
+        diagonal = slope.square().sum(-2)
+        size = torch.maximum(size * 0.9, diagonal)
+        now = values[:, free]
+        stuck = ((now <= low) & (gradient < 0)) | ((now >= high) & (gradient > 0)) | (size <= 0)
+        held = torch.zeros_like(now)
+        for _ in range(len(free)):
+            unit = torch.where(stuck, torch.ones_like(size), size).sqrt()
+            left = residual - (slope @ held.unsqueeze(-1))[..., 0]
+            u, s, v = torch.linalg.svd(
+                torch.where(stuck[:, None], torch.zeros_like(slope), slope / unit[:, None]), full_matrices=False
+            )
+            along = (u.transpose(-1, -2) @ left.unsqueeze(-1))[..., 0]
+            shrink = s / (s.square() + damping[:, None] + 1e-14)
+            change = (v.transpose(-1, -2) @ (shrink * along).unsqueeze(-1))[..., 0] / unit
+            change = torch.where(stuck, held, change)
+            free_move = torch.where(log, now * change.clamp(-2, 2).exp(), now + change)
+            over = ~stuck & ((free_move < low) | (free_move > high))
+            if not bool(over.any()):
+                break
+            wall = free_move.clamp(low, high)
+            held = torch.where(over, torch.where(log, (wall / now).log(), wall - now), held)
+            stuck = stuck | over
+        moved = free_move.clamp(low, high)
+        trial = values.clone()
+        trial[:, free] = torch.where(done[:, None], now, moved)
+        step = torch.where(log, (trial[:, free] / now).log(), trial[:, free] - now)
+        reach = (slope @ step.unsqueeze(-1))[..., 0]
+        predicted = 2 * (step * gradient).sum(-1) - reach.square().sum(-1)
+        # A step from which the trajectory cannot be mended at once is too long; only if that goes on is it marched.
+        rows = (~done).nonzero()[:, 0]  # the others are not evaluated again
+        part = None if warm is None else warm.rows(rows)
+        *found, warm_part = evaluate(
+            trial[rows], target[rows] if target.ndim == 2 else target, part, bool((lost[rows] >= 3).any())
+        )
+        y_new, jacobian_new, residual_new, chi2_new = (
+            old.index_copy(0, rows, new) for old, new in zip((y, jacobian, residual, chi2), found, strict=True)
+        )
+        lost = torch.where(torch.isfinite(chi2_new) | (lost >= 3), torch.zeros_like(lost), lost + 1)
+        gain = (chi2 - chi2_new) / predicted.clamp_min(1e-300)
+        better = (chi2_new < chi2) & ~done
+        small = predicted.abs() <= TOLERANCE * (chi2 + 1e-3 * problem.n)
+        done = done | (small & ~(chi2_new < chi2 * (1 - TOLERANCE))) | (~better & (damping > 1e10))
+        for old, new in (
+            (values, trial),
+            (y, y_new),
+            (jacobian, jacobian_new),
+            (residual, residual_new),
+            (chi2, chi2_new),
+        ):
+            old[better] = new[better]
+        if warm is not None and warm_part is not None:
+            warm = warm.updated(better, warm_part.rows(better[rows]))
+        # A step that had to be taken back teaches caution: along a bent valley the damping would swing otherwise.
+        eager = torch.where(better, (eager * 0.9).clamp_min(0.2), (eager * 2.0).clamp_max(0.8))
+        ease = torch.where(
+            gain > 0.75, eager, torch.where(gain > 0.25, torch.full_like(gain, 0.9), torch.full_like(gain, 2.0))
+        )
+        damping = torch.where(better, damping * ease, damping * 4.0)
+        damping = damping.clamp(1e-9, 1e12)
+        passed.append(chi2.clone())
+        taken.append(taken[-1] + better)
+        if len(passed) > STEPS:  # along a valley that is nearly flat
+            creeping = passed[-1 - STEPS] - chi2 < CREEPING * (chi2 / problem.n).clamp_max(1.0)
+            done = done | (creeping & (taken[-1] - taken[-1 - STEPS] >= TAKEN))
+        if bool(done.all()):
+            break
+    best = int(chi2.argmin())
+    agreeing = float((chi2 <= chi2[best] * (1 + 1e-3) + 0.1).double().mean())
+    if free and finish and not bool(done[best]):
+        last = fit(
+            problem,
+            whitening,
+            values[best : best + 1],
+            free,
+            warm=None if warm is None else warm.rows(torch.tensor([best])),
+            data=None if data is None else data[best : best + 1],
+            max_steps=finish,
+            finish=0,
+        )
+        if last is not None:
+            return dataclasses.replace(last, ends=values, ends_chi2=chi2, agreeing=agreeing)
+    gradient = (whitening(jacobian[best]).T @ residual[best]) if free else residual[best, :0]
+    now = values[best, free]
+    width = torch.where(torch.isfinite(high - low), high - low, now.abs().clamp_min(1e-300))
+    near = 1e-6 * width
+    spread = torch.ones_like(now)
+    if free:
+        tangents = whitening(jacobian[best])
+        edge = (now <= low + near) | (now >= high - near)
+        others = tangents[:, ~edge]
+        sizes = others.norm(dim=0).clamp_min(1e-300)
+        uu, ss, _ = torch.linalg.svd(others / sizes, full_matrices=False)
+        basis = uu[:, ss > 1e-7 * ss.max()] if others.shape[1] else tangents[:, :0]
+        spread = (tangents - basis @ (basis.T @ tangents)).norm(dim=0).clamp_min(1e-300)
+    pushed = gradient / spread
+    at_bound = ((now <= low + near) & (pushed < -2.0)) | ((now >= high - near) & (pushed > 2.0))
+    return Fitted(
+        problem=problem,
+        whitening=whitening,
+        values=values[best],
+        free=list(free),
+        y=y[best],
+        jacobian=jacobian[best],
+        chi2=float(chi2[best]),
+        at_bound=at_bound,
+        warm=None if warm is None else Solution(warm.states[best : best + 1]),  # tangents would only take memory
+        ends=values,
+        ends_chi2=chi2,
+        agreeing=agreeing,
+    )
+
+
+def refit(found: Fitted, whitening: Whitening, problem: Problem | None = None) -> Fitted:
+    """The same model fitted again with other noise, or to other data, from where it stood."""
+    problem = found.problem if problem is None else problem
+    again = fit(problem, whitening, found.values[None], found.free, warm=found.warm)
+    return dataclasses.replace(found, problem=problem, whitening=whitening) if again is None else again
+
+
+def weighed(found: Fitted, whitening: Whitening) -> Fitted:
+    """The same values under other noise, not fitted again."""
+    chi2 = float(whitening.vector(found.residual).square().sum())
+    return dataclasses.replace(found, whitening=whitening, chi2=chi2)

@@ -1,0 +1,238 @@
+"""The base, calibrated: from many starts, without outliers, with the noise estimated and time steps short enough."""
+
+import dataclasses
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.fits.candidates import base_columns
+from torchcal.discovery.fits.fitting import Fitted, fit, follow_slopes, refit, starts
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.fits.sharpen import SOLVER_SHARE, sharpen
+from torchcal.discovery.misfit.noise import Noise, estimate, growth
+from torchcal.discovery.misfit.outliers import spikes
+from torchcal.errors import ConvergenceError, SimulatorError
+from torchcal.simulators import Trajectories, workable
+
+__all__ = ["calibrate_base", "growing"]
+
+#: How often steps are chosen anew at most.
+HALVED = 7
+#: The solver's error at the first starting value, in the data's spread, from which on the fit begins with shorter
+#: steps, and how often they are halved for that at most.
+WRONG, EARLY = 0.1, 2
+#: Misfit of an output, in that of all, each in its spread, below which the solver need not be more exact for it.
+FAR_BELOW = 0.03
+#: Difference of χ² up to which an initial angle in another turn gives the same fit.
+SAME_FIT = 0.01
+#: Share of the data that may be outliers, and how often some are set aside before those that are left are looked at
+#: again.
+MOST, ROUNDS = 0.2, 5
+#: How often noise that grows is estimated from what it leaves when it is weighed.
+GROWTHS = 4
+#: Log odds from which on noise forgets with every sample and not with time.
+BY_SAMPLE = 1.0
+
+
+def calibrate_base(
+    problem: Problem,
+    fixed: Mapping[str, float],
+    num_starts: int,
+    seed: int,
+    *,
+    clean: bool = False,
+    unit: Tensor | None = None,
+) -> tuple[Fitted, Noise]:
+    """Fit the base, set outliers aside, estimate the noise, shorten the solver's steps where they matter.
+
+    Args:
+        problem: The data and the base.
+        fixed: Parameters that are held, by name.
+        num_starts: Starting values.
+        seed: Of these.
+        clean: Whether outliers are set aside already.
+        unit: How unknown noise grows with the outputs, where that is known better than from the base's residual.
+
+    Raises:
+        ConvergenceError: If no starting value gives finite outputs.
+        SimulatorError: If the solution does not settle when time steps are halved.
+    """
+    recording = problem.recording
+    exact = isinstance(recording.noise, str)
+    free, held = base_columns(problem, fixed)
+    rough = recording.noise if isinstance(recording.noise, Tensor) else 0.1 * recording.spread
+    outputs = torch.zeros(len(recording.outputs), dtype=torch.float64)
+    begin = starts(problem, num_starts, seed, held)
+    problem = _steady(problem, begin[:1])
+    found = _from_starts(problem, begin, free, rough, outputs)
+    if found is None:
+        raise ConvergenceError(
+            f"Expected finite outputs of the base at one of {num_starts} starting values at least. Got none, the first "
+            f"with {_point(problem, begin[0], free)}. Give initial= near the truth, or bounds, to the parameters (a "
+            "rate is about 1 over the time in which something happens), and look at the runs' initial values."
+        )
+    found = _unwound(_sharpen(found))
+    found, units = _grown(found, unit)
+    if not exact and not clean:
+        whole = found, units
+        for _ in range(ROUNDS):
+            given = recording.noise if isinstance(recording.noise, Tensor) else None
+            bad = spikes(found.problem, found.residual / units[found.problem.index], given)
+            if not bool(bad.any()):
+                break
+            keep = found.problem.keep.clone()
+            keep[found.problem.index[bad]] = False
+            if float(keep.sum()) < (1 - MOST) * whole[0].problem.n:  # so many are none
+                found, units = whole
+                break
+            found, units = _grown(_again(found, keep), unit)
+    noise = estimate(found.problem, found.residual, found.jacobian, recording.noise, units)
+    base = refit(found, noise.whitening(found.problem))
+    if not exact:
+        base, units = _grown(base, unit, units)
+        base, noise = _with_memory(base, units)
+        base = _sharpen(refit(base, noise.whitening(base.problem)), noise.sd)
+    return base, noise
+
+
+def _steady(problem: Problem, begin: Tensor) -> Problem:
+    """With steps that do for a starting value ``(1, P)``, roughly."""
+    simulator = problem.simulator
+    if not isinstance(simulator, Trajectories):
+        return problem
+    return problem.with_simulator(workable(simulator, begin, WRONG * problem.recording.spread, halvings=EARLY))
+
+
+def _grown(found: Fitted, known: Tensor | None, before: Tensor | None = None) -> tuple[Fitted, Tensor]:
+    """A fit and how its noise grows, ``(n_total,)``, each by the other; as ``known`` where it is, else from ``before``.
+
+    What large data leave hides how little small ones scatter, until they are weighed so.
+    """
+    unit = torch.ones_like(found.problem.recording.y) if before is None else before
+    if known is not None:
+        return found, known
+    for _ in range(GROWTHS):
+        before, unit = unit, growing(found, unit)
+        if torch.allclose(unit, before):
+            break
+        noise = estimate(found.problem, found.residual, found.jacobian, None, unit)
+        found = refit(found, noise.whitening(found.problem))
+    return found, unit
+
+
+def _with_memory(found: Fitted, units: Tensor) -> tuple[Fitted, Noise]:
+    """A fit and its noise, which forgets with time, or with every sample where that is clearly likelier."""
+    known = found.problem.recording.noise
+    with_time = dataclasses.replace(found.problem, by_sample=False)
+    noise = estimate(with_time, found.residual, found.jacobian, known, units)
+    if with_time.uneven:
+        by_sample = dataclasses.replace(with_time, by_sample=True)
+        other = estimate(by_sample, found.residual, found.jacobian, known, units)
+        if other.log_density > noise.log_density + BY_SAMPLE:
+            return dataclasses.replace(found, problem=by_sample), other
+    return dataclasses.replace(found, problem=with_time), noise
+
+
+def growing(found: Fitted, before: Tensor) -> Tensor:
+    """How unknown noise grows with the outputs, by the residual of a fit weighed by what was found before,
+    ``(n_total,)``; see `growth`."""
+    if found.problem.recording.noise is not None:
+        return torch.ones_like(found.problem.recording.y)
+    whole = dataclasses.replace(found.problem, keep=torch.ones_like(found.problem.keep))
+    f = whole.evaluate(found.values[None], [], found.warm)[0][0]
+    return growth(found.problem, found.residual, found.jacobian, f, before)
+
+
+def _from_starts(problem: Problem, begin: Tensor, free: list[int], rough: Tensor, outputs: Tensor) -> Fitted | None:
+    """The best fit from many starts: over the first part of the runs, then over all, so that no phase is lost."""
+    if not problem.in_time:
+        return fit(problem, problem.whitening(rough, outputs), begin, free)
+    guided = follow_slopes(problem, begin)
+    begin = torch.cat([guided, begin[: max(2, len(begin) // 4)]])
+    keep = torch.zeros(problem.recording.n, dtype=torch.bool)
+    run = problem.recording.x["run"]  # type: ignore[index]
+    for r in run.unique():
+        mine = (run == r).nonzero()[:, 0]
+        keep[mine[: max(8, len(mine) // 4)]] = True
+    early = problem.keeping(keep.repeat(len(problem.recording.outputs)))
+    ends = begin
+    if early.n >= 3 * len(free):
+        first = fit(early, early.whitening(rough, outputs), begin, free, max_steps=15, finish=0)
+        if first is not None and first.ends is not None and first.ends_chi2 is not None:
+            order = first.ends_chi2.argsort()
+            ends = torch.cat([first.ends[order[: max(4, len(order) // 2)]], guided[:4]])
+    return fit(problem, problem.whitening(rough, outputs), ends, free)
+
+
+def _unwound(found: Fitted) -> Fitted:
+    """The same fit with unseen initial angles within half a turn of zero, where whole turns change nothing.
+
+    Not everything that may be missing is as periodic as the base.
+    """
+    bound = found.problem.simulator
+    if not isinstance(bound, Trajectories):
+        return found
+    names = [q.name for q in found.problem.parameters]
+    values = found.values.clone()
+    for i in found.free:
+        turns = round(float(values[i]) / (2 * math.pi))
+        if turns and names[i] in bound.initial_names:
+            values[i] -= 2 * math.pi * turns
+            y = found.problem.evaluate(values[None], [])[0][0]
+            same = float(found.whitening.vector(found.problem.y - y).square().sum()) <= found.chi2 + SAME_FIT
+            values[i] = values[i] if same else found.values[i]
+    if torch.equal(values, found.values):
+        return found
+    again = fit(found.problem, found.whitening, values[None], found.free)
+    if again is None or again.chi2 > found.chi2 + SAME_FIT:
+        return found
+    return dataclasses.replace(again, agreeing=found.agreeing)
+
+
+def _again(found: Fitted, keep: Tensor) -> Fitted:
+    """The same fit to fewer data."""
+    problem = dataclasses.replace(found.problem, keep=keep)
+    rough = torch.zeros(len(keep), dtype=torch.float64)
+    rough[found.problem.index] = found.whitening.sd
+    return refit(
+        found, problem.whitening(rough, torch.zeros(len(problem.recording.outputs), dtype=torch.float64)), problem
+    )
+
+
+def _misfit_of_each(found: Fitted) -> Tensor:
+    """RMSE of each output, at its data ``(n,)``."""
+    size = torch.zeros_like(found.y)
+    for k in found.problem.output_of.unique():
+        mine = found.problem.output_of == k
+        size[mine] = found.residual[mine].square().mean().sqrt()
+    return size
+
+
+def _sharpen(found: Fitted, sd: Tensor | None = None) -> Fitted:
+    """Shorten time steps, where they err, until the solver's error is small against the noise, of an sd ``(n_total,)``;
+    against each output's misfit where none is known yet, but not far below that of all: one without noise tells no more
+    than that of how exact the others must be."""
+    recording = found.problem.recording
+
+    def allowed(now: Fitted) -> Tensor:
+        spread = recording.spread[now.problem.index]
+        if isinstance(recording.noise, Tensor):
+            return SOLVER_SHARE * torch.maximum(recording.noise[now.problem.index], 1e-6 * spread)
+        size = _misfit_of_each(now) if sd is None else sd[now.problem.index]
+        least = FAR_BELOW * float((now.residual / spread).square().mean().sqrt())
+        return SOLVER_SHARE * torch.maximum(size, max(least, 1e-6) * spread)
+
+    found, error = sharpen(found, allowed, rounds=HALVED)
+    if not error:
+        return found
+    raise SimulatorError(
+        "Expected the solution to settle when time steps are halved. Got a change of "
+        f"{error:.3g} after {HALVED} times, with {_point(found.problem, found.values, found.free)} (a discontinuous "
+        "model: smooth it, or give max_step=; or a fit that an initial= far from the truth led astray)."
+    )
+
+
+def _point(problem: Problem, values: Tensor, free: list[int]) -> str:
+    return ", ".join(f"{problem.parameters[i].name} = {float(values[i]):.3g}" for i in free)

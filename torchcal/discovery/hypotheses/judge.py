@@ -1,0 +1,61 @@
+"""What of a refitted hypothesis speaks against it: its number of parameters, its bounds, what nature is known to be."""
+
+import dataclasses
+import math
+
+from torchcal.discovery.fits.fitting import Fitted
+from torchcal.discovery.fits.local import ENDS, is_window
+from torchcal.discovery.hypotheses.model import Model
+
+__all__ = ["judge"]
+
+#: Prior odds against an estimate on a physical bound that it wants to cross.
+UNPHYSICAL = math.log(1e-3)
+
+
+def judge(model: Model, base: Fitted) -> None:
+    """Fill in its price, its bounds, where it acts and what speaks against it, beside the base's fit."""
+    found, candidate = model.found, model.candidate
+    names = [q.name for q in candidate.problem.parameters]
+    if model.window is not None:
+        low, high = model.window.low, model.window.high
+        for i in candidate.own:
+            low = float(found.values[i]) if names[i].endswith(ENDS["from"]) else low
+            high = float(found.values[i]) if names[i].endswith(ENDS["to"]) else high
+        model.window = dataclasses.replace(model.window, low=low, high=high)
+    before = base.stuck
+    new = [name for name in found.stuck if name not in before and not is_window(name)]
+    amplitude = {names[i] for i in candidate.amplitudes}
+    off = set()
+    for i, at in zip(found.free, found.at_bound.tolist(), strict=True):
+        if at and names[i] in amplitude:
+            value, q = float(found.values[i]), candidate.problem.parameters[i]
+            end = min((one for one in (q.low, q.high) if one is not None), key=lambda one: abs(one - value))
+            if end == float(candidate.neutral[candidate.own.index(i)]):
+                off.add(names[i])
+    closed = model.window is not None and model.window.low >= model.window.high
+    model.physical = not new and not closed
+    if closed:
+        model.note = "its window has closed"
+    elif off:
+        model.note = f"wants the wrong sign: {', '.join(sorted(off))} stays at its neutral value"
+    elif new:
+        model.note = f"at its bound: {', '.join(new)}"
+    else:
+        model.note = ""
+    parameters = len([i for i in candidate.own if names[i] not in off])
+    model.price = -0.5 * parameters * math.log(base.problem.n) + (UNPHYSICAL if new else 0.0) + _expected(model)
+
+
+def _expected(model: Model) -> float:
+    """Log density of a model's estimates where its terms say what these are in nature, relative to its largest."""
+    known = {term.full(name): told for term in model.candidate.terms for name, told in term.expected.items()}
+    if not known:
+        return 0.0
+    found = model.found
+    values, spread = found.by_name, dict(zip(found.by_name, found.sd().tolist(), strict=True))
+    total = 0.0
+    for name, (value, sd) in known.items():
+        own = spread[name] if math.isfinite(spread[name]) else math.inf
+        total -= 0.5 * (values[name] - value) ** 2 / (sd**2 + own**2)
+    return total

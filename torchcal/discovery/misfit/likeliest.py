@@ -1,0 +1,231 @@
+"""How likely the data are under a hypothesis with the noise that suits it best.
+
+Noise of unknown size or correlation and physics that is left out are two explanations of one residual. No hypothesis is
+judged by the noise that another one needs: each has its own, and the data decide between the pairs.
+"""
+
+import dataclasses
+import itertools
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.fits.fitting import Fitted, refit, weighed
+from torchcal.discovery.fits.problem import Problem, Whitening
+from torchcal.discovery.misfit.channels import channels
+from torchcal.discovery.misfit.curves import orthonormal
+from torchcal.discovery.misfit.noise import GRID, LEAST, Noise, estimate, least, log_prior, mine
+from torchcal.discovery.misfit.residual import Residual
+from torchcal.discovery.misfit.structure import evidences, responses_of
+
+__all__ = ["Tangents", "alone", "log_likelihood", "log_normal", "settled", "with_unknown"]
+
+#: Places in `GRID` of the coefficients that are tried beside something unknown, and how often for every output.
+TRIED, ROUNDS = (0, 8, 16, 24, 30, 36), 2
+#: Waves that are taken out of what is left, one after another.
+WAVES = 4
+#: Shares of the noise sd beyond smooth curves that are tried where there are several conditions: these curves may not
+#: bend as much there as what is unknown.
+SMALLER = (1.0, 0.75, 0.5, 0.35, 0.25)
+
+#: Places in `GRID` and in `SMALLER`, by output.
+_Places = tuple[tuple[int, ...], tuple[int, ...]]
+
+
+@dataclass(frozen=True, eq=False)
+class Tangents:
+    """Directions in which the base can move the data, which every likelihood is integrated over.
+
+    Fits are normal in all parameters: what integrating does is a determinant, and that of the base's tangents alone
+    differs from noise to noise for every hypothesis alike.
+
+    Attributes:
+        directions: Orthonormal, ``(n, r)``.
+        grams: Of the whitened directions within each output, for noise of unit size (or of the size that is given) and
+            each coefficient in `GRID`, ``(outputs, grid, r, r)``.
+        logs: Half the log determinant of the noise's correlation, ``(outputs, grid)``.
+    """
+
+    directions: Tensor
+    grams: Tensor
+    logs: Tensor
+
+    @classmethod
+    def of(cls, base: Fitted, noise: Noise) -> "Tangents":
+        """Of the base's fit."""
+        slope = orthonormal(base.jacobian[:, ~base.at_bound], cut=1e-7)
+        problem, outputs, unit = base.problem, len(noise.correlation), _unit(noise)
+        grams, logs = [], []
+        for rho in GRID:
+            w = problem.whitening(unit, torch.full_like(noise.correlation, float(rho)))
+            white, half = w(slope), 0.5 * torch.log1p(-w.correlation.square())
+            parts = [problem.output_of == k for k in range(outputs)]
+            grams.append(torch.stack([white[part].T @ white[part] for part in parts]))
+            logs.append(torch.stack([half[part].sum() for part in parts]))
+        return cls(slope, torch.stack(grams, 1), torch.stack(logs, 1))
+
+
+def _counts(problem: Problem) -> Tensor:
+    """Used data of every output, ``(outputs,)``."""
+    return torch.bincount(problem.output_of, minlength=len(problem.recording.outputs)).double()
+
+
+def _unit(noise: Noise) -> Tensor:
+    return noise.unit if noise.open else noise.sd
+
+
+def log_likelihood(found: Fitted, noise: Noise, tangents: Tangents) -> float:
+    """Of the data by a fit under a noise model, the base's parameters integrated out.
+
+    The log prior of the correlation is included.
+    """
+    w = noise.whitening(found.problem)
+    return _log_density(w, w.vector(found.residual), noise, tangents, found.problem)
+
+
+def _log_density(w: Whitening, e: Tensor, noise: Noise, tangents: Tangents, problem: Problem) -> float:
+    found = log_normal(w, e) + float(log_prior(noise.correlation, _counts(problem)).sum())
+    if tangents.directions.shape[1]:
+        found -= float(torch.linalg.qr(w(tangents.directions)).R.diagonal().abs().log().sum())
+    return found
+
+
+def log_normal(w: Whitening, e: Tensor) -> float:
+    """Log density of data by their whitened residual ``(n,)``, without the constant of 2π."""
+    size = 0.5 * float(torch.log1p(-w.correlation.square()).sum()) + float(w.sd.log().sum())
+    return -size - 0.5 * float(e.square().sum())
+
+
+def alone(found: Fitted, noise: Noise, tangents: Tangents) -> tuple[Noise, float]:
+    """The likeliest noise of a model that leaves nothing else, and the log-likelihood with it.
+
+    Args:
+        found: The model's fit.
+        noise: Estimated before; it says what is known.
+        tangents: The base's.
+    """
+    problem = found.problem
+    if noise.source == "replicates":
+        return noise, log_likelihood(found, noise, tangents)
+    unit, outputs = _unit(noise), len(noise.correlation)
+    squares = torch.stack([
+        problem.whitening(unit, torch.full_like(noise.correlation, float(rho))).vector(found.residual).square()
+        for rho in GRID
+    ])  # fmt: skip
+    count = _counts(problem)
+    freedom = (count * (1 - len(found.free) / problem.n)).clamp_min(1.0)
+    square = torch.stack([squares[:, problem.output_of == k].sum(1) for k in range(outputs)])  # (outputs, grid)
+    sizes = (square / freedom[:, None]).clamp_min(1e-300) if noise.open else torch.ones_like(square)
+    blocks = tangents.grams / sizes[:, :, None, None]
+    best = [int((GRID - rho).abs().argmin()) for rho in noise.correlation]
+    posterior = noise.posterior.clone()
+    for k in range(outputs):
+        if not count[k]:
+            continue
+        others = torch.zeros_like(blocks[0, 0])
+        for j in range(outputs):
+            others = others + blocks[j, best[j]] if j != k else others
+        like = log_prior(GRID, count[k]) - tangents.logs[k]
+        like = like - 0.5 * count[k] * sizes[k].log() - 0.5 * square[k] / sizes[k]
+        like = like - 0.5 * torch.linalg.slogdet(others + blocks[k])[1]
+        if count[k] < LEAST or problem.sweeps is None:
+            like[1:] = -math.inf
+        best[k] = int(like.argmax())
+        posterior[k] = (like - like[best[k]]).exp() / (like - like[best[k]]).exp().sum()
+    sd, correlation = noise.sd.clone(), noise.correlation.clone()
+    for k in range(outputs):
+        if count[k]:
+            correlation[k] = GRID[best[k]]
+            if noise.open:
+                here = mine(problem, k)
+                sd[here] = sizes[k, best[k]].sqrt() * unit[here]
+    if noise.open:
+        sd = torch.maximum(sd, least(problem, noise.step))
+        noise = dataclasses.replace(noise, freedom=float(freedom[count > 0].min()))
+    fresh = dataclasses.replace(noise, sd=sd, correlation=correlation, posterior=posterior)
+    return fresh, log_likelihood(found, fresh, tangents)
+
+
+def settled(found: Fitted, noise: Noise, tangents: Tangents) -> tuple[Noise, float]:
+    """The same with the model fitted again under that noise."""
+    fresh, _ = alone(found, noise, tangents)
+    return alone(refit(found, fresh.whitening(found.problem)), noise, tangents)
+
+
+def with_unknown(
+    model: Fitted, given: Tensor | str | None, tangents: Tangents, unit: Tensor
+) -> tuple[Noise, float]:
+    """The likeliest noise beside a model and something unknown, smooth or a wave, and the log evidence of the two.
+
+    Args:
+        model: The model's fit.
+        given: As ``recording.noise``.
+        tangents: The base's.
+        unit: Of unknown noise, as in `Noise`.
+    """
+    problem = model.problem
+    available = [c for c in channels(problem, model) if c.kind in problem.kinds]
+    looks = responses_of(problem, available)
+
+    def likeliest(peeled: list[Fitted]) -> tuple[Noise, float, Tensor | None]:
+        """Beside what is unknown and the waves taken out so far, near what is estimated without these."""
+        noise = estimate(problem, peeled[-1].residual, model.jacobian, given, unit)
+        found: dict[_Places, tuple[Noise, float, Tensor | None]] = {}
+
+        def evidence(at: _Places) -> float:
+            if at not in found:
+                tried = _at(model, noise, *at)
+                w = tried.whitening(problem)
+                residuals = [Residual(weighed(one, w), tried, draws=0) for one in peeled]
+                seen, wave = evidences(residuals[-1], looks, available)
+                gain = max(seen) - math.log(len(seen)) if seen else -math.inf
+                gain += sum(max(evidences(one, (), available)[0], default=0.0) for one in residuals[:-1])
+                like = _log_density(w, residuals[0].e, tried, tangents, problem)
+                found[at] = tried, like + gain, wave
+            return found[at][1]
+
+        factors = range(len(SMALLER) if noise.open and problem.order is None else 1)
+        places = tuple(int((GRID - rho).abs().argmin()) for rho in noise.correlation)
+        best = places, (0,) * len(places)
+        evidence(best)
+        for _ in range(ROUNDS if noise.source != "replicates" else 0):
+            before = best
+            for k, n in enumerate(torch.bincount(problem.output_of, minlength=len(places)).tolist()):
+                rhos = {best[0][k], *TRIED} if n >= LEAST and problem.sweeps is not None else {best[0][k]}
+                wanted = itertools.product(rhos, factors if n else (0,))
+                best = max((_with(best, k, *one) for one in wanted), key=evidence)
+            if best == before:
+                break
+        return found[best]
+
+    peeled = [model]
+    noise, evidence, wave = likeliest(peeled)
+    while wave is not None and len(peeled) <= WAVES:  # no noise is estimated from a wave
+        peeled.append(dataclasses.replace(peeled[-1], y=peeled[-1].y + wave))
+        fresh, more, wave = likeliest(peeled)
+        if more <= evidence:
+            break
+        noise, evidence = fresh, more
+    return noise, evidence
+
+
+def _with(at: _Places, k: int, rho: int, factor: int) -> _Places:
+    """Another coefficient and size of output k."""
+    return (*at[0][:k], rho, *at[0][k + 1 :]), (*at[1][:k], factor, *at[1][k + 1 :])
+
+
+def _at(model: Fitted, noise: Noise, places: tuple[int, ...], smaller: tuple[int, ...]) -> Noise:
+    """The noise model at other coefficients, by their places in `GRID`, and sizes, by those in `SMALLER`."""
+    correlation = GRID[list(places)]
+    sd, posterior = noise.sd.clone(), noise.posterior.clone()
+    for output, (place, factor) in enumerate(zip(places, smaller, strict=True)):
+        here, other = mine(model.problem, output), correlation[output] != noise.correlation[output]
+        if other:
+            posterior[output] = (torch.arange(len(GRID)) == place).to(posterior)
+        if noise.open:
+            sd[here] = SMALLER[factor] * (noise.sizes[output, place] * noise.unit[here] if other else sd[here])
+    if noise.open:
+        sd = torch.maximum(sd, least(model.problem, noise.step))
+    return dataclasses.replace(noise, sd=sd, correlation=correlation, posterior=posterior)

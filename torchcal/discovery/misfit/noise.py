@@ -1,0 +1,337 @@
+"""What is noise and what may be physics: the noise model, from the recording itself where nobody knows it.
+
+Physics moves slowly against the sampling, or along the tangents of the model. Whatever is left beyond a smooth curve
+and those tangents is taken for noise, and its size and correlation are estimated by restricted maximum likelihood.
+"""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.fits.problem import Problem, Whitening, remembered
+from torchcal.discovery.misfit.curves import beyond
+from torchcal.discovery.records import NoiseModel
+from torchcal.errors import DomainError
+
+__all__ = [
+    "GRID", "LEAST", "Noise", "decorrelated", "estimate", "growth", "least", "log_prior", "mine", "quantisation"
+]  # fmt: skip
+
+#: Difference of replicates, in the size of the data, up to which they agree.
+ROUNDING = 1e-12
+#: AR(1) coefficients that are tried.
+GRID = torch.linspace(0.0, 0.95, 39, dtype=torch.float64)
+#: Weights against correlation, in log prior density: of φ, and of the share of a recording that it lasts.
+SHRINK, SLOW = 1.0, 20.0
+#: Fewest data of an output whose noise may be correlated.
+LEAST = 40
+#: Quantile of its posterior at which a clear correlation is taken.
+CAUTION = 0.6
+#: Smallest noise sd that is estimated, in the output's spread.
+FLOOR = 1e-7
+#: Fewest data of an output whose noise may grow with it; the log-likelihood that this must gain; the sd at zero that
+#: are tried, in those at the largest output; the ratio of the largest sd to the smallest below which nothing is gained;
+#: and as how many independent data differences of neighbours count.
+FEWEST, GROWS, LITTLE, INDEPENDENT = 20, 3.0, 4.0, 0.6
+OFFSETS = (1e-5, 3e-5, 1e-4, 3e-4, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3)
+#: Least share of a datum's own noise that smooth curves leave of it.
+LEVERAGE = 0.1
+#: Ratio of the largest to the smallest sd of an output from which on both are told.
+VARIES = 1.05
+#: How much larger the noise found may be than the noise given before the given one is doubted.
+EXCESS = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """A noise model of the used data.
+
+    Attributes:
+        sd: ``(n_total,)``.
+        correlation: AR(1) coefficient by output, ``(outputs,)``.
+        freedom: Degrees of freedom that the size was estimated with; infinite where it is known.
+        posterior: Probability of each coefficient in `GRID`, by output, ``(outputs, grid)``.
+        source: As in `NoiseModel`.
+        sizes: Noise sd at each coefficient in `GRID`, by output, ``(outputs, grid)``; of a known noise, in its sd; of
+            an unknown one, in `unit`.
+        doubted: By how much the residual's fastest part exceeds the noise given, where that is a contradiction; else 1.
+        step: As in `NoiseModel`.
+        unit: Of unknown noise, its sd in units of its median, ``(n_total,)``; see `growth`.
+        log_density: Of what it was estimated from, with the prior of the correlation, up to a constant.
+    """
+
+    sd: Tensor
+    correlation: Tensor
+    freedom: float
+    posterior: Tensor
+    source: str
+    sizes: Tensor
+    doubted: float = 1.0
+    step: dict[str, float] = dataclasses.field(default_factory=dict)
+    unit: Tensor = dataclasses.field(default_factory=lambda: torch.ones(()))
+    log_density: float = 0.0
+
+    @property
+    def open(self) -> bool:
+        """Whether its size is neither given nor known from replicates."""
+        return self.source == "estimated"
+
+    def whitening(self, problem: Problem) -> Whitening:
+        """Of a problem's residuals."""
+        return problem.whitening(self.sd, self.correlation)
+
+    def record(self, problem: Problem) -> NoiseModel:
+        """For the result."""
+        names = problem.recording.outputs
+        used = problem.recording.split(torch.where(problem.recording.observed, self.sd, math.nan))
+        used = {name: values[torch.isfinite(values)] for name, values in used.items()}
+        ends = {name: (float(values.min()), float(values.max())) for name, values in used.items() if len(values)}
+        return NoiseModel(
+            sd={name: float(values.median()) if len(values) else math.nan for name, values in used.items()},
+            range={name: (low, high) for name, (low, high) in ends.items() if high > VARIES * low},
+            correlation={name: float(c) for name, c in zip(names, self.correlation, strict=True)},
+            source=self.source,
+            outliers=int((problem.recording.observed_once & ~problem.keep).sum()),
+            quantisation=self.step,
+            memory=("sample" if problem.by_sample else "time") if problem.uneven and self.correlation.any() else "",
+        )
+
+
+def log_prior(rho: Tensor, n: Tensor | float) -> Tensor:
+    """Of AR(1) coefficients of n data, up to a constant.
+
+    Noise that is correlated over 1/ln(1/φ) data, a good part of them, looks like physics, and is the less likely.
+    """
+    return -SHRINK * rho + SLOW / rho.clamp_min(1e-9).log() / torch.as_tensor(n).clamp_min(1)
+
+
+def estimate(
+    problem: Problem, residual: Tensor, design: Tensor, given: Tensor | str | None, unit: Tensor | None = None
+) -> Noise:
+    """The noise model from the residual of a fitted model.
+
+    Args:
+        problem: The used data.
+        residual: ``(n,)``.
+        design: Tangents that a further refit could use, ``(n, k)``; what they explain is not noise.
+        given: As ``recording.noise``.
+        unit: As `growth` found it, where the size is unknown; 1 by default.
+
+    Raises:
+        DomainError: If there are too few data to tell noise from anything else.
+    """
+    recording = problem.recording
+    outputs = len(recording.outputs)
+    correlation = torch.zeros(outputs, dtype=torch.float64)
+    posterior = torch.zeros(outputs, len(GRID), dtype=torch.float64)
+    posterior[:, 0] = 1.0
+    table = torch.ones(outputs, len(GRID), dtype=torch.float64)
+    if isinstance(given, str):  # a detailed simulation: what counts is the misfit in units of the spread
+        sd = recording.spread * 1e-3
+        return Noise(sd, correlation, math.inf, posterior, "none", table, unit=torch.ones_like(sd))
+    unit = torch.ones_like(recording.y) if unit is None else unit
+    known = given if isinstance(given, Tensor) else unit
+    replicated = _replicates(problem) if given is None else None
+    sd = known.clone()
+    freedom, doubted, log_density = math.inf, 1.0, 0.0
+    for output in range(outputs):
+        parts = [places for places in problem.recorded if int(problem.output_of[places[0]]) == output]
+        n = sum(len(places) for places in parts)
+        if n == 0:
+            continue
+        scaled = [residual[places] / known[problem.index[places]] for places in parts]
+        bases = [beyond(problem, places, design, known, ends=isinstance(given, Tensor)) for places in parts]
+        usable = sum(len(basis) - basis.shape[1] for basis in bases)
+        if usable < 2 and given is not None:
+            continue
+        if usable < 2:
+            raise DomainError(
+                f"Expected enough data to tell noise from misfit. Got {n} of output {recording.outputs[output]!r}. "
+                "Give noise= its standard deviation."
+            )
+        correlated = n >= LEAST and problem.sweeps is not None and replicated is None
+        gaps = [problem.gaps(places) for places in parts]
+        logs, sizes = [], []
+        for rho in GRID if correlated else GRID[:1]:
+            square, log_det, count = 0.0, 0.0, 0
+            for places, r, basis, apart in zip(parts, scaled, bases, gaps, strict=True):
+                each = remembered(rho, apart)
+                e, b = (decorrelated(values, each[:, None]) for values in (r[:, None], basis))
+                e = e[:, 0]
+                q, upper = torch.linalg.qr(b)
+                left = e - q @ (q.T @ e)
+                square += float(left.square().sum())
+                log_det += 0.5 * float(torch.log1p(-each.square()).sum())
+                log_det += float(upper.diagonal().abs().log().sum())
+                count += len(places) - b.shape[1]
+            sizes.append(square / count)
+            size = 0.5 * count * math.log(max(square, 1e-300)) if given is None else 0.5 * square
+            logs.append(-size - log_det + float(log_prior(rho, n)))
+        likelihood = torch.tensor(logs, dtype=torch.float64)
+        log_density += float(likelihood.max())
+        weight = (likelihood - likelihood.max()).exp()
+        posterior[output, : len(weight)] = weight / weight.sum()
+        best = int(likelihood.argmax())
+        tail = posterior[output].cumsum(0)
+        if float(tail[1]) < 0.05:  # clearly correlated: too little of it would pass noise off as physics
+            best = int((tail < CAUTION).sum())
+        correlation[output] = GRID[best]
+        scale = math.sqrt(sizes[best])
+        mask = mine(problem, output)
+        table[output, : len(sizes)] = torch.tensor(sizes, dtype=torch.float64).sqrt()
+        if given is None:
+            if replicated is not None:
+                sd[mask] = replicated[output].sd(problem, unit) * unit[mask]
+                freedom = min(freedom, replicated[output].freedom)
+            else:
+                sd[mask], freedom = scale * unit[mask], min(freedom, usable)
+        elif scale > EXCESS * (1 + 2 / math.sqrt(2 * usable)):
+            doubted = max(doubted, scale)
+    step = quantisation(problem) if given is None else {}
+    if given is None:
+        sd = torch.maximum(sd, least(problem, step))
+    source = "given" if isinstance(given, Tensor) else "replicates" if replicated is not None else "estimated"
+    return Noise(sd, correlation, freedom, posterior, source, table, doubted, step, unit, log_density)
+
+
+def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor, before: Tensor) -> Tensor:
+    """Noise sd in units of its median, ``(n_total,)``: 1, or growing with the model's output where the scatter does.
+
+    An sd of a + |f| / max |f| is taken for the best of a few a where it makes the fastest part of the residual much
+    likelier (by `GROWS`; Laplace's distribution, whose scale a few outliers move little). Where there are replicates,
+    how far they are off their means takes the place of the residual. It is for noise of unknown size. Outputs ``f`` are
+    those of all data, used or not, ``(n_total,)``; ``before`` is what was found before, by which data are weighed.
+    """
+    unit = torch.ones_like(problem.recording.y)
+    f, replicated = f.abs(), _replicates(problem)
+    for output in range(len(problem.recording.outputs)):
+        parts = [places for places in problem.recorded if int(problem.output_of[places[0]]) == output]
+        if not parts:
+            continue
+        used = f[problem.index[torch.cat(parts)]]
+        if replicated is not None:
+            e, told = replicated[output].off.abs(), float(replicated[output].freedom)
+            size_of = f[problem.index[replicated[output].places]] / used.max()
+        else:
+            left, size = [], []
+            for places in parts:
+                kept, inside = _fastest(problem, places, residual, design, before)
+                left.append(kept)
+                size.append(f[problem.index[places]][inside] / used.max())
+            e, size_of = torch.cat(left).abs(), torch.cat(size)
+            told = (INDEPENDENT if problem.order is not None else 1.0) * len(e)
+        seen = e > 0  # what is exact, a blank set to zero, is no measure of noise
+        e, size_of, told = e[seen], size_of[seen], told * float(seen.double().mean())
+        if len(e) < FEWEST or not float(used.max()) > 0 or not float(e.sum()) > 0:
+            continue
+        best = GROWS - told * math.log(float(e.sum()))
+        for offset in OFFSETS:
+            shape = offset + size_of
+            if float(shape.max()) < LITTLE * float(shape.min()):
+                continue
+            like = -told * (math.log(float((e / shape).sum())) + float(shape.log().mean()))
+            if like > best:
+                best, here = like, mine(problem, output)
+                unit[here] = (offset + f[here] / used.max()) / (offset + float(used.median() / used.max()))
+    return torch.where(torch.isfinite(unit), unit, 1.0)
+
+
+def _fastest(
+    problem: Problem, places: Tensor, residual: Tensor, design: Tensor, unit: Tensor
+) -> tuple[Tensor, slice]:
+    """What a sequence has that no smooth curve has, and at which of its data.
+
+    In an order by how much data are off the line between their neighbours, which hardly any misfit moves; elsewhere
+    what is left beyond smooth curves, weighed by a unit of the noise ``(n_total,)``.
+    """
+    r = residual[places]
+    if len(r) < 3:
+        return r[:0], slice(0, 0)
+    if problem.order is None:
+        basis, size = beyond(problem, places, design, unit), unit[problem.index[places]]
+        left = (1 - basis.square().sum(1)).clamp_min(LEVERAGE).sqrt()  # what the curves leave of the noise of a datum
+        return (r - size * (basis @ (basis.T @ (r / size)))) / left, slice(None)
+    at = problem.order[problem.condition_of[places]]
+    at = at if bool((at.diff() > 0).all()) else torch.arange(len(r), dtype=torch.float64)
+    share = (at[1:-1] - at[:-2]) / (at[2:] - at[:-2])
+    off = r[1:-1] - (1 - share) * r[:-2] - share * r[2:]
+    return off / (1 + share.square() + (1 - share).square()).sqrt(), slice(1, -1)
+
+
+def mine(problem: Problem, output: int) -> Tensor:
+    """Which of all data are of an output, bool ``(n_total,)``."""
+    return torch.arange(len(problem.recording.y)) // problem.recording.n == output
+
+
+def least(problem: Problem, step: dict[str, float]) -> Tensor:
+    """Smallest noise sd of all data ``(n_total,)``: a perfect fit would leave no unit to measure anything in."""
+    sd = FLOOR * problem.recording.spread
+    for name, size in step.items():
+        mask = mine(problem, problem.recording.outputs.index(name))
+        sd[mask] = sd[mask].clamp_min(size / math.sqrt(12.0))
+    return sd
+
+
+def decorrelated(values: Tensor, rho: Tensor) -> Tensor:
+    """Successive values ``(m, k)`` with what follows from the one before, by correlations ``(m - 1, k)``, taken out;
+    one column of either goes with all of the other."""
+    rest = (values[1:] - rho * values[:-1]) / (1 - rho.square()).sqrt()
+    return torch.cat([values[:1].expand(1, rest.shape[1]), rest])
+
+
+@dataclass(frozen=True)
+class _Replicates:
+    """What data of one output at identical conditions tell of its noise.
+
+    Attributes:
+        places: Of the used data that are not alone at their conditions.
+        off: How far each is from the mean of its conditions, in what makes its variance that of the noise.
+        freedom: Degrees of freedom.
+    """
+
+    places: Tensor
+    off: Tensor
+    freedom: int
+
+    def sd(self, problem: Problem, unit: Tensor) -> float:
+        """Noise sd in a unit ``(n_total,)``, which is the same at identical conditions."""
+        off, count = self.off / unit[problem.index[self.places]], len(self.places)
+        return math.sqrt(float(off.square().mean())) if count else 0.0
+
+
+def _replicates(problem: Problem) -> list[_Replicates] | None:
+    """Replicates of every output; None without any, or with too few of one."""
+    if problem.in_time:
+        return None
+    levels, group = problem.levels
+    if len(levels) == len(group):
+        return None
+    found = []
+    for output in range(len(problem.recording.outputs)):
+        places = (problem.output_of == output).nonzero()[:, 0]
+        y, g = problem.y[places], group[problem.condition_of[places]]
+        count = torch.zeros(len(levels), dtype=torch.float64).index_add_(0, g, torch.ones_like(y))
+        total = torch.zeros_like(count).index_add_(0, g, y)
+        many = count[g] > 1
+        off = (y - total[g] / count[g]) * (count[g] / (count[g] - 1).clamp_min(1)).sqrt()
+        found.append(_Replicates(places[many], off[many], int((count - 1).clamp_min(0).sum())))
+    if not any(bool((one.off.abs() > ROUNDING * problem.recording.y.nan_to_num().abs().max()).any()) for one in found):
+        return None  # what always agrees, as coarse readings do, tells nothing of the noise
+    return found if min(one.freedom for one in found) >= 3 else None
+
+
+def quantisation(problem: Problem) -> dict[str, float]:
+    """Step of each output whose values are few multiples of one number."""
+    found = {}
+    for name, values in problem.recording.split(problem.recording.y).items():
+        seen = values[torch.isfinite(values)].unique()
+        if len(seen) < 3 or len(seen) > 0.8 * int(torch.isfinite(values).sum()) or len(values) < 20:
+            continue
+        step = float(seen.diff().min())
+        size = float(seen.abs().max())
+        if step > 1e-6 * size and float(((seen / step) - (seen / step).round()).abs().max()) < 1e-3:
+            found[name] = step
+    return found

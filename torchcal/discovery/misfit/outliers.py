@@ -1,0 +1,265 @@
+"""Data that are no noise of the rest: single samples far from their neighbours, or from a model that explains these."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.misfit.curves import smooth_columns
+
+__all__ = ["lone", "spikes"]
+
+#: A sample that leaves its neighbours' range by more than this many robust sd, alone or with one beside it, is one.
+SPIKE = 4.5
+#: Robust sd from which on a residual of a model that explains the rest is an outlier, where its neighbours' are not
+#: half as large that way.
+LONE = 4.5
+#: How many times as far as the bend of those beside it would take it a sample must be off to be an outlier.
+BENT = 3.0
+#: Distance, in that of the farthest neighbour, below which two neighbours tell no more of a bend than one.
+APART = 0.1
+#: How many times as large the product of the distances to both neighbours must be in places for a table to be uneven.
+UNEVEN = 2.0
+#: Share of the largest sample below which a bend is rounding.
+ROUNDED = 1e-12
+#: Share of supposed outliers with another one as nearest neighbour above which they are no outliers.
+TOGETHER = 0.4
+#: Probability of as many of them at one value of a condition by chance, below which they are no outliers.
+CHANCE = 0.1
+
+
+def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
+    """Used data that stick out alone from their neighbours, bool ``(n,)``.
+
+    Along one order they are compared with two neighbours on either side. Among several conditions the
+    residual of a robust smooth fit takes its place.
+    """
+    found = torch.zeros(problem.n, dtype=torch.bool)
+    for places in problem.sequences:
+        if len(places) < 10:
+            continue
+        r = residual[places]
+        if sd is not None:
+            r = r / sd[problem.index[places]]
+        if problem.order is None:
+            left, scale = _robust_left(smooth_columns(problem, places, ranks=True), r)
+            high, far = (_high(values, sd is not None) for values in (left, left / scale))
+            found[places] = _first(high & far, left / scale) if not _clustered(problem, places, high) else False
+            continue
+        at = problem.order[problem.condition_of[places]].double()
+        # A curve leaves its neighbours' range nowhere, but bends everywhere.
+        least = SPIKE * math.sqrt(1.3) * _bends(at, r).clamp_min(float(sd is not None))  # 1 is what white noise gives
+        if bool((least > 0).all()):
+            found[places] = _alone(at, r, _with_ends(at, r, _off_neighbours(r), least), least)
+    return found
+
+
+def lone(problem: Problem, residual: Tensor, sd: Tensor | None, ends: bool = False) -> Tensor:
+    """Used data that a model that explains the others misses by far, bool ``(n,)``.
+
+    In an order their neighbours must not be half as far off that way, and the ends are not judged unless that is
+    wanted: a quick beginning is physics as likely as not. Among several conditions they must not be together.
+    """
+    found = torch.zeros(problem.n, dtype=torch.bool)
+    for places in problem.sequences:
+        if len(places) < 10:
+            continue
+        r = residual[places]
+        size = (1.4826 * r.abs().median()).expand(len(r))
+        if sd is not None:
+            size = size.maximum(sd[problem.index[places]])
+        far = (r.abs() > LONE * size) & (size > 0)
+        if problem.order is None:
+            far = _first(far, r)
+            found[places] = far & (not _clustered(problem, places, far))
+            continue
+        beside = torch.full_like(r, -math.inf)
+        beside[1:] = r[:-1] * r[1:].sign()
+        beside[:-1] = torch.maximum(beside[:-1], r[1:] * r[:-1].sign())
+        if not ends:
+            far[[0, -1]] = False
+        found[places] = far & (beside < 0.5 * r.abs())
+    return found
+
+
+def _first(far: Tensor, r: Tensor) -> Tensor:
+    """Of data that are far off the one that is off twice as far as any other, as it draws the fit off those around it;
+    all of them where there is none."""
+    worst = far & (r.abs() >= 0.5 * r[far].abs().max()) if bool(far.any()) else far
+    return worst if int(worst.sum()) == 1 else far
+
+
+def _off_neighbours(r: Tensor) -> Tensor:
+    """By how much samples ``(m,)`` leave the range of the two middle ones of their four neighbours.
+
+    Beside two spikes that range reaches from the other samples to the spikes, so that these alone leave it.
+    """
+    padded = torch.cat([r[:1].expand(2), r, r[-1:].expand(2)])
+    around = torch.stack([padded[k : k + len(r)] for k in (0, 1, 3, 4)]).sort(0).values
+    off: Tensor = r - torch.maximum(torch.minimum(r, around[2]), around[1])
+    return off
+
+
+def _bends(at: Tensor, r: Tensor) -> Tensor:
+    """Usual distance of samples ``(m,)`` from the lines through their neighbours, in that of white noise of unit size.
+
+    White noise bends alike whatever the spacing; a curve bends with the product of the distances to both neighbours. By
+    how much more they bend where that is large is seen from the thirds where it is smallest and largest.
+    """
+    before, behind = at.diff()[:-1], at.diff()[1:]
+    span = before + behind
+    share = torch.where(span > 0, before / span.clamp_min(1e-300), torch.full_like(span, 0.5))
+    line = r[:-2] + share * (r[2:] - r[:-2])
+    size = ((r[1:-1] - line).square() / (1 + share.square() + (1 - share).square())).sqrt()
+    reach = before * behind
+    third = len(size) // 3
+    order = reach.argsort()
+    near, far = (float(reach[part].median().clamp_min(1e-300)) for part in (order[:third], order[-third:]))
+    moving = size > ROUNDED * r.abs().max()
+    if not bool(moving.any()):
+        return torch.zeros_like(r)
+    usual = size[moving].median()  # equal readings at equal conditions tell nothing of the others
+    power = 0.0
+    if far > UNEVEN * near and float(usual) > 0:
+        less, more = (float(size[part].median().clamp_min(1e-300)) for part in (order[:third], order[-third:]))
+        power = min(max(math.log(more / less) / math.log(far / near), 0.0), 1.0)
+    grown = reach.clamp_min(1e-300) ** power
+    found = 1.4826 * torch.maximum(usual, (size / grown)[moving].median() * grown)
+    return torch.cat([found[:1], found, found[-1:]])
+
+
+def _with_ends(at: Tensor, r: Tensor, off: Tensor, least: Tensor) -> Tensor:
+    """The same with both ends measured from a line through the next four.
+
+    Scaled to vary as much as the others do by noise alone; 0 where one of the four is off itself, by more than
+    ``least``, or where they bend: a decay ends farther off the line than the parabola through them.
+    """
+    off = off.clone()
+    for end, next_, x in ((0, r[1:5], at[1:5] - at[0]), (-1, r[-5:-1].flip(0), at[-1] - at[-5:-1].flip(0))):
+        beside = slice(1, 5) if end == 0 else slice(-5, -1)
+        parabola = _through(x, 2)
+        if len(parabola) < 3:
+            off[end] = 0.0
+            continue
+        near, far = x[:2].mean(), x[2:].mean()
+        away = float(near / (far - near))
+        line = torch.tensor([1 + away, 1 + away, -away, -away], dtype=r.dtype) / 2
+        here = float(r[end] - line @ next_)
+        bend = float((line @ x.square()) * (parabola[2] @ next_))
+        plain = abs(here) > BENT * abs(bend) and not bool((off[beside].abs() > least[beside]).any())
+        off[end] = here * math.sqrt(1.3 / (1 + float(line.square().sum()))) if plain else 0.0
+    return off
+
+
+def _through(x: Tensor, degree: int) -> Tensor:
+    """What gives the coefficients of the polynomial that comes nearest to samples at x ``(k,)``, ``(degree + 1, k)``;
+    of a lower degree where they are at too few places."""
+    size = x.abs().max().clamp_min(1e-300)
+    powers = torch.arange(min(degree, len((x / size / APART).round().unique()) - 1) + 1)
+    return torch.linalg.pinv((x / size)[:, None] ** powers) / (size**powers)[:, None]
+
+
+def _alone(at: Tensor, r: Tensor, off: Tensor, least: Tensor) -> Tensor:
+    """Which differences from neighbours are at least so large, singly or two together, bool ``(m,)``.
+
+    Those beside the top of a curve are nearly as large as at its top; those beside a spike are not. Before and behind a
+    step the values differ; before and behind a spike they do not. Two at the top of a curve are off their neighbours,
+    but not off the parabola through those.
+    """
+    high = (off.abs() > least).tolist()
+    size = [*off.abs().tolist(), 0.0]
+    found = torch.zeros(len(off), dtype=torch.bool)
+    k = 0
+    while k < len(high):
+        end = k
+        while end < len(high) and high[end]:
+            end += 1
+        if 0 < end - k <= 2:
+            inside = 0 < k and end < len(high)
+            step = abs(float(r[max(k - 3, 0) : k].median() - r[end : end + 3].median())) if inside else 0.0
+            alone = max(size[k - 1] if k else 0.0, size[end], step) < 0.5 * max(size[k:end])
+            found[k:end] = alone and _off_curve(at, r, high, k, end, least)
+        k = end + 1
+    return found
+
+
+def _off_curve(at: Tensor, r: Tensor, high: Sequence[bool], k: int, end: int, least: Tensor) -> bool:
+    """Whether one of the samples from k to ``end`` is as far off the parabola through two before and two behind, and
+    not for how these bend.
+
+    By the farther the worse that tells for how they are spaced. Samples that are ``high`` themselves are passed over.
+    """
+    before = [i for i in range(max(k - 4, 0), k) if not high[i]][-2:]
+    behind = [i for i in range(end, min(end + 4, len(r))) if not high[i]][:2]
+    around = torch.tensor([*before, *behind])
+    if not before or not behind:
+        return True
+    for i in range(k, end):
+        x = at[around] - at[i]
+        weights, even = (_through(part, 2)[0] for part in (x, around.double() - i))
+        worse = float((1 + weights.square().sum()) / (1 + even.square().sum()))
+        off = abs(float(r[i] - weights @ r[around]))
+        bend = abs(float((weights - _through(x, 1)[0]) @ r[around]))
+        if off > float(least[i]) * math.sqrt(max(worse, 1.0)) and off > BENT * bend:
+            return True
+    return False
+
+
+def _clustered(problem: Problem, places: Tensor, high: Tensor) -> bool:
+    """Whether data that stick out lie together among the conditions, as outliers do not."""
+    count = int(high.sum())
+    if count < 2:
+        return False
+    columns = problem.recording.columns[problem.condition_of[places]].unbind(-1)
+    if any(_one_level(column, high, CHANCE / len(columns)) for column in columns):
+        return True
+    if count < 3:
+        return False
+    ranks = torch.stack([c.unique(return_inverse=True)[1].double() for c in columns], dim=-1)
+    ranks = ranks * (len(places) / (ranks.amax(0) + 1))
+    distance = torch.cdist(ranks[high], ranks)
+    distance[torch.arange(count), high.nonzero()[:, 0]] = math.inf
+    nearest = (distance <= distance.amin(1, keepdim=True) * (1 + 1e-9)).double()
+    together = float((nearest @ high.double() / nearest.sum(1)).mean())
+    return together > TOGETHER
+
+
+def _one_level(column: Tensor, high: Tensor, chance: float) -> bool:
+    """Whether more data that stick out share one value of a condition than by chance of less than this."""
+    levels, which = column.unique(return_inverse=True)
+    count = int(high.sum())
+    if 2 * len(levels) > len(column):
+        return False
+    there = torch.bincount(which[high], minlength=len(levels)).tolist()
+    share = (torch.bincount(which, minlength=len(levels)).double() / len(column)).tolist()
+    least = min(
+        sum(math.comb(count, k) * q**k * (1 - q) ** (count - k) for k in range(seen, count + 1))
+        for seen, q in zip(there, share, strict=True)
+    )
+    return least * len(levels) < chance
+
+
+def _high(left: Tensor, known: bool) -> Tensor:
+    """Which residuals exceed `SPIKE` robust sd, or noise of unit size where that is ``known``."""
+    size = max(1.4826 * float(left.abs().median()), float(known))
+    return left.abs() > SPIKE * size if size > 0 else torch.zeros_like(left, dtype=torch.bool)
+
+
+def _robust_left(columns: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+    """What a smooth fit with Tukey's biweight leaves, and the sd of that by white noise of unit size.
+
+    At an edge the fit follows a datum that it takes in, and is uncertain where it leaves one out: the variance is near
+    1 + q (1 − 2 w²), with w the datum's weight and q the variance of the curve.
+    """
+    columns = columns[:, : max(1, len(values) // 8)]
+    weight = torch.ones_like(values)
+    left = values - values.median()
+    for _ in range(10):
+        size = max(1.4826 * float(left.abs().median()), 1e-300)
+        weight = (1 - (left / (4.685 * size)).square()).clamp_min(0)
+        solution = torch.linalg.lstsq(columns * weight[:, None], (values * weight)[:, None], driver="gelsd").solution
+        left = values - (columns @ solution)[:, 0]
+    curve = (columns @ torch.linalg.pinv(columns * weight[:, None], rtol=1e-9)).square().sum(1)
+    return left, (1 + curve * (1 - 2 * weight.square())).clamp_min(0.1).sqrt()

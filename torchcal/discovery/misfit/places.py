@@ -1,0 +1,108 @@
+"""Places where something may be missing: unknown changes of a channel along a driver, with their evidence."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.misfit.channels import Channel
+from torchcal.discovery.misfit.residual import Residual
+
+__all__ = ["SIZES", "SMALL", "Change", "Place", "evidence_of"]
+
+#: Singular values below this share of the largest are none.
+SMALL = 1e-6
+#: Share of a change that is the same everywhere up to which the base's parameters make up for it.
+SAME = 1e-3
+#: Sizes of an unknown change that are tried, in noise sd.
+SIZES = torch.logspace(-0.3, 3.0, 14, dtype=torch.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """An unknown change of one channel against one driver: smooth, or an oscillation.
+
+    Attributes:
+        channel: Where.
+        driver: Against what.
+        evidence: Log evidence against no change.
+        share: Share of the excess misfit that it removes.
+        profile: Estimated change at the channel's points, ``(K,)``; its median is 0 where the base's parameters make
+            up for one that is the same everywhere.
+        sd: Its standard deviation there.
+        period: Of an oscillation, in units of the driver; None of a smooth change.
+    """
+
+    channel: Channel
+    driver: str
+    evidence: float
+    share: float
+    profile: Tensor
+    sd: Tensor
+    period: float | None = None
+
+
+def evidence_of(u: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
+    """Log evidence with every one of `SIZES` as likely, ``(B,)``, and the likeliest size; u ``(r, B)``, s ``(r,)``."""
+    gain = (SIZES[:, None] * s).square()  # (G, r)
+    shrink = gain / (1 + gain)
+    logs = 0.5 * shrink @ u.square() - 0.5 * torch.log1p(gain).sum(-1, keepdim=True)
+    return logs.logsumexp(0) - math.log(len(SIZES)), SIZES[logs.argmax(0)]
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """Smooth changes of a channel along a driver, in principal directions.
+
+    Attributes:
+        features: Radial functions at the channel's points, ``(K, m)``.
+        scale: Of their responses, which are divided by it.
+        s: Singular values of the responses, ``(m,)``.
+        v: Right singular vectors, ``(m, m)``.
+        along: The residual along the left ones, ``(m,)``.
+        null: The simulated residuals along them, ``(m, draws)``.
+    """
+
+    features: Tensor
+    scale: float
+    s: Tensor
+    v: Tensor
+    along: Tensor
+    null: Tensor
+
+    @classmethod
+    def of(cls, features: Tensor, columns: Tensor, least: float, residuals: Tensor) -> "Change | None":
+        """From the responses, projected; None where there are none beyond rounding, ``least``."""
+        scale = float(columns.norm()) / math.sqrt(columns.shape[1])
+        if scale <= least:
+            return None
+        columns = columns / scale
+        values, v = torch.linalg.eigh(columns.T @ columns)
+        s = values.clamp_min(0.0).sqrt()
+        there = s > SMALL * s[-1]
+        along = (v[:, there].T @ (columns.T @ residuals)) / s[there, None]
+        return cls(features, scale, s[there], v[:, there], along[:, 0], along[:, 1:])
+
+    def place(self, channel: Channel, driver: str, residual: Residual) -> Place:
+        """The estimate."""
+        evidence, size = evidence_of(self.along[:, None], self.s)
+        gain = (float(size[0]) * self.s).square()
+        shrink = gain / (1 + gain)
+        weights = (self.v * (shrink / self.s)) @ self.along / self.scale
+        removed = float(((1 - (1 - shrink).square()) * self.along.square()).sum())
+        share = residual.share(removed, float(shrink.sum()))
+        features, profile = self.features, self.features @ weights
+        if _is_unseen(channel, residual):
+            features, profile = features - features.mean(0), profile - profile.median()
+        within = (features @ self.v) / (1 + gain).sqrt()
+        # What the data say nothing about keeps its prior sd.
+        beyond = (features.square().sum(1) - (features @ self.v).square().sum(1)).clamp_min(0.0)
+        sd = (within.square().sum(1) + beyond).sqrt() * float(size[0]) / self.scale
+        return Place(channel, driver, float(evidence[0]), share, profile, sd)
+
+
+def _is_unseen(channel: Channel, residual: Residual) -> bool:
+    """Whether the base's parameters make up for a change that is the same everywhere, so that it may be any."""
+    change = channel.response(channel.time.new_ones(len(channel.time), 1))
+    return float(residual.tangent(change).norm()) <= SAME * float(residual.found.whitening(change).norm())

@@ -1,0 +1,181 @@
+"""Is there more in a residual than noise, and where does it sit?
+
+The residual of a fit, whitened and projected off the fit's tangent space, is compared with unknown smooth changes of
+every channel against every driver, with oscillations of every output, and of every equation and parameter in time.
+Probabilities come from simulated noise that went through the same projection.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.fits.local import Span
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.misfit.channels import Channel, channels
+from torchcal.discovery.misfit.lines import Lines, lines_of
+from torchcal.discovery.misfit.noise import quantisation
+from torchcal.discovery.misfit.places import SIZES, Change, Place, evidence_of
+from torchcal.discovery.misfit.residual import Residual
+from torchcal.discovery.misfit.waves import wave_places
+
+__all__ = ["Structure", "analyse", "evidences", "responses_of"]
+
+#: Radial functions along time, and along any other driver: the evidence chooses how many.
+IN_TIME, ALONG = (12, 24, 48), (12, 24)
+#: Of more functions than the fewest, how many data there must be for each, in time and among conditions.
+DATA_EACH = (4, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Structure:
+    """What an analysis of a residual found.
+
+    Attributes:
+        places: By falling evidence.
+        p_value: Probability of so much structure by noise alone.
+        channels: All of them.
+        null_best: Largest evidence in each simulated residual.
+    """
+
+    places: list[Place]
+    p_value: float
+    channels: list[Channel]
+    null_best: Tensor
+
+
+def _features(driver: Tensor, count: int) -> Tensor:
+    """Radial functions ``(K, count)`` that sum to smooth curves along a driver."""
+    low, high = float(driver.min()), float(driver.max())
+    centres = torch.linspace(low, high, count, dtype=torch.float64)
+    width = 1.2 * (high - low) / (count - 1)
+    return torch.exp(-0.5 * ((driver[:, None] - centres) / width).square())
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """Smooth changes of a channel along a driver: functions ``(K, m)`` and responses ``(n, m)``, not whitened."""
+
+    channel: Channel
+    driver: str
+    features: list[Tensor]
+    responses: Tensor
+
+
+def responses_of(problem: Problem, available: Sequence[Channel]) -> list[_Look]:
+    """Every channel along every driver, and its logarithm over decades, with fewer and more functions."""
+    found = []
+    for channel in available:
+        data = problem.n if channel.kind != "output" else int((channel.matrix != 0).sum())
+        for name, driver in channel.drivers.items():
+            distinct = len(driver.unique())
+            if distinct < 2:
+                continue
+            counts = dict.fromkeys(min(count, distinct) for count in _counts(problem, data, name))
+            scales = [driver, driver.log()] if not problem.is_time(name) and Span.of(driver).log else [driver]
+            parts = [_features(scale, count) for scale in scales for count in counts]
+            found.append(_Look(channel, name, parts, channel.response(torch.cat(parts, dim=1))))
+    return found
+
+
+def _counts(problem: Problem, data: int, driver: str) -> list[int]:
+    """Numbers of smooth functions along a driver that are tried with some data."""
+    most = max(ALONG[0], data // DATA_EACH[0 if problem.in_time else 1])
+    return [count for count in (IN_TIME if problem.is_time(driver) else ALONG) if count <= most]
+
+
+def _lines(residual: Residual, available: Sequence[Channel]) -> list[Lines]:
+    """Oscillations of every output."""
+    problem = residual.found.problem
+    x = problem.recording.x
+    driver = "t" if problem.in_time else next(iter(x)) if isinstance(x, dict) else "x"
+    return lines_of(
+        problem, available, quantisation(problem), residual.found.whitening.sd, driver,
+        lambda data: _counts(problem, data, driver)[-1],
+    )  # fmt: skip
+
+
+def _line_place(lines: Lines, residual: Residual) -> Place:
+    """The likeliest oscillation of an output."""
+    found = residual.found
+    evidence, number = lines.evidence(residual.e[:, None], SIZES)
+    profile, removed = lines.wave(found.residual, residual.e, number, SIZES)
+    taken = 2.0 * len(lines.parts) + 1.0  # two amplitudes in every run, and the frequency
+    return Place(
+        lines.channel, lines.driver, float(evidence[0]), residual.share(removed, taken), profile,
+        lines.sd(found.whitening.sd), 1.0 / float(lines.frequencies[number]),
+    )  # fmt: skip
+
+
+def evidences(
+    residual: Residual, looks: Sequence[_Look], available: Sequence[Channel]
+) -> tuple[list[float], Tensor | None]:
+    """Log evidence for a smooth change of each channel against each driver, and for oscillations of each output.
+
+    Also returns the oscillation ``(n,)`` that the residual has where one is likelier than all else.
+    """
+    smooth: dict[int, float] = {}
+    for key, _, change in _changes(residual, looks, residual.e[:, None]):
+        smooth[key] = max(smooth.get(key, -math.inf), float(evidence_of(change.along[:, None], change.s)[0]))
+    found, wave = list(smooth.values()), None
+    for lines in _lines(residual, available):
+        evidence, number = lines.evidence(residual.e[:, None], SIZES)
+        if float(evidence[0]) > max([0.0, *found]):
+            wave = lines.wave(residual.found.residual, residual.e, number, SIZES)[0]
+        found.append(float(evidence[0]))
+    return found, wave
+
+
+def _changes(residual: Residual, looks: Sequence[_Look], residuals: Tensor) -> Iterator[tuple[int, _Look, Change]]:
+    """Changes of every channel along every driver, under the residual's noise."""
+    for number, look in enumerate(looks):
+        responses = residual.found.whitening(look.responses)
+        columns = residual.project(responses)
+        if not bool(torch.isfinite(columns).all()):
+            continue
+        sizes = [part.shape[1] for part in look.features]
+        pieces = zip(look.features, columns.split(sizes, 1), responses.split(sizes, 1), strict=True)
+        for features, block, whole in pieces:
+            change = Change.of(features, block, 1e-9 * float(whole.norm()), residuals)
+            if change is not None:
+                yield number, look, change
+
+
+def analyse(residual: Residual, *, every: bool = False) -> Structure:
+    """Look for smooth changes of every channel against every driver, and for oscillations.
+
+    Args:
+        residual: The fit's.
+        every: Also look at channels of kinds that do not count for the test, for the report.
+    """
+    found = residual.found
+    available = channels(found.problem, found)
+    kinds = found.problem.kinds
+    chosen = [c for c in available if every or c.kind in kinds]
+    best: dict[int, Place] = {}
+    nulls: dict[int, Tensor] = {}
+    both = torch.cat([residual.e[:, None], residual.null], dim=1)
+    for key, look, change in _changes(residual, responses_of(found.problem, chosen), both):
+        place = change.place(look.channel, look.driver, residual)
+        if key not in best or place.evidence > best[key].evidence:
+            best[key] = place
+        if look.channel.kind in kinds:
+            simulated = evidence_of(change.null, change.s)[0]
+            nulls[key] = torch.maximum(nulls[key], simulated) if key in nulls else simulated
+    places = list(best.values())
+    for lines in _lines(residual, chosen):
+        places.append(_line_place(lines, residual))
+        nulls[-len(places)] = lines.evidence(residual.null, SIZES)[0]
+    for place, simulated in wave_places(residual, chosen, both):
+        places.append(place)
+        if place.channel.kind in kinds:
+            nulls[-len(places)] = simulated
+    places.sort(key=lambda place: -place.evidence)
+    if not nulls:
+        return Structure(places, 1.0, available, torch.zeros(1, dtype=torch.float64))
+    null = torch.stack(list(nulls.values())).amax(0)
+    seen = max((p.evidence for p in places if p.channel.kind in kinds), default=0.0)
+    p_value = (1.0 + float((null >= seen).sum())) / (1.0 + len(null))
+    return Structure(places, p_value, available, null)

@@ -1,0 +1,302 @@
+"""Why the best explanation of a recording may be no name, however probable it is."""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.fits.fitting import weighed
+from torchcal.discovery.fits.local import force, is_window
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.hypotheses.model import Model
+from torchcal.discovery.hypotheses.own_noise import beside
+from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.verdicts.explain import misfit_size, stated_sd
+from torchcal.discovery.verdicts.given import as_good
+from torchcal.discovery.verdicts.instruments import no_instrument, unnatural
+from torchcal.errors import TorchcalError
+from torchcal.simulators import Trajectories
+from torchcal.terms import Term
+
+__all__ = ["by_hold", "distinct", "doubt", "left_open", "unfit"]
+
+#: Correlation from sample to sample from which on noise of unknown size may be physics that a term has left.
+SLOWEST = 0.85
+#: Robust over plain sd of the innovations below which they are of several sizes (1 if normal, 0.73 if Laplace's), and
+#: data of an output from which on that can be told.
+EVEN, MANY = 0.55, 30
+#: Correlation along the rows of a grid, in sd, from which on what is left may be noise in the order of the recording.
+ALONG = 3.3
+#: Distance of a term's amplitudes from neutral, in their joint sd, up to which the data leave them open.
+OPEN = 0.1
+#: The same of a term that acts in a window, where most terms can do what a few data want, of one of several, which may
+#: make up for each other, or of data without noise, where nothing else weighs it.
+CLEARLY_OPEN = 2.0
+#: Distinct values of its driver at which a window must be open, and at which closed: its height, end and slope can be
+#: drawn through fewer, whatever they are. And the share of a term that may be missing, or left.
+LEVELS, NEARLY = 3, 0.2
+#: Distinct values of its driver below a threshold up to which nothing shows that the effect begins there.
+FREE = 2
+#: Sd of a slow drive's gain, and share of it, by which it must be more than the base's own: a pure dead time takes
+#: twice as much, a lag with half a gap between samples beside it a fifth more.
+WRONG_WAY, MORE = 2.0, 1 / 3
+#: Log odds against a nameless change from which on a term in a window is there for its own shape.
+CLEARLY = 3.0
+#: Share of the squared misfit that two terms leave at most, where few data show them together alone.
+NEXT_TO_NOTHING = 1e-3
+#: Share of the largest effect of the base's parameters below which a direction of them moves no datum.
+UNSEEN = 1e-7
+
+
+def doubt(search: Search, model: Model) -> str:
+    """Why a model is no name, however probable, in a sentence; empty if it may be one."""
+    found = _no_better(search, model) or unfit(search, model) or by_hold(search, model) or _pair_of_many(search, model)
+    return found or ("" if search.exact else _noise_or_physics(search, model))
+
+
+def _pair_of_many(search: Search, model: Model) -> str:
+    """Why terms that show together alone, in few data, are no name unless they leave next to nothing."""
+    if not search.paired:
+        return ""
+    left, whole = (float(found.residual.square().sum()) for found in (model.found, search.base))
+    if left <= NEXT_TO_NOTHING * whole:
+        return ""
+    return (
+        "So few data with noise of unknown size show it by two terms together alone, as two others may do: more data, "
+        "replicates or a known noise sd would tell."
+    )
+
+
+def unfit(search: Search, model: Model) -> str:
+    """Why what a model adds is open, or nothing that its terms stand for, in a sentence; empty if it is neither."""
+    return (
+        left_open(search, model)
+        or unnatural(model)
+        or no_instrument(search, model)
+        or _no_threshold(model)
+        or _no_drive(model)
+    )
+
+
+def left_open(search: Search, model: Model) -> str:
+    """Why the data do not determine what a model adds; empty if they do."""
+    names = [q.name for q in model.found.problem.parameters]
+    if (noise := beside(search, model)) is not search.noise:
+        model = dataclasses.replace(model, found=weighed(model.found, noise.whitening(model.found.problem)))
+    for term in model.candidate.terms:
+        shapes = [i for i in model.candidate.own if term.brings(names[i]) and not is_window(names[i])]
+        places = [i for i in model.candidate.amplitudes if term.brings(names[i])]
+        sure = model.window is None and len(model.candidate.terms) == 1 and not search.exact
+        least = OPEN if sure else CLEARLY_OPEN
+        # Without noise the misfit is what an amplitude is uncertain by.
+        if places and _distance(model, places, shapes, misfit_size(model.found) if search.exact else 1.0) <= least:
+            bound = search.base.stuck
+            looks = f" {', '.join(bound)} ran to a bound in the base: a bound that is wrong looks like this too."
+            told = "The data leave the size of what it adds open: more conditions would tell."
+            return told + looks if bound else told
+    if model.window is not None and _levels(model) < LEVELS:
+        return (
+            f"It acts in full, or not at all, at hardly more than one value of {model.window.driver}, where something "
+            f"else may be missing as well: more values of {model.window.driver} would tell."
+        )
+    # As many to spare as are added: else there is a curve through the data, whatever they are.
+    if distinct(search.problem) - len(model.found.free) <= len(model.candidate.own):
+        return "There are hardly more distinct conditions than parameters: more conditions would tell."
+    return ""
+
+
+def _no_better(search: Search, model: Model) -> str:
+    """Why a term in a window is hardly likelier than a constant change there; empty if it is clearly so."""
+    rival = max(search.nameless, key=lambda one: one.weight, default=None)
+    if model.window is None or rival is None or rival.window is None or rival.weight < model.weight - CLEARLY:
+        return ""
+    if search.constants.intersection(model.numbers):  # which has no other shape to show
+        return ""
+    what = f"{rival.candidate.name[0].upper()}{rival.candidate.name[1:]} in a range of {rival.window.driver}"
+    return f"{what} would do nearly as well: the term's own shape is not seen yet."
+
+
+def by_hold(search: Search, model: Model) -> str:
+    """Why a model may stand for a wrong guess of what inputs do between samples; empty if that is clearly less."""
+    if not as_good(search, model):
+        return ""
+    less = "without it" if len(model.names) == 1 else "without all or a part of it"
+    return f"Inputs that go on otherwise between samples (hold=) would do nearly as well {less}."
+
+
+def _no_threshold(model: Model) -> str:
+    """Why a threshold of what a model adds is none: it would end the effect below all data but a few."""
+    found, problem = model.found, model.found.problem
+    drivers = problem.drivers_at_data(found.values[None], found.warm)
+    values = found.by_name
+    for term in model.candidate.terms:
+        for own, driver in term.scales.items():
+            value = values[term.full(own)]
+            if driver not in drivers or problem.is_time(driver) or value <= 0:
+                continue
+            below = drivers[driver].abs() <= value
+            if len(drivers[driver][below].unique()) <= FREE and _ends(model, term, drivers, driver, value):
+                return (
+                    f"By it {driver} is beyond {own} = {value:.3g} at all data but a few: nothing shows that "
+                    f"{term.name} begins there, and what has no such threshold does as well."
+                )
+    return ""
+
+
+def _ends(model: Model, term: Term, drivers: Mapping[str, Tensor], driver: str, value: float) -> bool:
+    """Whether a term does nothing where a driver is below a value."""
+    problem = model.found.problem
+    below = {**drivers, driver: 0.5 * value * drivers[driver].sign()}
+    given = problem.arguments(below, term.own(problem.parameters_at_data(model.found.values)))
+    functions = [*(rate for state, rate in term.rates.items() if state not in term.states), *term.shifts.values()]
+    try:
+        return bool(functions) and all(not bool(torch.as_tensor(term.call(f, *given)).any()) for f in functions)
+    except TorchcalError:  # not every function works on a row of data
+        return False
+
+
+def _no_drive(model: Model) -> str:
+    """Why a slow drive is none: an equation would at first follow its input the wrong way.
+
+    A drive that lags takes its input's effect away, and gives it back later. It has no more to take than there is.
+    """
+    bound, sd = model.found.problem.simulator, stated_sd(model.found)
+    for term in model.candidate.terms:
+        if term.takes is None or not term.states or not isinstance(bound, Trajectories):
+            continue
+        unsure = [float(sd[i] / model.found.values[i].abs()) for i in model.candidate.amplitudes
+                  if term.brings(model.found.problem.parameters[i].name)]  # fmt: skip
+        least = max([MORE, *(WRONG_WAY * one for one in unsure)])
+        for state in term.rates:
+            if state in term.states:
+                continue
+            try:
+                total, own = _response(model, bound, term, state, term.takes)
+            except TorchcalError:  # not every function works on a row of data
+                continue
+            if bool(((own * (total - own) < 0) & (total * own > least * own.square())).all()):
+                return (
+                    f"By it the rate of {state} would at first follow {term.takes} the wrong way: it takes more of "
+                    "its effect away than there is."
+                )
+    return ""
+
+
+def _response(model: Model, bound: Trajectories, term: Term, state: str, name: str) -> tuple[Tensor, Tensor]:
+    """How a state's whole rate, and a term's share of it, change at the data with an input, by its range."""
+    problem = model.found.problem
+    drivers = problem.drivers_at_data(model.found.values[None], model.found.warm)
+    p = bound.layout.by_name(model.found.values[None], bound.grid.run_of[problem.condition_of])
+    states = list(bound.ode.states)
+    s = torch.stack([drivers[one] for one in states], dim=-1)[None]
+    named = dict(zip(states, s.unbind(-1), strict=True))
+    t, inputs = drivers["t"], {one: drivers[one] for one in bound.runs[0].inputs}
+    given = torch.cat([run.inputs[name] for run in bound.runs])
+    found = []
+    for u in ({**inputs, name: inputs[name] + given.max() - given.min()}, inputs):
+        total = bound.steps.rates(t, s, p, u)[..., states.index(state)]
+        found.append((total, torch.as_tensor(term.call(term.rates[state], t, named, term.own(p), u))))
+    (total, own), (total_before, own_before) = found
+    return total - total_before, own - own_before
+
+
+def _levels(model: Model) -> int:
+    """Distinct values of a window's driver, at data in use, at which it is nearly open, or nearly closed if these are
+    fewer."""
+    found, w = model.found, model.window
+    if w is None or w.span is None:
+        return 0
+    driver = found.problem.drivers_at_data(found.values[None], found.warm)[w.driver]
+    p = {q.name.rsplit(".", 1)[-1]: value
+         for q, value in zip(found.problem.parameters, found.values, strict=True) if is_window(q.name)}  # fmt: skip
+    share = force(w.span, driver, p)
+    return min(len(driver[there].unique()) for there in (share >= 1 - NEARLY, share <= NEARLY))
+
+
+def _distance(model: Model, places: Sequence[int], shapes: Sequence[int], size: float) -> float:
+    """Of a term's amplitudes from neutral, in their joint sd with its shapes held, but not the ends of its window; that
+    of the noise is ``size`` times what the fit was weighed with.
+
+    A product may be determined where neither of its factors is; and what the base leaves open of its own parameters,
+    the scale of a state that is not seen, say, is no matter of the term.
+    """
+    found, candidate = model.found, model.candidate
+    away = found.values[list(places)] - candidate.neutral[[candidate.own.index(i) for i in places]]
+    columns = found.whitening(found.jacobian) / max(size, 1e-300)
+    mine = [found.free.index(i) for i in places]
+    kept = [k for k, i in enumerate(found.free) if i not in {*places, *shapes}]
+    moved = columns[:, mine] @ away
+    left = _beside(columns[:, kept], moved)
+    if left > OPEN:
+        return left
+    base = [k for k, i in enumerate(found.free) if i not in candidate.own]
+    if not base:
+        return left
+    values = found.values.clone()
+    values[candidate.own] = candidate.neutral
+    jacobian = found.problem.evaluate(values[None], [found.free[k] for k in base])[1][0]
+    slope = found.whitening(jacobian) / max(size, 1e-300)
+    if not bool(slope.isfinite().all()):
+        return left
+    unit = slope.norm(dim=0)
+    unit = torch.where(unit > 0, unit, unit.max().clamp_min(1e-300))
+    _, sizes, directions = torch.linalg.svd(slope / unit, full_matrices=False)
+    seen = directions[sizes > UNSEEN * sizes.max()] / unit  # in the parameters' own units, (directions, base)
+    others = [k for k in kept if k not in base]
+    return _beside(torch.cat([columns[:, base] @ seen.T, columns[:, others]], dim=1), moved)
+
+
+def _beside(columns: Tensor, moved: Tensor) -> float:
+    """What is left of an effect beside others, in noise sd."""
+    unit = columns / columns.norm(dim=0).clamp_min(1e-300)
+    left = moved - unit @ torch.linalg.lstsq(unit, moved[:, None], rcond=1e-10, driver="gelsd").solution[:, 0]
+    return float(left.norm())
+
+
+def _noise_or_physics(search: Search, model: Model) -> str:
+    """What may be physics that a model leaves, though it is taken for noise.
+
+    Noise of unknown size that is slow is what a wrong shape leaves, too; where most of it is small, and some of it
+    large, it is no noise of one size. Where rows do not follow one another no correlated noise is estimated.
+    """
+    noise, problem = beside(search, model), model.found.problem
+    e = noise.whitening(problem).vector(model.found.residual)
+    if problem.sweeps is None and not bool(model.found.met.all()) and _along_rows(problem, e) > ALONG:
+        return (
+            "What it leaves is correlated in the order of the recording, as noise or as physics: the same conditions "
+            "in another order would tell."
+        )
+    for k, rho in enumerate(noise.correlation.tolist() if noise.open else ()):
+        mine = e[problem.output_of == k]
+        if bool(model.found.met[problem.output_of == k].all()):
+            continue  # what is left is rounding
+        if rho >= SLOWEST or (len(mine) >= MANY and _evenness(mine) < EVEN):
+            return (
+                "What it leaves is so slow, or of such uneven size, that it may as well be physics as noise: a known "
+                "noise sd, replicates or a repeated run would tell."
+            )
+    return ""
+
+
+def _evenness(e: Tensor) -> float:
+    """Robust over plain sd."""
+    return 1.4826 * float(e.abs().median()) / max(float(e.square().mean().sqrt()), 1e-300)
+
+
+def _along_rows(problem: Problem, e: Tensor) -> float:
+    """Correlation of what is left with the next datum of the recording, in its sd by chance; of the worst output."""
+    worst = 0.0
+    for k in problem.output_of.unique().tolist():
+        mine = e[problem.output_of == k]
+        worst = max(worst, float(mine[1:] @ mine[:-1]) / max(float(mine @ mine), 1e-300) * math.sqrt(len(mine)))
+    return worst
+
+
+def distinct(problem: Problem) -> int:
+    """Data in use at distinct conditions, of a static recording: replicates do not tell one curve from another."""
+    if problem.in_time:
+        return problem.n
+    which = problem.levels[1][problem.condition_of]
+    return len(torch.stack([which, problem.output_of], dim=-1).unique(dim=0))

@@ -1,0 +1,282 @@
+"""From the search to the records of a result: how much, and what cannot be told."""
+
+import itertools
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.fits.fitting import Fitted, fit, starts
+from torchcal.discovery.fits.local import ENDS, WIDTH_OF_EDGE, is_window
+from torchcal.discovery.hypotheses.model import Model
+from torchcal.discovery.hypotheses.screen import Window
+from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.misfit.structure import Structure
+from torchcal.discovery.records import Estimate, Fit
+
+__all__ = [
+    "depends",
+    "estimates",
+    "fit_record",
+    "identifiability",
+    "misfit_size",
+    "other_minima",
+    "removed",
+    "stated_sd",
+    "surpassed",
+]
+
+#: Gaps between data that an end of a window may lie in, where its edge is a step.
+GAPS = 200
+#: Share of the largest part of a direction that the data do not see from which on a parameter belongs to it.
+MIXED = 0.02
+#: Smallest squared effect of a direction of unit size, each parameter's effect being 1, that is one.
+UNSEEN = 1e-6
+#: Share of an estimate from which on its sd is so large that it may be told in a combination only.
+LOOSE = 0.1
+#: Log evidence between two candidates that are told apart.
+APART = 5.0
+#: Starts from which what is named is fitted again, and steps; a minimum that is higher by less than `RIVAL` in χ² and
+#: more than `ELSEWHERE` sd away is another one.
+STARTS, AGAIN, RIVAL, ELSEWHERE = 4, 60, 4.0, 4.0
+#: Correlation of what two accepted terms do to the data from which on one law between them may look like their sum.
+ONE_LAW = 0.9
+#: A parameter depends on what acts beside it when that moves it by more than this many of its sd.
+MOVED = 2.0
+
+
+def estimates(found: Fitted, places: Sequence[int], window: Window | None = None) -> tuple[Estimate, ...]:
+    """Estimates of some parameters. Without noise the misfit takes its place.
+
+    An sd beyond what the bounds allow, or far beyond the estimate, says that the data do not determine it. Where the
+    edge of a static window is a step, its end is known by the gaps between data that it may lie in.
+    """
+    sd = stated_sd(found)
+    bound = {i for i, at in zip(found.free, found.at_bound.tolist(), strict=True) if at}
+    result = []
+    for i in places:
+        q = found.problem.parameters[i]
+        value = float(found.values[i])
+        spread = float(sd[i])
+        if window is not None and not found.problem.in_time and q.name.endswith(tuple(ENDS.values())):
+            spread = _stepped_sd(found, i, window.driver, spread)
+        allowed = math.inf if q.low is None or q.high is None else q.high - q.low
+        if spread > min(1e5 * abs(value) or math.inf, allowed):
+            spread = math.inf
+        at_bound = i in bound or (i in found.free and value in (q.low, q.high) and not is_window(q.name))
+        result.append(Estimate(q.name, value, spread, q.unit, at_bound))
+    return tuple(result)
+
+
+def stated_sd(found: Fitted) -> Tensor:
+    """Standard deviations of all parameters ``(P,)``. Without noise the misfit takes its place."""
+    return found.sd() * (misfit_size(found) if isinstance(found.problem.recording.noise, str) else 1.0)
+
+
+def _stepped_sd(found: Fitted, i: int, driver: str, spread: float) -> float:
+    """Sd of a window's end whose edge is a step, over the gaps that the misfit allows; else as the curvature says."""
+    pairs = zip(found.problem.parameters, found.values.tolist(), strict=True)
+    width = next((value for q, value in pairs if q.name.endswith(WIDTH_OF_EDGE)), math.inf)
+    along = found.problem.drivers_at_data(found.values[None], None)[driver].unique()
+    if width > float(along.diff().median()):
+        return spread
+    middle, gap = 0.5 * (along[1:] + along[:-1]), along.diff()
+    near = (middle - found.values[i]).abs().argsort()[:GAPS]
+    middle, gap = middle[near], gap[near]
+    rows = found.values.repeat(len(middle), 1)
+    rows[:, i] = middle
+    problem = found.problem
+    chi2 = found.whitening.vector(problem.y - problem.evaluate(rows, [])[0]).square().sum(-1).nan_to_num(nan=math.inf)
+    weight = gap * (0.5 * (chi2.min() - chi2)).exp()
+    weight = weight / weight.sum()
+    mean = float(weight @ middle)
+    return math.sqrt(float(weight @ ((middle - mean).square() + gap.square() / 12)))
+
+
+def misfit_size(found: Fitted) -> float:
+    """Root of χ² per degree of freedom."""
+    return math.sqrt(found.chi2 / max(found.problem.n - len(found.free), 1))
+
+
+def fit_record(
+    found: Fitted, structure: Structure | None, terms: tuple[str, ...], window: Window | None = None
+) -> Fit:
+    """A fit as a record."""
+    recording = found.problem.recording
+    whole = found.problem.simulator.linearise(recording.x, found.values[None], recording.outputs, [], found.warm)
+    residual = torch.where(recording.observed, recording.y - whole.y[0], torch.full_like(recording.y, math.nan))
+    return Fit(
+        terms,
+        estimates(found, found.free, window),
+        whole.y[0],
+        residual,
+        found.chi2,
+        structure.p_value if structure else 1.0,
+    )
+
+
+def removed(search: Search, model: Model) -> float:
+    """Share of the squared misfit beyond noise that a model removes."""
+    freedom = search.problem.n - len(search.base.free)
+    excess = search.base.chi2 - (0 if search.exact else freedom)
+    left = model.found.chi2 - (0 if search.exact else search.problem.n - len(model.found.free))
+    if excess <= 0:
+        return 0.0
+    return min(max(1.0 - max(left, 0.0) / excess, 0.0), 1.0)
+
+
+def surpassed(search: Search, model: Model, larger: Model) -> float:
+    """Share of the squared misfit that a larger model removes and this one leaves."""
+    whole = search.base.chi2 - larger.found.chi2
+    return min(max((model.found.chi2 - larger.found.chi2) / whole, 0.0), 1.0) if whole > 0 else 0.0
+
+
+def depends(known: Sequence[Estimate], other: Sequence[Estimate], beside: Sequence[str]) -> str:
+    """Which of the estimates moves most with terms beside those that are named, in a sentence; empty where none does.
+    """
+    there = {e.name: e for e in other}
+    away = {e.name: abs(there[e.name].value - e.value) / max(e.sd, 1e-300) for e in known if e.name in there}
+    name = max(away, key=lambda one: away[one], default=None)
+    if name is None or away[name] <= MOVED:
+        return ""
+    return f"{name} depends on what acts beside it: {there[name].amount} with {' and '.join(beside)}."
+
+
+def identifiability(search: Search, best: Model | None) -> list[str]:
+    """Parameters and candidates that these data cannot tell."""
+    unseen, mixed = _untold(search.base)
+    if best is not None:
+        more = _untold(best.found)
+        unseen, mixed = unseen + more[0], mixed + more[1]
+    rows = [f"{name} has no effect on these data" for name in dict.fromkeys(unseen)]
+    rows += [
+        f"a common change of {', '.join(group)} moves no datum: only combinations can be told"
+        for group in _merged(mixed)
+    ]
+    screening = search.screening
+    for i, candidate in enumerate(search.candidates):
+        if screening.best[i] < 0 and not candidate.blind:
+            own = best is not None and best.window is not None and i in best.numbers
+            everywhere = ", where it acts everywhere," if own else ""
+            rows.append(f"{candidate.name}{everywhere} cannot be told from the parameters of the base")
+        for j in range(i):
+            c = _alike(search, i, j)
+            if c > 0.99 and not _told_apart(search, i, j):
+                rows.append(
+                    f"{search.candidates[j].name} and {candidate.name} are nearly the same here (correlation {c:.3f})"
+                )
+    return [*([] if best is None else _one_law(best)), *rows][:12]
+
+
+def _alike(search: Search, i: int, j: int) -> float:
+    """Correlation of what two candidates do, of the signs that both may have."""
+    screening = search.screening
+    c = screening.correlation(i, j)
+    if min(screening.best[i], screening.best[j]) < 0:
+        return 0.0
+    sides = [search.candidates[k].one_sided(search.amplitude(screening.best[k])) for k in (i, j)]
+    return c * math.prod(sides) if all(sides) else abs(c)
+
+
+def _one_law(model: Model) -> list[str]:
+    """Pairs of accepted terms that do nearly the same to the data: a law between them looks like their sum."""
+    found, candidate = model.found, model.candidate
+    names = [q.name for q in found.problem.parameters]
+    without = found.values.repeat(len(candidate.terms), 1)
+    for row, term in zip(without, candidate.terms, strict=True):
+        for i in candidate.amplitudes:
+            if term.brings(names[i]):
+                row[i] = candidate.neutral[candidate.own.index(i)]
+    if len(without) < 2:
+        return []
+    change = found.whitening((found.y - found.problem.evaluate(without, [])[0]).T)
+    unit = change / change.norm(dim=0).clamp_min(1e-300)
+    rows = []
+    for i, j in itertools.combinations(range(len(candidate.terms)), 2):
+        alike = float(unit[:, i] @ unit[:, j])
+        if alike > ONE_LAW:
+            a, b = candidate.terms[i].name, candidate.terms[j].name
+            rows.append(f"{a} and {b} do much the same here (correlation {alike:.2f}): one law may look like both")
+    return rows
+
+
+def _untold(found: Fitted) -> tuple[list[str], list[list[str]]]:
+    """Parameters of a fit that move no datum, and combinations of others that do not and leave two of them open."""
+    names = [found.problem.parameters[i].name for i in found.free]
+    jacobian = found.whitening(found.jacobian)
+    size = jacobian.norm(dim=0)
+    # Between two data an end of a window moves none.
+    mine = [k for k, name in enumerate(names) if not is_window(name)]
+    unseen = [names[k] for k in mine if float(size[k]) == 0]
+    kept = [k for k in mine if float(size[k]) > 0]
+    if len(kept) < 2:
+        return unseen, []
+    loose = (~(stated_sd(found) <= LOOSE * found.values.abs()))[found.free]  # an sd of infinity, or none, is loose too
+    unit = jacobian[:, kept] / size[kept]
+    values, vectors = torch.linalg.eigh(unit.T @ unit)
+    groups = []
+    for k in (values < UNSEEN).nonzero()[:, 0].tolist():
+        parts = vectors[:, k].abs()
+        members = [kept[j] for j in range(len(kept)) if float(parts[j]) > MIXED * float(parts.max())]
+        if sum(bool(loose[j]) for j in members) > 1:
+            groups.append([names[j] for j in members])
+    return unseen, groups
+
+
+def _merged(groups: Sequence[list[str]]) -> list[list[str]]:
+    """Groups of names, those that share one made one."""
+    merged: list[list[str]] = []
+    for group in groups:
+        apart = [other for other in merged if not set(other) & set(group)]
+        together = [name for other in merged if set(other) & set(group) for name in other]
+        merged = [*apart, list(dict.fromkeys([*together, *group]))]
+    return merged
+
+
+def other_minima(search: Search, model: Model) -> list[str]:
+    """Other estimates of a named term's size that fit about as well, from the base's first guesses.
+
+    The sd that are given are those within one minimum.
+    """
+    found, candidate = model.found, model.candidate
+    sd, neutral = found.sd(), dict(zip(candidate.own, candidate.neutral.tolist(), strict=True))
+    # Where the size is open, as the scale of an unseen state leaves it, there is a valley and no other minimum.
+    places = [i for i in candidate.amplitudes if 0 < float(sd[i]) < abs(float(found.values[i]) - neutral[i])]
+    if search.exact or not places:
+        return []
+    held = [i for i in range(len(found.values)) if i not in found.free]
+    begin = starts(found.problem, STARTS, search.seed, {i: float(found.values[i]) for i in (*held, *candidate.own)})
+    again = fit(found.problem, found.whitening, begin, found.free, max_steps=AGAIN, finish=0)
+    if again is None or again.ends is None or again.ends_chi2 is None:
+        return []
+    for k in again.ends_chi2.argsort().tolist():
+        more = float(again.ends_chi2[k]) - found.chi2
+        away = (again.ends[k] - found.values).abs()
+        if more < RIVAL and any(float(away[i]) > ELSEWHERE * float(sd[i]) for i in places):
+            values = [f"{found.problem.parameters[i].name} = {float(again.ends[k, i]):.3g}" for i in places]
+            told = f"{', '.join(values)} fits about as well (χ² {max(more, 0.0):+.1f})"
+            return [f"{told}: the sd given holds around one minimum"]
+    return []
+
+
+def _told_apart(search: Search, i: int, j: int) -> bool:
+    """Whether refits of two candidates differ by far, whatever their tangents say."""
+    a, b = (search.plain.get(k) for k in (i, j))
+    return a is not None and b is not None and abs(a.log_evidence - b.log_evidence) > APART
+
+
+def formulas(model: Model) -> list[str]:
+    """The accepted terms' formulas with their estimates."""
+    rows = []
+    for term in model.candidate.terms:
+        own = [i for i in model.candidate.own if term.brings(model.found.problem.parameters[i].name)]
+        text = term.formula or term.name
+        if model.window is not None:
+            text = text.split(" where ")[0]
+        if term.elapsed and any(float(run.time[0]) != 0.0 for run in model.found.problem.recording.runs or ()):
+            text += f" (its t counted from the first sample of the {term.elapsed})"
+        if model.window is not None:
+            text += f" where {model.where}"
+        rows.append(f"{text}, with " + "; ".join(str(e) for e in estimates(model.found, own, model.window)))
+    return rows

@@ -1,0 +1,242 @@
+"""Why what a model takes for an instrument is none."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.fits.candidates import spread_values
+from torchcal.discovery.fits.local import is_window
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.hypotheses.model import Model
+from torchcal.discovery.hypotheses.own_noise import beside
+from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.verdicts.explain import stated_sd
+from torchcal.simulators import Values
+from torchcal.terms import Term, extend
+
+__all__ = ["no_instrument", "only_instruments", "unnatural", "which_instruments"]
+
+#: Noise sd by which an instrument's reading must fall while the true value rises to be no instrument's: a hard limit is
+#: one. And the least sd, in the data's spread.
+FALL, ROUNDING = 2.0, 1e-3
+#: Variation that an instrument may add, in that of what it measures: with more it is another model of the thing.
+ADDED = 1.0
+#: Share of the range of the true values by which it is looked at beyond them.
+BEYOND = 0.2
+#: Noise sd, together, by which a reading must leave a straight line at the recorded values, but for so many of them.
+SEEN, FEW = 2.0, 2
+#: Times the recorded range in which it is looked for bends, and the share of that up to which what a straight line
+#: leaves is rounding.
+FAR, STRAIGHT = 3.0, 1e-9
+#: Joint sd of an estimate and of what it is in nature, from which on it is not that.
+APART = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Reading:
+    """What an instrument shows of true values ``(m,)``.
+
+    Attributes:
+        problem: Says how functions are called.
+        term: The instrument.
+        function: Of one of its outputs.
+        drivers: At the data, ``(m,)`` each.
+        p: Parameters there.
+    """
+
+    problem: Problem
+    term: Term
+    function: Callable[..., Tensor]
+    drivers: dict[str, Tensor]
+    p: Values
+
+    def __call__(self, y: Tensor) -> Tensor:
+        return self.moved(y, 0)
+
+    def moved(self, y: Tensor, by: int, *, timely: bool = False) -> Tensor:
+        """The same, so many places further on in the data; at the same time even so, where that is to be timely."""
+        order = torch.arange(len(y)).roll(by)
+        at, p = {name: each[order] for name, each in self.drivers.items()}, self.p.at(order)
+        if timely:
+            at["t"], p.start = self.drivers["t"], self.p.start
+        shown: Tensor = self.term.call(self.function, *self.problem.arguments(at, self.term.own(p), y)) + 0 * y
+        return shown
+
+    @cached_property
+    def _values(self) -> Tensor:
+        """Some true values."""
+        return torch.linspace(1.0, 2.0, len(next(iter(self.drivers.values()))), dtype=torch.float64)
+
+    @property
+    def works(self) -> bool:
+        """Whether the function can be asked like this."""
+        try:
+            self(self._values)
+        except Exception:  # the simulator calls it otherwise, and tells what is wrong
+            return False
+        return True
+
+    def is_of_value(self, *, and_time: bool = False) -> bool:
+        """Whether what is shown follows from the true value alone, or with the time, wherever in the data that is."""
+        y = self._values
+        shown = self(y)
+        moved = [self.moved(y, by, timely=and_time) for by in (1, len(y) // 2)]
+        return all(torch.allclose(shown, one, rtol=0, atol=0, equal_nan=True) for one in moved)
+
+
+def unnatural(model: Model) -> str:
+    """Which estimate of a model's terms is not what these have in nature, in a sentence; empty if all are."""
+    values, sd = model.found.by_name, dict(zip(model.found.by_name, stated_sd(model.found).tolist(), strict=True))
+    for term in model.candidate.terms:
+        for name, (expected, spread) in term.expected.items():
+            full = term.full(name)
+            if abs(values[full] - expected) > APART * math.hypot(spread, sd[full]):
+                return (
+                    f"In nature {full} is {expected:g} within {spread:g}, and not {values[full]:.2g} ± "
+                    f"{sd[full]:.1g}: something else may have left as much."
+                )
+    return ""
+
+
+def only_instruments(model: Model) -> bool:
+    """Whether all that a model adds is instruments."""
+    return all(which_instruments(model))
+
+
+def which_instruments(model: Model) -> list[bool]:
+    """Which terms of a model show a true value otherwise, and read nothing else but what has a memory of its own, or
+    counts from the first sample."""
+    problem = model.found.problem
+    drivers = problem.drivers_at_data(model.found.values[None], model.found.warm)
+    p = problem.parameters_at_data(model.found.values)
+
+    def is_one(term: Term) -> bool:
+        if not term.outputs or term.shifts or term.frees or not set(term.rates) <= set(term.states):
+            return False
+        if term.states or term.elapsed:
+            return True
+        readings = (_Reading(problem, term, function, drivers, p) for function in term.outputs.values())
+        return all(reading.works and reading.is_of_value() for reading in readings)
+
+    return [is_one(term) for term in model.candidate.terms]
+
+
+def no_instrument(search: Search, model: Model) -> str:
+    """Why a model's instruments are none: the reading of one falls where the true value rises, or shows more of the
+    instrument than of what it measures."""
+    problem = model.found.problem
+    instruments = [term for term in model.candidate.terms if term.is_sensor and not term.states]
+    if not instruments:
+        return ""
+    others = [term for term in model.candidate.terms if term not in instruments]
+    bare = search.problem.with_simulator(extend(search.problem.simulator, others))
+    bare = dataclasses.replace(bare, keep=problem.keep)
+    values = spread_values(bare, [q.name for q in problem.parameters], model.found.values)
+    true = bare.evaluate(values[None], [], bare.guess(model.found.warm, values[None]))[0][0]
+    drivers = problem.drivers_at_data(model.found.values[None], model.found.warm)
+    p = problem.parameters_at_data(model.found.values)
+    sd = _noise_at_data(search, model)
+    names = [q.name for q in problem.parameters]
+    shapes = set(model.candidate.own) - set(model.candidate.amplitudes)
+    for term in instruments:
+        for name, function in term.outputs.items():
+            number = problem.recording.outputs.index(name) if name in problem.recording.outputs else 0
+            here = (problem.output_of == number).nonzero()[:, 0]
+            along = {d: each[here] for d, each in drivers.items()}
+            reading = _Reading(problem, term, function, along, p.at(here))
+            if not (len(here) and reading.works):
+                continue
+            curve = reading.is_of_value()
+            if curve and _falls(reading, true[here]) > FALL * float(sd[here].median()):
+                return (
+                    f"By it the reading of {name} falls where the true value rises, at the recorded values or just "
+                    "beyond them, as that of no instrument does."
+                )
+            shown = reading(true[here])
+            drifts = curve or (problem.in_time and reading.is_of_value(and_time=True))
+            if drifts and float((shown - true[here]).std()) > ADDED * float(true[here].std()):
+                return f"By it the reading of {name} varies more by the instrument's error than by the true value."
+            shaped = curve and any(term.brings(names[i]) and not is_window(names[i]) for i in shapes)
+            if shaped and _bends(reading, true[here]) and _straight(reading, true[here], sd[here]):
+                return (
+                    f"By it the reading of {name} is a straight line at the recorded values, as with an offset and a "
+                    "gain error: where it bends there are hardly any data."
+                )
+            true[here] = shown
+    return ""
+
+
+def _bends(reading: _Reading, true: Tensor) -> bool:
+    """Whether a reading is no straight line of the true value near the recorded ones, as with an offset or a gain
+    error."""
+    middle = true.mean()
+    wide = middle + FAR * (_range(true) - middle)
+    for y in (true, wide):
+        shown = reading(y)
+        if not bool(shown.isfinite().all()):
+            return True
+        if float(_off_line(y, shown).abs().max()) > STRAIGHT * float(wide.max() - wide.min()):
+            return True
+    return False
+
+
+def _straight(reading: _Reading, true: Tensor, sd: Tensor) -> bool:
+    """Whether a reading follows a straight line at the recorded values, but for a few, as far as noise shows."""
+    kept, shown = torch.ones_like(true, dtype=torch.bool), reading(true)
+    if not bool(shown.isfinite().all()):
+        return False
+    for _ in range(FEW):
+        off = torch.zeros_like(true)
+        off[kept] = (_off_line(true[kept], shown[kept]) / sd[kept]).abs()
+        kept &= true != true[off.argmax()]
+    return float((_off_line(true[kept], shown[kept]) / sd[kept]).norm()) < SEEN
+
+
+def _off_line(y: Tensor, shown: Tensor) -> Tensor:
+    """What a straight line through readings of true values leaves, ``(m,)``."""
+    line = torch.stack([torch.ones_like(y), y], dim=-1)
+    return shown - line @ torch.linalg.lstsq(line, shown[:, None], driver="gelsd").solution[:, 0]
+
+
+def _noise_at_data(search: Search, model: Model) -> Tensor:
+    """Sd of the noise, or of what a model leaves where there is none, ``(n,)``."""
+    problem = model.found.problem
+    if not search.exact:
+        return beside(search, model).sd[problem.index]
+    left = torch.zeros(problem.n, dtype=torch.float64)
+    for output in problem.output_of.unique():
+        mine = problem.output_of == output
+        left[mine] = model.found.residual[mine].square().mean().sqrt()
+    return torch.maximum(left, ROUNDING * problem.recording.spread[problem.index])
+
+
+def _range(true: Tensor) -> Tensor:
+    """As many values from somewhat below the true ones ``(m,)`` to somewhat above, but not beyond 0 if all are on one
+    side of it: a fit likes the turning point of a response, where it bends most, and stops just short of it."""
+    low, high = true.min(), true.max()
+    beyond = BEYOND * (high - low)
+    return torch.linspace(
+        float((low - beyond).clamp_min(0) if low >= 0 else low - beyond),
+        float((high + beyond).clamp_max(0) if high <= 0 else high + beyond),
+        len(true),
+        dtype=true.dtype,
+    )
+
+
+def _falls(reading: _Reading, true: Tensor) -> float:
+    """By how much a reading falls while the true value rises, at the recorded values or just beyond them."""
+    y = _range(true)
+    slope = _slope(reading, y)
+    return -float((y.diff() * 0.5 * (slope[:-1] + slope[1:]).clamp_max(0)).nansum())
+
+
+def _slope(reading: _Reading, y: Tensor) -> Tensor:
+    """Of what is shown by what is true, ``(m,)``; 0 where the one does not follow from the other."""
+    with torch.enable_grad():
+        leaf = y.detach().clone().requires_grad_(True)
+        return torch.autograd.grad(reading(leaf).sum(), leaf)[0].detach()
