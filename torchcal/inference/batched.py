@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,25 +11,19 @@ from tqdm.auto import tqdm
 
 from torchcal.display import PATIENCE
 from torchcal.errors import InterruptionWarning, warn
-from torchcal.inference import hmc_step, nuts_step
-from torchcal.inference.arrays import Arrays, arrays_for
+from torchcal.inference.arrays import arrays_for
 from torchcal.inference.coordinates import Laplace, Slopes, Whitened, gathered, starting_points
 from torchcal.inference.draws import Draws, most_divergences
-from torchcal.inference.nuts_step import Outcome
+from torchcal.inference.kernels import HMC, NUTS, Kernel
+from torchcal.inference.warm_up import DualAveraging, warm_up
 from torchcal.priors import Bounds
 
 __all__ = ["MOST_ELEMENTS", "run_batched"]
-
-_WINDOWS = (0.3, 0.3, 0.4)
-"""Shares of the warm-up: two windows that end in new coordinates, and one that sets the step size for good."""
 
 TARGET = {"nuts": 0.65, "hmc": 0.8}
 """Mean acceptance that the first steps aim at. For No-U-Turn the cost of an effective draw is flat between 0.6 and 0.9
 (Betancourt, Byrne & Girolami 2014, arXiv:1411.6669); of the posteriors in ``benchmarks/sampling`` it is lowest at the
 lower end. Divergences raise it."""
-
-DIVERGING = 5e-4
-"""Share of divergent transitions at the end of the warm-up from which on smaller steps are tried."""
 
 _WARM_UP_CHAINS, _FEW_WARM_UP_CHAINS = 64, 16
 """Chains that adapt together: pooled draws make the covariance reliable after a few transitions each. The fewer where
@@ -40,9 +33,6 @@ _WARM_UP_ELEMENTS = 2**17
 
 MOST_ELEMENTS = 2**22
 """Numbers that one evaluation of all chains may handle where the number of chains is ours to choose."""
-
-_STRICT, _STRICTEST = 0.9, 0.98
-"""Mean acceptance where trajectories have diverged, at least; and from which on that is no matter of the step size."""
 
 _REPEATS, _SHORTER = 3, 0.7
 """How often draws with divergences are drawn anew with smaller steps, and these as a share of those before. A higher
@@ -56,108 +46,6 @@ _ENOUGH = 1.05
 
 _STUCK = 0.8
 """Where twice the draws leave this much of what was missing, twice in a row, chains stay apart."""
-
-
-@dataclass
-class _DualAveraging:
-    """Step size for a wanted acceptance (Hoffman & Gelman 2014, section 3.2), fed with means over chains."""
-
-    log_step: float
-    target: float
-    count: int = 0
-    error: float = 0.0
-    averaged: float = 0.0
-
-    def __post_init__(self) -> None:
-        self.center = self.log_step + math.log(2.0)
-
-    def update(self, accept: float) -> None:
-        self.count += 1
-        share = 1 / (self.count + 10)
-        self.error = (1 - share) * self.error + share * (self.target - accept)
-        wanted = self.center - math.sqrt(self.count) / 0.05 * self.error
-        self.log_step += min(max(wanted - self.log_step, -0.7), 0.7)
-        decay = self.count**-0.75
-        self.averaged = decay * self.log_step + (1 - decay) * self.averaged
-
-    @property
-    def step_size(self) -> float:
-        """To try next."""
-        return math.exp(min(self.log_step, 3.0))
-
-    @property
-    def settled(self) -> float:
-        """To sample with."""
-        return math.exp(self.averaged)
-
-    def stricter(self) -> "_DualAveraging":
-        """From here, for half the rejections or fewer."""
-        return _DualAveraging(self.averaged, max(0.5 * (1 + self.target), _STRICT))
-
-
-class _Kernel(Protocol):
-    """Moves all chains on; every call finishes some of their transitions."""
-
-    def init(self, z: Tensor, space: Whitened, step_size: float) -> Any: ...
-
-    def step(self, state: Any, space: Whitened, step_size: float) -> tuple[Any, Outcome]: ...
-
-    def positions(self, state: Any) -> Tensor: ...
-
-    def tune(self, z: Tensor, groups: Tensor, space: Whitened, step_size: float) -> Tensor: ...
-
-
-class _NUTS:
-    """See `nuts_step`. Trees are short at first: a step size that starts far too small must not cost thousands."""
-
-    def __init__(self, max_tree_depth: int, arrays: Arrays) -> None:
-        self.arrays = arrays
-        self.full = nuts_step.Tables.build(max_tree_depth, arrays)
-        self.tables = nuts_step.Tables.build(min(max_tree_depth, 6), arrays)
-
-    def init(self, z: Tensor, space: Whitened, step_size: float) -> nuts_step.State:
-        start = self.arrays.take(z)
-        return nuts_step.init(start, space.potential, step_size=step_size, tables=self.tables, arrays=self.arrays)
-
-    def step(
-        self, state: nuts_step.State, space: Whitened, step_size: float
-    ) -> tuple[nuts_step.State, Outcome]:
-        return nuts_step.step(state, space.potential, step_size=step_size, tables=self.tables, arrays=self.arrays)
-
-    def positions(self, state: nuts_step.State) -> Tensor:
-        return torch.as_tensor(state.proposal[:, : state.momentum_sum.shape[1]])
-
-    def tune(self, z: Tensor, groups: Tensor, space: Whitened, step_size: float) -> Tensor:
-        self.tables = self.full
-        return z
-
-
-class _HMC:
-    """See `hmc_step`."""
-
-    def __init__(self, arrays: Arrays) -> None:
-        self.arrays = arrays
-        self.length = hmc_step.QUARTER
-
-    def init(self, z: Tensor, space: Whitened, step_size: float) -> hmc_step.State:
-        return hmc_step.init(self.arrays.take(z), space.potential)
-
-    def step(
-        self, state: hmc_step.State, space: Whitened, step_size: float
-    ) -> tuple[hmc_step.State, Outcome]:
-        return hmc_step.step(
-            state, space.potential, step_size=step_size, length=self.length, arrays=self.arrays
-        )
-
-    def positions(self, state: hmc_step.State) -> Tensor:
-        return torch.as_tensor(state.position)
-
-    def tune(self, z: Tensor, groups: Tensor, space: Whitened, step_size: float) -> Tensor:
-        state = self.init(z, space, step_size)
-        self.length, state = hmc_step.tuned_length(
-            state, space.potential, groups, step_size=step_size, arrays=self.arrays
-        )
-        return self.positions(state)
 
 
 def run_batched(
@@ -206,7 +94,7 @@ def run_batched(
     loc = modes[0].loc
     generator = torch.Generator(device=loc.device).manual_seed(seed)
     arrays = arrays_for(loc.device, seed)
-    moves: _Kernel = _HMC(arrays) if kernel == "hmc" else _NUTS(max_tree_depth, arrays)
+    moves: Kernel = HMC(arrays) if kernel == "hmc" else NUTS(max_tree_depth, arrays)
     most, cheap = max(4, MOST_ELEMENTS // max(1, cost)), max(_FEW_WARM_UP_CHAINS, _WARM_UP_ELEMENTS // max(1, cost))
     crowd = max(num_chains, min(_WARM_UP_CHAINS, most, cheap))
     bar = tqdm(total=num_warmup + num_samples, desc=kernel.upper(), disable=not progress, delay=PATIENCE, leave=False)
@@ -216,8 +104,8 @@ def run_batched(
         z, groups = starting_points(space, modes, crowd, generator)
         lowest = space.height(space.inner(torch.stack([mode.loc for mode in modes])))[groups]
         space, z = gathered(space, z, groups, lowest, generator)
-        averaging = _DualAveraging(math.log(0.5), TARGET[kernel] if target_accept is None else target_accept)
-        space, z, averaging = _warm_up(
+        averaging = DualAveraging(math.log(0.5), TARGET[kernel] if target_accept is None else target_accept)
+        space, z, averaging = warm_up(
             moves, space, z, groups, num_warmup, averaging, bar, stricter=target_accept is None
         )
         owners, step_size = groups[:num_chains], averaging.settled
@@ -249,7 +137,7 @@ def run_batched(
 
 
 def _sample(
-    moves: _Kernel,
+    moves: Kernel,
     state: Any,
     space: Whitened,
     step_size: float,
@@ -288,91 +176,6 @@ def _alpha(z: np.ndarray, space: Whitened, transform: Bounds) -> Tensor:
     return alpha.detach().to(device="cpu", dtype=torch.float64)
 
 
-def _warm_up(
-    moves: _Kernel,
-    space: Whitened,
-    z: Tensor,
-    groups: Tensor,
-    num_warmup: int,
-    averaging: _DualAveraging,
-    bar: tqdm,
-    *,
-    stricter: bool,
-) -> tuple[Whitened, Tensor, _DualAveraging]:
-    """Coordinates, positions in them, and the step size."""
-    diverging, length = 0.0, 0
-    for number, share in enumerate(_WINDOWS):
-        length = max(4, round(share * num_warmup))
-        last = number == len(_WINDOWS) - 1
-        pooled, owners, z, diverging = _adapt(moves, space, z, averaging, length, bar, settle=last)
-        other = space.refined(pooled, groups[owners], owners)
-        # A bend shows only when chains have come near the ridge, and then best in coordinates that follow it already.
-        if last and other.bend is None:
-            break
-        z = other.inner(space.outer(z))
-        space = other
-        z = moves.tune(z, groups, space, averaging.settled)
-        averaging = _DualAveraging(averaging.averaged, averaging.target)
-        if last:
-            _, _, z, diverging = _adapt(moves, space, z, averaging, length, bar, settle=True)
-    while stricter and diverging > DIVERGING and averaging.target < _STRICTEST:
-        averaging = averaging.stricter()
-        _, _, z, diverging = _adapt(moves, space, z, averaging, length, bar, settle=True)
-    return space, z, averaging
-
-
-def _adapt(
-    moves: _Kernel,
-    space: Whitened,
-    z: Tensor,
-    averaging: _DualAveraging,
-    length: int,
-    bar: tqdm,
-    *,
-    settle: bool = False,
-) -> tuple[Tensor, Tensor, Tensor, float]:
-    """One warm-up window: draws of its second half, whose they are, where all chains end, and the share diverged.
-
-    Where the window is to ``settle``, that half has the step size that was found, and the share is that of its steps;
-    elsewhere nothing is judged, and it is 0.
-    """
-    chains = len(z)
-    state = moves.init(z, space, averaging.step_size)
-    finished = shown = 0
-    pooled: list[np.ndarray] = []
-    owners: list[np.ndarray] = []
-    accepted: list[np.ndarray] = []
-    waiting = diverged = counted = 0
-    begun = np.zeros(chains, dtype=bool)  # whose trajectory has the step size that is judged
-    while finished < length * chains:
-        settled = settle and finished > length * chains // 2
-        state, outcome = moves.step(state, space, averaging.settled if settled else averaging.step_size)
-        count = int(outcome.done.sum())
-        if not count:
-            continue
-        finished += count
-        if not settled:
-            waiting += count
-            accepted.append(outcome.accept[outcome.done])
-        # One update for every half of the crowd: a step size is judged by trajectories that used it, not by those
-        # still on the way from before, and short ones do not count more than long ones.
-        if 2 * waiting >= chains:
-            averaging.update(float(np.concatenate(accepted).mean()))
-            accepted.clear()
-            waiting = 0
-        if finished > length * chains // 2:
-            pooled.append(outcome.position[outcome.done])
-            owners.append(outcome.done.nonzero()[0])
-            diverged += int((outcome.divergent & begun).sum())
-            counted += int((outcome.done & begun).sum())
-            if settled:
-                begun = begun | outcome.done
-        bar.update(finished // chains - shown)
-        shown = finished // chains
-    drawn, whose = (torch.as_tensor(np.concatenate(parts), device=z.device) for parts in (pooled, owners))
-    return drawn, whose, moves.positions(state), diverged / max(counted, 1)
-
-
 class _Collector:
     """Draws of chains that need not be equally far, ``(n, C, P)``; room grows as it is needed.
 
@@ -387,7 +190,7 @@ class _Collector:
         self.least = 0
 
     def collect(
-        self, moves: _Kernel, state: Any, space: Whitened, step_size: float, goal: int, bar: tqdm
+        self, moves: Kernel, state: Any, space: Whitened, step_size: float, goal: int, bar: tqdm
     ) -> Any:
         """Go on until every chain has ``goal`` draws."""
         while self.least < goal:
