@@ -7,6 +7,7 @@ consistent and reproducible, or to an error with a name.
 import contextlib
 import random
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pyro
@@ -353,6 +354,23 @@ def test_the_global_random_state_is_left_alone(sampler):
     assert global_state() == before
     assert torch.get_default_dtype() == torch.float32
     assert not pyro.get_param_store()
+
+
+@pytest.mark.parametrize("sampler", ["nuts", "pyro"])
+def test_threads_give_the_draws_that_their_seeds_give_alone(sampler):
+    def run(seed):
+        options = {**TINY, "seed": seed, "sampler": sampler}
+        return tc.calibrate(line(), tc.Recording(x=X, y=Y), likelihood=ABC(epsilon=0.3), **options).samples
+
+    seeds = [1, 2, 3, 4]
+    before = global_state()
+    with tiny_chains():
+        alone = [run(seed) for seed in seeds]
+        with ThreadPoolExecutor(4) as pool:
+            together = list(pool.map(run, seeds))
+    for one, other in zip(alone, together, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=0)
+    assert global_state() == before
 
 
 def test_the_global_random_state_is_left_alone_by_a_failure():
