@@ -83,6 +83,49 @@ def test_a_strong_effect_with_sharp_ends_is_named_where_it_acts(extra, driver, t
     assert d.noise.correlation["x"] < 0.15
 
 
+def cell(drop, *, n=120, seed=0):
+    """A discharged cell whose voltage is recorded, with a drop of voltage ``drop(t, v, i)`` in it, by SciPy."""
+    t = np.linspace(0, 12, n)
+    i = np.sin(1.1 * t) + 0.6 * np.sin(2.7 * t + 1)
+
+    def rate(at, v):
+        return 0.5 * np.interp(at, t, i) - 0.2 * v
+
+    v = solve_ivp(rate, (0, 12), [1.0], t_eval=t, rtol=1e-9, atol=1e-10, max_step=0.05).y[0]
+    shown = v + 0.3 * i + drop(t, v, i) + NOISE * np.random.default_rng(seed).standard_normal(n)
+    simulator = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"v": p["q"] * u["i"] - p["k"] * s["v"]},
+        states={"v": "V"},
+        parameters=[tc.Parameter(name, low=0.0, initial=0.4) for name in ("q", "k", "r")],
+        observe={"V": lambda t, s, p, u: s["v"] + p["r"] * u["i"]},
+    )
+    terms = [
+        tc.Term("square drop", outputs={"V": lambda t, s, p, u, y: y + p["a"] * u["i"] * u["i"].abs()}, parameters=[A]),
+        tc.Term("leak", rates={"v": lambda t, s, p, u: -p["a"] * s["v"] ** 3}, parameters=[A]),
+        tc.Term("surge", rates={"v": lambda t, s, p, u: p["a"] * u["i"] ** 3}, parameters=[A]),
+        *tc.terms.sensor("V", dynamic=False),
+    ]
+    run = tc.Run(time=t, inputs={"i": i}, outputs={"V": shown})
+    return simulator, tc.Recording(runs=[run], noise=NOISE), terms
+
+
+def test_physics_of_an_output_may_act_in_a_part_of_the_time():
+    d = diagnose(*cell(lambda t, v, i: np.where(t > 6.5, 0.15 * i * np.abs(i), 0.0)))
+    assert d.terms == ["square drop"]
+    ((low, high),) = d.where[0].spans
+    assert low == pytest.approx(6.5, abs=0.3)
+    assert high == pytest.approx(12.0)
+    (a,) = [one for one in d.final.estimates if one.name == "square drop.a"]
+    assert abs(a.value - 0.15) < 4 * a.sd
+
+
+def test_an_instrument_has_no_window_in_time():
+    simulator, recording, terms = cell(lambda t, v, i: np.where(t > 6.5, 0.15 * i * np.abs(i), 0.0))
+    d = diagnose(simulator, recording, [one for one in terms if one.is_sensor and one.name != "square drop"])
+    assert d.verdict == "unexplained"
+    assert not any(row.region for row in d.ranking if row.refitted)
+
+
 @pytest.mark.slow
 def test_a_kick_at_one_moment_is_no_window():
     data = recorded(lambda t, x, v: 0.0, kick=0.3)

@@ -14,6 +14,7 @@ from torchcal.discovery.hypotheses.screen import Window, windows_of
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.channels import responses
 from torchcal.discovery.misfit.residual import Residual
+from torchcal.discovery.verdicts.instruments import only_instruments
 from torchcal.discovery.verdicts.verdict import PLAINLY_WHITE
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators import Trajectories
@@ -230,7 +231,10 @@ def _around(search: Search, model: Model) -> list[Window]:
     """
     found, term = model.found, model.candidate.terms[0]
     bound = found.problem.simulator
-    if term.states or term.frees or (term.outputs and isinstance(bound, Trajectories)):
+    moves = bool(term.rates or term.shifts)
+    if term.states or term.frees:
+        return []
+    if term.outputs and isinstance(bound, Trajectories) and (moves or only_instruments(model)):
         return []
     column = search.screening.acting[model.numbers[0]]
     if column < 0:
@@ -244,7 +248,7 @@ def _around(search: Search, model: Model) -> list[Window]:
         if is_window(name):
             everywhere[i] = beyond(found.problem.parameters[i])
     residual = Residual(found, search.noise, seed=search.seed, draws=10, without=own)
-    if isinstance(bound, Trajectories):
+    if moves and isinstance(bound, Trajectories):
         states = bound.solve(found.values[None], found.warm)
         with torch.no_grad():
             forcing, present = (
@@ -256,7 +260,7 @@ def _around(search: Search, model: Model) -> list[Window]:
     elif place in found.free:
         acting = found.jacobian[:, found.free.index(place)]
         response = found.problem.evaluate(everywhere[None], [place])[1][0, :, 0]
-        drivers = found.problem.drivers_at_data(found.values[None], None)
+        drivers = found.problem.drivers_at_data(found.values[None], found.warm)
     else:
         return []
     residual.e = residual.e + residual.tangent(value * acting[:, None])[:, 0]

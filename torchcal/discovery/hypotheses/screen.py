@@ -15,7 +15,9 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.fits.candidates import Candidate
+from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.local import SHORT, Span
+from torchcal.discovery.fits.readings import are_instruments
 from torchcal.discovery.misfit.channels import responses
 from torchcal.discovery.misfit.residual import Residual
 from torchcal.simulators import Trajectories
@@ -151,16 +153,19 @@ class Window:
 
 def contributions(
     residual: Residual, candidates: Sequence[Candidate], screening: Screening
-) -> tuple[dict[int, Tensor], dict[str, Tensor]]:
+) -> dict[int, tuple[Tensor, dict[str, Tensor]]]:
     """What a candidate's amplitude does to the data from each part of the trajectory (or each condition) alone.
 
-    Returns responses ``(n, K)`` by candidate, or their diagonals ``(n,)`` where each part is a datum, and the drivers
-    ``(K,)``. Terms with hidden states, which remember, and terms that free a parameter are left out.
+    Returns by candidate responses ``(n, K)``, or their diagonals ``(n,)`` where each part is a datum, and the drivers
+    ``(K,)``. Terms with hidden states, which remember, terms that free a parameter, and instruments of a recording in
+    time are left out.
     """
     found = residual.found
     bound = found.problem.simulator
     states = bound.solve(found.values[None], found.warm) if isinstance(bound, Trajectories) else None
-    chosen, parts = [], []
+    at_data = found.problem.drivers_at_data(found.values[None], found.warm if states is not None else None)
+    parts: dict[int, tuple[Tensor, dict[str, Tensor]]] = {}
+    moving, forcing = [], []
     for i, candidate in enumerate(candidates):
         column = screening.acting[i]
         if column < 0 or any(term.states or term.frees for term in candidate.terms):
@@ -169,20 +174,27 @@ def contributions(
         values[candidate.own] = candidate.shapes[int(screening.shape[column])]
         place = candidate.amplitudes[int(screening.amplitude[column])]
         extended = candidate.problem.simulator
-        if states is None or not isinstance(extended, Trajectories):
-            chosen.append(i)
-            parts.append(candidate.tangents[int(screening.shape[column]), :, int(screening.amplitude[column])])
+        moves = any(term.rates or term.shifts for term in candidate.terms)
+        if states is None or not isinstance(extended, Trajectories) or not (moves or _is_instrument(candidate, found)):
+            tangent = candidate.tangents[int(screening.shape[column]), :, int(screening.amplitude[column])]
+            parts[i] = tangent, at_data
         elif not any(term.outputs for term in candidate.terms):
-            chosen.append(i)
+            moving.append(i)
             with torch.no_grad():
-                parts.append(extended.steps.derivatives(values[None], states, [place])[2][0])
-    if not chosen:
-        return {}, {}
-    if isinstance(bound, Trajectories):
-        response, drivers, _ = responses(found.problem, found, torch.cat(parts, dim=-1))
-        return {i: response[:, :, k] for k, i in enumerate(chosen)}, drivers
-    drivers = found.problem.drivers_at_data(found.values[None], None)
-    return dict(zip(chosen, parts, strict=True)), drivers
+                forcing.append(extended.steps.derivatives(values[None], states, [place])[2][0])
+    if moving:
+        response, drivers, _ = responses(found.problem, found, torch.cat(forcing, dim=-1))
+        parts |= {i: (response[:, :, k], drivers) for k, i in enumerate(moving)}
+    return dict(sorted(parts.items()))
+
+
+def _is_instrument(candidate: Candidate, found: Fitted) -> bool:
+    """Whether what changes outputs alone shows a true value otherwise, and reads nothing else."""
+    low, high = candidate.problem.limits()
+    values = candidate.begin.clone()
+    for place in candidate.amplitudes:  # at neutral it does nothing, whatever it reads
+        values[place] = (values[place] + 1.0).clamp(low[place], high[place])
+    return any(are_instruments(candidate.problem, candidate.terms, values, found.warm))
 
 
 def windows(residual: Residual, candidates: Sequence[Candidate], screening: Screening) -> tuple[list[Window], Tensor]:
@@ -192,8 +204,7 @@ def windows(residual: Residual, candidates: Sequence[Candidate], screening: Scre
     """
     found: list[Window] = []
     null = torch.zeros(residual.null.shape[1], dtype=torch.float64)
-    parts, drivers = contributions(residual, candidates, screening)
-    for i, response in parts.items():
+    for i, (response, drivers) in contributions(residual, candidates, screening).items():
         column = screening.acting[i]
         sign = candidates[i].one_sided(candidates[i].amplitudes[int(screening.amplitude[column])])
         mine, largest = windows_of(i, residual, response, drivers, sign)

@@ -2,22 +2,18 @@
 
 import dataclasses
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from torchcal.discovery.fits.candidates import spread_values
 from torchcal.discovery.fits.local import is_window
-from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.fits.readings import Reading, are_instruments
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.own_noise import beside
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.verdicts.explain import stated_sd
-from torchcal.simulators import Values
-from torchcal.terms import Term, extend
+from torchcal.terms import extend
 
 __all__ = ["no_instrument", "only_instruments", "unnatural", "which_instruments"]
 
@@ -35,58 +31,6 @@ SEEN, FEW = 2.0, 2
 FAR, STRAIGHT = 3.0, 1e-9
 #: Joint sd of an estimate and of what it is in nature, from which on it is not that.
 APART = 2.0
-
-
-@dataclass(frozen=True, eq=False)
-class _Reading:
-    """What an instrument shows of true values ``(m,)``.
-
-    Attributes:
-        problem: Says how functions are called.
-        term: The instrument.
-        function: Of one of its outputs.
-        drivers: At the data, ``(m,)`` each.
-        p: Parameters there.
-    """
-
-    problem: Problem
-    term: Term
-    function: Callable[..., Tensor]
-    drivers: dict[str, Tensor]
-    p: Values
-
-    def __call__(self, y: Tensor) -> Tensor:
-        return self.moved(y, 0)
-
-    def moved(self, y: Tensor, by: int, *, timely: bool = False) -> Tensor:
-        """The same, so many places further on in the data; at the same time even so, where that is to be timely."""
-        order = torch.arange(len(y)).roll(by)
-        at, p = {name: each[order] for name, each in self.drivers.items()}, self.p.at(order)
-        if timely:
-            at["t"], p.start = self.drivers["t"], self.p.start
-        shown: Tensor = self.term.call(self.function, *self.problem.arguments(at, self.term.own(p), y)) + 0 * y
-        return shown
-
-    @cached_property
-    def _values(self) -> Tensor:
-        """Some true values."""
-        return torch.linspace(1.0, 2.0, len(next(iter(self.drivers.values()))), dtype=torch.float64)
-
-    @property
-    def works(self) -> bool:
-        """Whether the function can be asked like this."""
-        try:
-            self(self._values)
-        except Exception:  # the simulator calls it otherwise, and tells what is wrong
-            return False
-        return True
-
-    def is_of_value(self, *, and_time: bool = False) -> bool:
-        """Whether what is shown follows from the true value alone, or with the time, wherever in the data that is."""
-        y = self._values
-        shown = self(y)
-        moved = [self.moved(y, by, timely=and_time) for by in (1, len(y) // 2)]
-        return all(torch.allclose(shown, one, rtol=0, atol=0, equal_nan=True) for one in moved)
 
 
 def unnatural(model: Model) -> str:
@@ -109,21 +53,9 @@ def only_instruments(model: Model) -> bool:
 
 
 def which_instruments(model: Model) -> list[bool]:
-    """Which terms of a model show a true value otherwise, and read nothing else but what has a memory of its own, or
-    counts from the first sample."""
-    problem = model.found.problem
-    drivers = problem.drivers_at_data(model.found.values[None], model.found.warm)
-    p = problem.parameters_at_data(model.found.values)
-
-    def is_one(term: Term) -> bool:
-        if not term.outputs or term.shifts or term.frees or not set(term.rates) <= set(term.states):
-            return False
-        if term.states or term.elapsed:
-            return True
-        readings = (_Reading(problem, term, function, drivers, p) for function in term.outputs.values())
-        return all(reading.works and reading.is_of_value() for reading in readings)
-
-    return [is_one(term) for term in model.candidate.terms]
+    """Which terms of a model are instruments, see `are_instruments`."""
+    found = model.found
+    return are_instruments(found.problem, model.candidate.terms, found.values, found.warm)
 
 
 def no_instrument(search: Search, model: Model) -> str:
@@ -148,7 +80,7 @@ def no_instrument(search: Search, model: Model) -> str:
             number = problem.recording.outputs.index(name) if name in problem.recording.outputs else 0
             here = (problem.output_of == number).nonzero()[:, 0]
             along = {d: each[here] for d, each in drivers.items()}
-            reading = _Reading(problem, term, function, along, p.at(here))
+            reading = Reading(problem, term, function, along, p.at(here))
             if not (len(here) and reading.works):
                 continue
             curve = reading.is_of_value()
@@ -171,7 +103,7 @@ def no_instrument(search: Search, model: Model) -> str:
     return ""
 
 
-def _bends(reading: _Reading, true: Tensor) -> bool:
+def _bends(reading: Reading, true: Tensor) -> bool:
     """Whether a reading is no straight line of the true value near the recorded ones, as with an offset or a gain
     error."""
     middle = true.mean()
@@ -185,7 +117,7 @@ def _bends(reading: _Reading, true: Tensor) -> bool:
     return False
 
 
-def _straight(reading: _Reading, true: Tensor, sd: Tensor) -> bool:
+def _straight(reading: Reading, true: Tensor, sd: Tensor) -> bool:
     """Whether a reading follows a straight line at the recorded values, but for a few, as far as noise shows."""
     kept, shown = torch.ones_like(true, dtype=torch.bool), reading(true)
     if not bool(shown.isfinite().all()):
@@ -228,14 +160,14 @@ def _range(true: Tensor) -> Tensor:
     )
 
 
-def _falls(reading: _Reading, true: Tensor) -> float:
+def _falls(reading: Reading, true: Tensor) -> float:
     """By how much a reading falls while the true value rises, at the recorded values or just beyond them."""
     y = _range(true)
     slope = _slope(reading, y)
     return -float((y.diff() * 0.5 * (slope[:-1] + slope[1:]).clamp_max(0)).nansum())
 
 
-def _slope(reading: _Reading, y: Tensor) -> Tensor:
+def _slope(reading: Reading, y: Tensor) -> Tensor:
     """Of what is shown by what is true, ``(m,)``; 0 where the one does not follow from the other."""
     with torch.enable_grad():
         leaf = y.detach().clone().requires_grad_(True)
