@@ -144,7 +144,8 @@ class _Changes:
             for _, place, begun in sorted(others, key=lambda one: one[0])[:ELSEWHERE]:
                 wanted[place, window.driver] = begun
         every = [one for each in wanted.values() for one in each]
-        search.nameless += [one for one in _refitted(search, every) if one is not None and one.physical]
+        refitted = map(long_enough, _refitted(search, every))
+        search.nameless += [one for one in refitted if one is not None and one.physical]
 
 
 def _elsewhere(search: Search, listed: list[Tensor]) -> dict[Places, Tensor]:

@@ -3,7 +3,7 @@
 import math
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from importlib import metadata
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any
 from torchcal.display import between, percent, up_to
 from torchcal.files import check_target, replacing
 from torchcal.plots.discovery import FigurePart, figure_parts
+from torchcal.plots.discovery.pieces import likeliest_with
 from torchcal.report.markup import (
     STYLE,
     Right,
@@ -133,10 +134,15 @@ def _headline(diagnosis: Any) -> str:
     verdict = str(diagnosis.verdict)
     terms = [str(term) for term in _get(diagnosis, "terms")]
     if verdict == "ambiguous":
-        return "Ambiguous: " + " or ".join(" + ".join(map(str, tied)) for tied in _get(diagnosis, "tied"))
+        told = [(tied, likeliest_with(_get(diagnosis, "ranking"), tied)) for tied in _get(diagnosis, "tied")]
+        return "Ambiguous: " + " or ".join(_where_it_acts(tied, getattr(row, "region", None)) for tied, row in told)
     if terms:
-        return f"{verdict.capitalize()}: " + " + ".join(terms)
+        return f"{verdict.capitalize()}: " + _where_it_acts(terms, getattr(diagnosis, "settings", {}).get("region"))
     return verdict.capitalize()
+
+
+def _where_it_acts(terms: Iterable[str], region: str | None) -> str:
+    return " + ".join(map(str, terms)) + (f" where {region}" if region else "")
 
 
 def _facts(diagnosis: Any) -> str:
@@ -189,12 +195,12 @@ def _where(diagnosis: Any, units: Mapping[str, str]) -> str:
 def _ranking(diagnosis: Any) -> str:
     chosen = set(_get(diagnosis, "terms"))
     region = getattr(diagnosis, "settings", {}).get("region")
-    tied = {frozenset(terms) for terms in _get(diagnosis, "tied")} - {frozenset(chosen)}
     hypotheses = sorted(_get(diagnosis, "ranking"), key=lambda item: -_comparable(item.log_evidence))
+    tied = [likeliest_with(hypotheses, terms) for terms in _get(diagnosis, "tied") if set(terms) != chosen]
     rows, marked = [], []
     for place, item in enumerate(hypotheses):
         is_chosen = bool(chosen) and set(item.terms) == chosen and item.region == region
-        remarks = ["accepted"] if is_chosen else ["tied"] if frozenset(item.terms) in tied else []
+        remarks = ["accepted"] if is_chosen else ["tied"] if any(item is other for other in tied) else []
         remarks += [] if item.physical else ["not physical"]
         remarks += [item.region] if item.region else []
         remarks += ["same as " + ", ".join(item.aliases)] if item.aliases else []

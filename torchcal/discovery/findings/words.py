@@ -10,7 +10,7 @@ from torchcal.discovery.findings.where_in_words import share_in_words, where_in_
 from torchcal.discovery.misfit.channels import RUN
 from torchcal.discovery.verdicts.by_share import REMOVED
 from torchcal.discovery.verdicts.verdict import PLAINLY_WHITE, WHITE
-from torchcal.display import NONE, up_to, with_unit
+from torchcal.display import NONE, percent, up_to, with_unit
 
 __all__ = ["paragraph"]
 
@@ -187,7 +187,7 @@ def _consistent(d: Any) -> list[str]:
     others = f", and {more} other{'s' if more > 1 else ''}" if more > 0 else ""
     return [
         f"{nothing} The smallest effects that these data could have shown "
-        f"(with probability {limits[0].power:.0%}): {shown}{others}."
+        f"(with probability {percent(limits[0].power)}): {shown}{others}."
     ]
 
 
@@ -346,9 +346,9 @@ def _ambiguous(d: Any) -> list[str]:
         told = math.floor(100 * sure) / 100  # and never what would be enough
         return [
             where_in_words(d),
-            f"{_and(known[0])}, the best explanation in the library, has a probability of {told:.2f}, which is too "
-            f"little for a name: something that is not in the library has {unknown:.2f}, other terms and the base "
-            f"alone have {max(1 - sure - unknown, 0.0):.2f} together. {_would_tell(d, known[0])}",
+            f"The best explanation in the library, {_hypothesis(d, known[0])}, has a probability of {told:.2f}, which "
+            f"is too little for a name: something that is not in the library has {unknown:.2f}, other terms and the "
+            f"base alone have {max(1 - sure - unknown, 0.0):.2f} together. {_would_tell(d, known[0])}",
         ]
     shares = [sum(row.probability for row in d.ranking if set(row.terms) == set(tied)) for tied in known]
     best = max(range(len(known)), key=lambda k: shares[k])
@@ -376,9 +376,10 @@ def _ambiguous(d: Any) -> list[str]:
         parts.append(f"The base alone has a probability of {base:.2f}.")
     shared = [name for name in known[0] if all(name in tied for tied in known)]
     if shared:
-        parts.append(f"All of them have {_and(shared)}.")
+        parts.append(f"{'Both' if len(known) == 2 else 'All of them'} have {_and(shared)}.")
     if d.settings.get("doubt"):
-        parts.append(re.sub(r"\bit ", "the best of them ", d.settings["doubt"], count=1))
+        doubt = re.sub(r"^It ", "The best of them ", d.settings["doubt"])
+        parts.append(re.sub(r"\bit ", "the best of them ", doubt, count=1) if doubt == d.settings["doubt"] else doubt)
     if len(known) < len(d.tied):
         share = f"probability {unknown:.2f}"
         if unknown < LISTED:

@@ -85,7 +85,7 @@ def sharpen(
 
 
 def _implicit(found: Fitted, allowed: Tensor, rounds: int) -> Fitted | None:
-    """The fit with implicit steps; None where these do not settle either."""
+    """The fit with implicit steps; None where these do not settle either, there or where the fit ends."""
     problem, simulator = found.problem, found.problem.simulator
     if not isinstance(simulator, Trajectories):
         return None
@@ -94,4 +94,7 @@ def _implicit(found: Fitted, allowed: Tensor, rounds: int) -> Fitted | None:
     other = settled_implicitly(simulator, found.values[None], most, rounds=rounds)
     if other is None:
         return None
-    return fit(problem.with_simulator(other), found.whitening, found.values[None], found.free)
+    again = fit(problem.with_simulator(other), found.whitening, found.values[None], found.free)
+    if again is None or not bool(again.problem.evaluate(again.values[None], [], again.warm)[0].isfinite().all()):
+        return None
+    return again

@@ -7,7 +7,7 @@ from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.local import ENDS, is_window
 from torchcal.discovery.hypotheses.model import Model
 
-__all__ = ["judge"]
+__all__ = ["UNPHYSICAL", "judge"]
 
 #: Prior odds against an estimate on a physical bound that it wants to cross.
 UNPHYSICAL = math.log(1e-3)

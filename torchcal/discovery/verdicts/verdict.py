@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
+from torchcal.discovery.hypotheses.judge import UNPHYSICAL
 from torchcal.discovery.hypotheses.model import PRIOR, Model
 from torchcal.discovery.hypotheses.own_noise import weigh_alone
 from torchcal.discovery.hypotheses.search import Search
@@ -14,7 +15,7 @@ from torchcal.discovery.misfit.structure import Structure
 from torchcal.discovery.verdicts.by_share import decide_exact, nearly
 from torchcal.discovery.verdicts.decision import Decision, certain, groups_of, other_names, tie_other_names, weigh
 from torchcal.discovery.verdicts.doubts import by_hold, doubt, unfit
-from torchcal.discovery.verdicts.instruments import only_instruments
+from torchcal.discovery.verdicts.instruments import no_instrument, only_instruments
 from torchcal.discovery.verdicts.proof import prove
 from torchcal.display import NONE
 
@@ -31,6 +32,8 @@ UNKNOWN = 0.7
 UNNAMED = 0.9
 #: Log odds behind the best model up to which one with fewer terms may be named for what all share.
 BEHIND = 5.0
+#: The same up to which it is a rival at all.
+RIVAL = 8.0
 #: Structure left after a hypothesis with less probability than this by noise alone speaks against it.
 WHITE = 0.005
 #: Structure left with at least this probability is none; and the share of its log evidence by which a linear estimate
@@ -113,7 +116,8 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     decision.none_evidence = math.log(PRIOR["none"])
     if detected:
         unknown, beside, here = weigh_alone(search)
-        ranked.sort(key=lambda m: -m.weight)
+        _dismiss(search, ranked)
+        ranked = sorted((m for m in ranked if m.physical), key=lambda m: -m.weight)
         found = _none_evidence(search, ranked, here)
         decision.none_evidence, beside = max(
             (unknown + decision.none_evidence, beside), found, key=lambda one: one[0]
@@ -186,6 +190,22 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     if len(decision.tied) < 2 or likely or local or pliant or decision.doubt:
         decision.tied.append(list(NONE))
     return decision
+
+
+def _dismiss(search: Search, ranked: list[Model]) -> None:
+    """Judge those of the likely models not to be physical whose instruments are none, where others explain the data.
+
+    Of instruments alone, a saturation that is a straight line at the recorded values does what a gain error does.
+    """
+    top = max((m.weight for m in ranked), default=0.0)
+    likely = [m for m in ranked if m.weight > top - RIVAL]
+    none = [m for m in likely if no_instrument(search, m)]
+    sound = [m for m in likely if m not in none and search.examine(m).p_value >= WHITE and _small(search, m)]
+    if not any(m.weight > top - BEHIND for m in sound):
+        return
+    for model in none:
+        model.physical, model.note = False, "no instrument reads like that"
+        model.price += UNPHYSICAL
 
 
 def _second(decision: Decision, ranked: Sequence[Model]) -> float:

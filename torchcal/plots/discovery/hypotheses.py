@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from torchcal.display import NONE, percent
 from torchcal.errors import DomainError
 from torchcal.plots import style
-from torchcal.plots.discovery.pieces import ACCEPTED, beside, draw_key, finite, signed, told_apart
+from torchcal.plots.discovery.pieces import ACCEPTED, beside, draw_key, finite, likeliest_with, signed, told_apart
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,7 +36,7 @@ def ranking(
             base), ``probability`` and ``physical``; ``region`` in words where it acts there alone.
         accepted: Terms of the accepted hypothesis.
         region: Where these act, if locally: other rows of the same terms are other hypotheses.
-        tied: Each the terms of a hypothesis that the data cannot tell from the best.
+        tied: Each the terms of a hypothesis that the data cannot tell from the best; the likeliest of these terms is.
         value: What the bars show: ``"log_evidence"`` or ``"probability"``.
         most: Largest number of bars; the base, "none of these" and the tied ones are among them.
         ax: Where to draw; a new figure by default.
@@ -53,10 +53,12 @@ def ranking(
     rows = sorted(hypotheses, key=lambda item: (-finite(item.probability, -1.0), -finite(item.log_evidence, -math.inf)))
     if not rows:
         raise DomainError("Expected at least one hypothesis. Got none.")
-    chosen, sets = frozenset(accepted), {frozenset(terms) for terms in tied}
+    chosen = frozenset(accepted)
+    others = [likeliest_with(rows, terms) for terms in tied if frozenset(terms) != chosen]
     same = [h for h in rows if chosen and frozenset(h.terms) == chosen]
     named = [h for h in same if getattr(h, "region", None) == region] or same
-    kept = [h for h in rows if not h.terms or tuple(h.terms) == NONE or frozenset(h.terms) in {*sets, chosen}]
+    told = [*others, *(h for h in rows if not h.terms or tuple(h.terms) == NONE or frozenset(h.terms) == chosen)]
+    kept = [h for h in rows if any(h is other for other in told)]
     kept += [h for h in rows if all(h is not other for other in kept)][: max(0, most - len(kept))]
     left_out = len(rows) - len(kept)
     rows = [h for h in rows if any(h is other for other in kept)]
@@ -80,7 +82,7 @@ def ranking(
             return "accepted"
         if not item.physical:
             return "not physical"
-        return "tied" if frozenset(item.terms) in sets - {chosen} else "considered"
+        return "tied" if any(item is other for other in others) else "considered"
 
     kinds = [kind(item) for item in rows]
     numbers = [finite(getattr(item, value), math.nan) for item in rows]

@@ -201,6 +201,14 @@ def _alike(first: str, second: str) -> int:
     return next(differing, min(len(first), len(second)))
 
 
+def likeliest_with(ranking: Iterable[Any], terms: Iterable[str]) -> Any:
+    """The likeliest of the hypotheses with exactly these terms, wherever they act; None where there is none."""
+    wanted = frozenset(terms)
+    same = [item for item in ranking if frozenset(item.terms) == wanted]
+    refitted = [item for item in same if getattr(item, "refitted", True)]
+    return max(refitted or same, key=lambda item: finite(item.probability, -1.0), default=None)
+
+
 def join_terms(terms: Iterable[str]) -> str:
     """A hypothesis by the names of its terms."""
     return plain(" + ".join(str(term) for term in terms), middle=True)
