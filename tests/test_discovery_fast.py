@@ -1,6 +1,7 @@
 """What is faster than the sampling: durations that a term may have, and time steps short enough for it."""
 
 import dataclasses
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,6 +10,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 import torchcal as tc
+from torchcal.discovery.fits import sharpen as sharpening
 from torchcal.discovery.fits.candidates import drivers_scale, prepare
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.sharpen import accurate, sharpen
@@ -94,6 +96,17 @@ def test_steps_are_chosen_anew_until_halving_them_changes_nothing():
     assert not accurate(base, 1e-9 * sd)
     _, left = sharpen(base, lambda now: 1e-13 * sd, rounds=1)
     assert left > 0  # it says by how much
+
+
+def test_implicit_steps_that_cannot_be_repeated_are_none(monkeypatch):
+    search = Search(Problem.of(heated(), recorded(0.3)), [], {}, 0, 4, 1, lambda text: None, None)
+    search.calibrate_base()
+    base = search.base
+    monkeypatch.setattr(sharpening, "settled_implicitly", lambda simulator, *given, **more: simulator)
+    assert sharpening._implicit(base, base.y.abs(), 1) is not None
+    lost = dataclasses.replace(base, values=torch.full_like(base.values, math.nan))
+    monkeypatch.setattr(sharpening, "fit", lambda *given: lost)  # it met a solution that no other start comes to
+    assert sharpening._implicit(base, base.y.abs(), 1) is None
 
 
 def shares(**given: float) -> tuple[Decision, list]:

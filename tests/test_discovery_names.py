@@ -414,6 +414,29 @@ def test_three_terms_together_and_windows_make_no_name_of_one(bend):
     assert powers(bend, wave=0.0).verdict == "unexplained"
 
 
+def test_what_no_instrument_does_is_no_rival_of_one():
+    # Over 1.5 to 4 a gain error is a saturation too, whose bend lies where there are no data.
+    t = np.linspace(0, 3, 80)
+    drive = 1.6 + 0.8 * np.sin(2 * t)
+    x = solve_ivp(lambda at, x: 0.8 * (np.interp(at, t, drive) - x), (0, 3), [4.0], t_eval=t, rtol=1e-9, atol=1e-10)
+    base = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"x": p["a"] * (u["f"] - s["x"])},
+        states={"x": "K"},
+        parameters=[tc.Parameter("a", low=0.0, initial=1.0)],
+        observe=("x",),
+    )
+    noise = torch.randn(80, dtype=F64, generator=torch.Generator().manual_seed(0))
+    y = 0.93 * torch.as_tensor(x.y[0]) + 0.02 * noise
+    run = tc.Run(time=t, inputs={"f": drive}, outputs={"x": y}, initial={"x": 4.0})
+    d = diagnose(base, tc.Recording(runs=[run], noise=0.02), tc.terms.sensor("x", dynamic=False))
+    assert ["gain error of x"] in [d.terms, *d.tied]
+    assert not any("saturation of x" in tied for tied in d.tied)
+    (row,) = [row for row in d.ranking if row.terms == ("saturation of x",) and not row.region]
+    assert not row.physical
+    assert row.note == "no instrument reads like that"
+    assert row.probability < 1e-3
+
+
 @pytest.mark.parametrize("seed", [5, 8])
 def test_a_name_that_has_another_is_none_though_it_may_act_in_a_window(seed):
     # A source of heat in a body that cools is an offset of its thermometer; in a window it is nearly as likely.

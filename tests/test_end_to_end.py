@@ -334,6 +334,24 @@ def test_a_parameter_that_the_data_do_not_see_is_reported():
         tc.calibrate(simulator, tc.Recording(x=X, y=Y), num_samples=0)
 
 
+@pytest.mark.parametrize("size", [1e-16, 1e-20, 1e-30])
+def test_a_parameter_whose_steps_are_lost_in_rounding_is_found(size):
+    # As where x is a charge in C: beside an a of 2 no step of b from 0 shows, up to 1e16.
+    found = []
+    for scale in (1.0, size):
+        with tiny_chains():
+            recording = tc.Recording(x=X * scale, y=Y)
+            result = tc.calibrate(line(), recording, likelihood=ABC(epsilon=0.3), num_samples=0, seed=3)
+        found.append((result.map.objective, float(result.map.mean[1]) * scale))
+    assert found[1] == pytest.approx(found[0], rel=1e-6)
+
+
+def test_a_simulator_that_uses_none_of_its_parameters_is_told_of():
+    simulator = tc.Simulator(lambda x, p: 2.0 + x, [tc.Parameter("a"), tc.Parameter("b")])
+    with tiny_chains(), pytest.raises(tc.TorchcalError):
+        tc.calibrate(simulator, tc.Recording(x=X, y=Y), num_samples=0)
+
+
 # --- random state and seeds -----------------------------------------------------------------------
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcal import plots
+from torchcal import plots, report
 from torchcal.data import Recording, Run
 from torchcal.discovery.fits import local
 from torchcal.discovery.records import (
@@ -499,6 +499,22 @@ def test_the_same_terms_in_another_region_are_told_apart():
     ]
     names = [text.get_text() for text in plots.ranking(rows).get_yticklabels()]
     assert names == ["leak, h < 0.2", "leak", "leak + lag", "base model alone"]
+
+
+def test_of_the_same_terms_the_likeliest_is_tied():
+    rows = [
+        Hypothesis(("drag",), 9.5, 0.5),
+        Hypothesis(("leak",), 9.0, 0.4, region="h < 0.2"),
+        Hypothesis(("leak",), 5.0, 0.1),
+        Hypothesis((), 0.0, 0.0),
+    ]
+    found = bars(plots.ranking(rows, tied=[["drag"], ["leak"]]))
+    assert [found[name].get_hatch() for name in ("drag", "leak, h < 0.2", "leak")] == ["////", "////", None]
+    d = oscillator()
+    d.verdict, d.terms, d.tied, d.ranking = "ambiguous", [], [["drag"], ["leak"]], rows
+    text = report.page(d)
+    assert "Ambiguous: drag or leak where h &lt; 0.2" in text
+    assert text.count("<td>tied") == 2
 
 
 def test_long_sets_of_terms_are_broken_between_terms():

@@ -20,6 +20,8 @@ from torchcal.simulators import Parameter, Scaling, Simulator, Trajectories, fre
 __all__ = ["LeastSquares", "allowed_solver_error", "least_squares", "plain_propagation"]
 
 _LEAST_SQUARES_STARTS = 64
+_PROBES = 8
+"""Gradients from which the size of a slight derivative is taken."""
 
 _FOLLOWED = 8
 """Of the starts of trajectories, those that are followed to the end."""
@@ -186,4 +188,26 @@ def _sensitivity(propagate: NISP, point: Tensor, residual: Callable[[NISP, Tenso
     shift = torch.diag(step)
     with torch.no_grad():
         change = residual(propagate, point + shift) - residual(propagate, point - shift)
-    return (change / (2 * step[:, None])).square().mean(-1).sqrt()
+    found = (change / (2 * step[:, None])).square().mean(-1).sqrt()
+    return found if bool((found > 0).all()) else torch.where(found > 0, found, _slight(propagate, point, residual))
+
+
+def _slight(propagate: NISP, point: Tensor, residual: Callable[[NISP, Tensor], Tensor]) -> Tensor:
+    """The same of parameters whose small steps are lost in rounding, about; 0 where no step moves the outputs so.
+
+    A derivative is not lost. Gradients along random directions in the data have its RMS.
+    """
+    with torch.enable_grad():
+        leaf = point.detach().clone().requires_grad_(True)
+        left = residual(propagate, leaf)
+        if not left.requires_grad:
+            return torch.zeros_like(point)
+        probes = torch.randn(_PROBES, len(left), dtype=left.dtype, generator=torch.Generator().manual_seed(0))
+        slopes = torch.stack(
+            [torch.autograd.grad(left @ probe.to(left.device), leaf, retain_graph=True)[0] for probe in probes]
+        )
+    found = (slopes / math.sqrt(len(left))).square().mean(0).sqrt()
+    step = torch.where(found > 0, 1 / found, torch.zeros_like(found))
+    with torch.no_grad():
+        change = (residual(propagate, point + torch.diag(step)) - left).square().mean(-1).sqrt()
+    return torch.where((change > 0.1) & (change < 10), found, torch.zeros_like(found))

@@ -205,7 +205,7 @@ def _dismiss(search: Search, ranked: list[Model]) -> None:
         return
     for model in none:
         model.physical, model.note = False, "no instrument reads like that"
-        model.price += UNPHYSICAL
+        model.price, model.log_evidence = model.price + UNPHYSICAL, model.log_evidence + UNPHYSICAL
 
 
 def _second(decision: Decision, ranked: Sequence[Model]) -> float:
