@@ -11,12 +11,13 @@ from benchmarks.concealed.families import (
     orbital,
     still,
     thermal,
+    unseen,
 )
 from benchmarks.concealed.families.base import Family
 
 FAMILIES: dict[str, Family] = {
     family.name: family
-    for module in (mechanical, thermal, hydraulic, chemical, electrical, orbital, still, late, newest, fresh)
+    for module in (mechanical, thermal, hydraulic, chemical, electrical, orbital, still, late, newest, fresh, unseen)
     for family in module.FAMILIES
 }
 

@@ -24,13 +24,14 @@ from benchmarks.concealed.models import (
     orbital,
     still,
     thermal,
+    unseen,
 )
 from benchmarks.concealed.models.base import Builder
 from torchcal.terms import Term
 
 BUILDERS: dict[str, Builder] = {
     family: builder
-    for module in (mechanical, thermal, hydraulic, chemical, electrical, orbital, still, late, newest, fresh)
+    for module in (mechanical, thermal, hydraulic, chemical, electrical, orbital, still, late, newest, fresh, unseen)
     for family, builder in module.BUILDERS.items()
 }
 
