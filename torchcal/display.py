@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 
-__all__ = ["DECADES", "FAR", "NONE", "PATIENCE", "between", "percent", "placed", "up_to", "with_unit"]
+__all__ = ["DECADES", "FAR", "NONE", "PATIENCE", "between", "percent", "placed", "raised", "up_to", "with_unit"]
 
 NONE = ("none of these",)
 """In place of terms: something that is not among the candidates."""
@@ -90,3 +90,12 @@ def between(spans: Sequence[tuple[float, float]], word: str, extent: float | Non
         placed(low, extent) if low == high else f"{placed(low, extent)} {word} {placed(high, extent)}"
         for low, high in spans
     ]
+
+
+def raised(error: BaseException) -> str:
+    """What was raised, as the end of a sentence that sets its own full stop.
+
+    >>> raised(ValueError("Not so."))
+    'ValueError: Not so'
+    """
+    return f"{type(error).__name__}: {error}".rstrip(". ")

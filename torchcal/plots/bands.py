@@ -161,7 +161,7 @@ def _expect(prediction: Any, kind: type, function: str) -> None:
     if not isinstance(prediction, kind):
         other = "additive_fit" if function == "fit" else "fit"
         raise DomainError(
-            f"Expected prediction: a {kind.__name__}. Got {type(prediction).__name__} (see also plots.{other})."
+            f"Expected prediction: {kind.__name__}. Got {type(prediction).__name__} (see also plots.{other})."
         )
 
 

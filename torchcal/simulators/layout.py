@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcal.data import Recording, Run
+from torchcal.display import raised
 from torchcal.errors import RecordingError, SimulatorError
 from torchcal.simulators.parameter import Parameter, in_run
 
@@ -188,7 +189,7 @@ class Layout:
                 except Exception as error:
                     raise SimulatorError(
                         f"Expected the initial value of {state!r} from those of {list(entries)}, which are known by "
-                        f"then, and parameters {list(own)}. It raised {type(error).__name__}: {error}."
+                        f"then, and parameters {list(own)}. It raised {raised(error)}."
                     ) from error
             rows.append(torch.cat([entries[state] for state in self._states], dim=-1))
         return torch.stack(rows, dim=-2)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcal.display import raised
 from torchcal.errors import SimulatorError
 from torchcal.simulators.executor import TaskError, worker_died
 
@@ -144,7 +145,7 @@ def failed_evaluation(failure: TaskError, point: str) -> SimulatorError:
     if isinstance(error, SimulatorError):
         return SimulatorError(f"{error} This happened at {point}.")
     return SimulatorError(
-        f"Expected the function to return a number. It raised {type(error).__name__}: {error}. It was called "
+        f"Expected the function to return a number. It raised {raised(error)}. It was called "
         f"with {point}. Mend it there, or let it return float('nan') where it has no answer."
     )
 

@@ -12,6 +12,7 @@ from torch.autograd import forward_ad
 
 from torchcal.checks import whole
 from torchcal.data import Recording
+from torchcal.display import raised
 from torchcal.errors import DomainError, ShapeError, SimulatorError
 from torchcal.simulators.dual import Still, still
 from torchcal.simulators.parameter import Parameter, spans
@@ -140,7 +141,7 @@ class Simulator:
                 raise
             except Exception as error:
                 raise SimulatorError(
-                    f"Expected the simulator to return a tensor. It raised {type(error).__name__}: {error}. "
+                    f"Expected the simulator to return a tensor. It raised {raised(error)}. "
                     f"It was called with conditions {_describe(x)} and parameters of shape "
                     f"{(*values.shape[:-1], 1)} ({spans(p)}).{_advice(error, x, self.names)}"
                 ) from error

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from torchcal.display import raised
 from torchcal.errors import SimulatorError
 from torchcal.simulators.grid import Grid
 from torchcal.simulators.layout import Layout, Values
@@ -62,7 +63,7 @@ class Steps:
             raise
         except Exception as error:
             raise SimulatorError(
-                f"Expected rates(t, s, p, u) to return the rates by state. It raised {type(error).__name__}: {error}. "
+                f"Expected rates(t, s, p, u) to return the rates by state. It raised {raised(error)}. "
                 f"It was called with states of shape {tuple(s.shape[:-1])} ({spans(named)}) and parameters "
                 f"of shape {tuple(next(iter(p.values())).shape)} ({spans(p)})."
             ) from error

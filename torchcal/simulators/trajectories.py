@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcal.data import Recording
+from torchcal.display import raised
 from torchcal.errors import DomainError, RecordingError, SimulatorError
 from torchcal.simulators.grid import Grid
 from torchcal.simulators.implicit import ImplicitSteps
@@ -294,7 +295,7 @@ class Trajectories(Simulator):
                 raise
             except Exception as error:
                 raise SimulatorError(
-                    f"Expected the output {name!r} as a tensor. Its function raised {type(error).__name__}: {error}."
+                    f"Expected the output {name!r} as a tensor. Its function raised {raised(error)}."
                 ) from error
             parts.append(torch.as_tensor(value, dtype=seen.dtype).expand(seen.shape[:-1]))
         return torch.cat(parts, dim=-1)

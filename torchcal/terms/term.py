@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcal.display import NONE
+from torchcal.display import NONE, raised
 from torchcal.errors import DomainError, SimulatorError, TorchcalError
 from torchcal.simulators import (
     Parameter,
@@ -257,7 +257,7 @@ class Term:
             known = "; ".join(", ".join(part) for part in given if isinstance(part, Mapping) and part)
             raise SimulatorError(
                 f"Expected a tensor from every function of the term {self.name!r}. One of them raised "
-                f"{type(error).__name__}: {error}. It was given {len(given)} arguments, with {known}.{advice}"
+                f"{raised(error)}. It was given {len(given)} arguments, with {known}.{advice}"
             ) from error
         if isinstance(result, np.ndarray | np.generic):
             result = torch.as_tensor(result)

@@ -271,7 +271,7 @@ def formulas(model: Model) -> list[str]:
     rows = []
     for term in model.candidate.terms:
         own = [i for i in model.candidate.own if term.brings(model.found.problem.parameters[i].name)]
-        text = term.formula or term.name
+        text = term.formula or f"{term.name} (of which no formula= was given)"
         if model.window is not None:
             text = text.split(" where ")[0]
         if term.elapsed and any(float(run.time[0]) != 0.0 for run in model.found.problem.recording.runs or ()):
