@@ -24,6 +24,7 @@ from torchcal.errors import (
     ImproperPosteriorError,
     ToleranceWarning,
 )
+from torchcal.inference.randomness import preserve_random_state
 from torchcal.likelihoods import ABC, ABCMean, Additive, Full, GaussianMarginal, Marginal
 
 X = torch.linspace(-1.0, 1.0, 5, dtype=torch.float64)
@@ -346,10 +347,27 @@ def test_a_parameter_whose_steps_are_lost_in_rounding_is_found(size):
     assert found[1] == pytest.approx(found[0], rel=1e-6)
 
 
-def test_a_simulator_that_uses_none_of_its_parameters_is_told_of():
-    simulator = tc.Simulator(lambda x, p: 2.0 + x, [tc.Parameter("a"), tc.Parameter("b")])
-    with tiny_chains(), pytest.raises(tc.TorchcalError):
-        tc.calibrate(simulator, tc.Recording(x=X, y=Y), num_samples=0)
+def test_bounded_parameters_and_failing_simulators_are_not_tried_far_out():
+    def model(x, p):
+        if float(torch.stack([p["b"].detach().abs().max(), p["c"].detach().abs().max()]).max()) > 1e6:
+            raise ValueError("off the table")
+        return p["a"] + 1e-30 * (p["b"] + p["c"]) * x
+
+    parameters = [tc.Parameter("a"), tc.Parameter("b", low=0.0, high=1.0), tc.Parameter("c")]
+    with tiny_chains():
+        warnings.simplefilter("ignore", IdentifiabilityWarning)
+        result = tc.calibrate(tc.Simulator(model, parameters), tc.Recording(x=X, y=Y), num_samples=0, num_starts=4)
+    assert float(result.map.mean[0]) == pytest.approx(float(Y.mean()), rel=0.2)
+
+
+def test_a_seed_that_is_refused_holds_up_nobody():
+    before = global_state()
+    with pytest.raises(ValueError, match="Seed"), preserve_random_state(2**33):
+        pass
+    assert global_state() == before
+    with ThreadPoolExecutor(1) as pool:
+        assert pool.submit(preserve_random_state._turn.acquire, timeout=5).result()
+        pool.submit(preserve_random_state._turn.release).result()
 
 
 # --- random state and seeds -----------------------------------------------------------------------

@@ -15,6 +15,7 @@ import torch
 from torchcal import Recording, Term, calibrate, diagnose
 from torchcal.embeddings import Gaussian
 from torchcal.errors import DomainError, ShapeError, SimulatorError
+from torchcal.likelihoods import ABC
 from torchcal.propagation import NISP
 from torchcal.simulators import ExternalSimulator, Parameter, Simulator
 
@@ -421,3 +422,25 @@ def test_a_function_that_returns_nan_itself_is_not_said_to_raise(values):
     with pytest.raises(SimulatorError, match=r"everywhere\. Check the simulator") as caught:
         ExternalSimulator(lambda x, p: math.nan, PARAMETERS).check(X, values)
     assert caught.value.__cause__ is None
+
+
+def test_a_black_box_is_searched_on_its_tangents():
+    calls = 0
+
+    def decay(x, p):
+        nonlocal calls
+        calls += 1
+        return p["a"] * math.exp(-p["k"] * x)
+
+    x = torch.linspace(0, 3, 10, dtype=torch.float64)
+    y = 2 * torch.exp(-0.8 * x) + 0.1 * x
+    parameters = [Parameter("a", low=0.0, high=5.0), Parameter("k", low=0.01, high=3.0, transform="log")]
+    simulators = (
+        ExternalSimulator(decay, parameters),
+        Simulator(lambda x, p: p["a"] * torch.exp(-p["k"] * x), parameters),
+    )
+    abc = ABC(epsilon=0.02)
+    box, model = (calibrate(one, Recording(x=x, y=y), likelihood=abc, num_samples=0).map for one in simulators)
+    assert box.objective == pytest.approx(model.objective, rel=1e-6)
+    torch.testing.assert_close(box.mean, model.mean, rtol=1e-4, atol=0)
+    assert calls < 1_000_000  # with every start on the model itself ten million

@@ -1,5 +1,6 @@
 """The best single parameter vector, and the coordinates that it suggests."""
 
+import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -112,7 +113,7 @@ def _least_squares(
         starts = starts[:1]
     best = _fit(propagate, prior, residual, prior.transform.unbound(starts))
     for _ in range(2):  # once more in the coordinates that the first fit suggests
-        slope = _sensitivity(propagate, best, residual)
+        slope = _sensitivity(propagate, best, residual, free)
         center = propagate.scaling.scaled(propagate.scaling.physical(best))
         natural = propagate.scaling.center + propagate.scaling.scale * center
         size = propagate.scaling.scale / slope
@@ -182,32 +183,44 @@ def _fit(
     return prior.transform.bound(found.points[0])
 
 
-def _sensitivity(propagate: NISP, point: Tensor, residual: Callable[[NISP, Tensor], Tensor]) -> Tensor:
+def _sensitivity(
+    propagate: NISP, point: Tensor, residual: Callable[[NISP, Tensor], Tensor], free: Sequence[Parameter]
+) -> Tensor:
     """RMS over the data of ∂(output / spread)/∂λ̃, by central differences, ``(d,)``."""
     step = 1e-5 * point.abs().clamp_min(1.0)
     shift = torch.diag(step)
     with torch.no_grad():
         change = residual(propagate, point + shift) - residual(propagate, point - shift)
     found = (change / (2 * step[:, None])).square().mean(-1).sqrt()
-    return found if bool((found > 0).all()) else torch.where(found > 0, found, _slight(propagate, point, residual))
+    # Of two bounds the scale is theirs; of one, large steps go away from it.
+    away = torch.tensor([0.0 if p.low is not None and p.high is not None else -1.0 if p.high is not None else 1.0
+                         for p in free], dtype=point.dtype)  # fmt: skip
+    if not bool(((found == 0) & (away != 0)).any()):
+        return found
+    return torch.where((found == 0) & (away != 0), _slight(propagate, point, residual, away), found)
 
 
-def _slight(propagate: NISP, point: Tensor, residual: Callable[[NISP, Tensor], Tensor]) -> Tensor:
-    """The same of parameters whose small steps are lost in rounding, about; 0 where no step moves the outputs so.
+def _slight(
+    propagate: NISP, point: Tensor, residual: Callable[[NISP, Tensor], Tensor], away: Tensor
+) -> Tensor:
+    """The same of parameters whose small steps are lost in rounding, about; 0 where no step ``away`` moves the outputs
+    so.
 
     A derivative is not lost. Gradients along random directions in the data have its RMS.
     """
     with torch.enable_grad():
         leaf = point.detach().clone().requires_grad_(True)
         left = residual(propagate, leaf)
-        if not left.requires_grad:
-            return torch.zeros_like(point)
         probes = torch.randn(_PROBES, len(left), dtype=left.dtype, generator=torch.Generator().manual_seed(0))
-        slopes = torch.stack(
-            [torch.autograd.grad(left @ probe.to(left.device), leaf, retain_graph=True)[0] for probe in probes]
-        )
+        slopes = torch.stack([torch.autograd.grad(left @ probe, leaf, retain_graph=True)[0] for probe in probes])
     found = (slopes / math.sqrt(len(left))).square().mean(0).sqrt()
-    step = torch.where(found > 0, 1 / found, torch.zeros_like(found))
-    with torch.no_grad():
-        change = (residual(propagate, point + torch.diag(step)) - left).square().mean(-1).sqrt()
-    return torch.where((change > 0.1) & (change < 10), found, torch.zeros_like(found))
+    for i in range(len(found)):
+        change = 0.0
+        if float(found[i]) > 0 and float(away[i]) != 0:
+            moved = point.clone()
+            moved[i] += away[i] / found[i]
+            with contextlib.suppress(SimulatorError), torch.no_grad():  # so far out nobody is asked to have an answer
+                change = float((residual(propagate, moved) - left).square().mean().sqrt())
+        if not 0.1 < change < 10:
+            found[i] = 0.0
+    return found

@@ -25,13 +25,19 @@ class preserve_random_state:
         self._mine.acquire()
         self._state = pyro.util.get_rng_state()  # which leaves out the accelerators, though the seed is theirs too
         self._cuda = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else []
-        pyro.set_rng_seed(self.seed)
+        try:
+            pyro.set_rng_seed(self.seed)
+        except BaseException:
+            self.__exit__()
+            raise
 
     def __exit__(self, *_: object) -> None:
-        pyro.util.set_rng_state(self._state)
-        if self._cuda:
-            torch.cuda.set_rng_state_all(self._cuda)
-        self._mine.release()
+        try:
+            pyro.util.set_rng_state(self._state)
+            if self._cuda:
+                torch.cuda.set_rng_state_all(self._cuda)
+        finally:
+            self._mine.release()
 
 
 def _begin_free() -> None:

@@ -120,7 +120,8 @@ def _detected(d: Any) -> str:
         rmse = d.before.fitted.rmse
         unit = _rmse_unit(d)
         return f"The recording is declared free of noise; the calibrated base leaves an RMSE of {rmse:.4g}{unit}."
-    text = f"Noise sd ({noise.source}): {sd}"
+    times = getattr(noise, "enlarged", 1.0)
+    text = f"Noise sd ({noise.source}{f', and taken for {times:.2g} times as large' if times > 1 else ''}): {sd}"
     correlated = [f"{name} {c:.2f}" for name, c in noise.correlation.items() if c >= 0.05]
     over = {"time": "over the usual gap", "sample": "from sample to sample, however far apart"}
     how = over.get(noise.memory, "from sample to sample")
@@ -346,7 +347,7 @@ def _ambiguous(d: Any) -> list[str]:
         told = math.floor(100 * sure) / 100  # and never what would be enough
         return [
             where_in_words(d),
-            f"The best explanation in the library, {_hypothesis(d, known[0])}, has a probability of {told:.2f}, which "
+            f"The best explanation in the library, {' with '.join(known[0])}, has a probability of {told:.2f}, which "
             f"is too little for a name: something that is not in the library has {unknown:.2f}, other terms and the "
             f"base alone have {max(1 - sure - unknown, 0.0):.2f} together. {_would_tell(d, known[0])}",
         ]

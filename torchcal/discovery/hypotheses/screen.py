@@ -192,8 +192,10 @@ def _is_instrument(candidate: Candidate, found: Fitted) -> bool:
     """Whether what changes outputs alone shows a true value otherwise, and reads nothing else."""
     low, high = candidate.problem.limits()
     values = candidate.begin.clone()
-    for place in candidate.amplitudes:  # at neutral it does nothing, whatever it reads
-        values[place] = (values[place] + 1.0).clamp(low[place], high[place])
+    for a, place in enumerate(candidate.amplitudes):  # at neutral it does nothing, whatever it reads
+        size = 1.0 / float(candidate.tangents[:, :, a].abs().max().clamp_min(1e-300))
+        up, down = float(high[place] - values[place]), float(values[place] - low[place])
+        values[place] += min(size, up) if up >= min(size, down) else -min(size, down)
     return any(are_instruments(candidate.problem, candidate.terms, values, found.warm))
 
 

@@ -32,8 +32,8 @@ UNKNOWN = 0.7
 UNNAMED = 0.9
 #: Log odds behind the best model up to which one with fewer terms may be named for what all share.
 BEHIND = 5.0
-#: The same up to which it is a rival at all.
-RIVAL = 8.0
+#: The same up to which it is a rival at all; and up to which one explains the data as well.
+RIVAL, AS_WELL = 8.0, 1.0
 #: Structure left after a hypothesis with less probability than this by noise alone speaks against it.
 WHITE = 0.005
 #: Structure left with at least this probability is none; and the share of its log evidence by which a linear estimate
@@ -193,18 +193,17 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
 
 
 def _dismiss(search: Search, ranked: list[Model]) -> None:
-    """Judge those of the likely models not to be physical whose instruments are none, where others explain the data.
+    """Judge likely models with an instrument that is none not to be physical, where another explains the data as well.
 
-    Of instruments alone, a saturation that is a straight line at the recorded values does what a gain error does.
+    A saturation that is a straight line at the recorded values does what a gain error does.
     """
     top = max((m.weight for m in ranked), default=0.0)
-    likely = [m for m in ranked if m.weight > top - RIVAL]
-    none = [m for m in likely if no_instrument(search, m)]
-    sound = [m for m in likely if m not in none and search.examine(m).p_value >= WHITE and _small(search, m)]
-    if not any(m.weight > top - BEHIND for m in sound):
+    none = [m for m in ranked if m.weight > top - RIVAL and no_instrument(search, m)]
+    others = [m for m in ranked if m.weight > top - AS_WELL and m not in none]
+    if not none or not any(search.examine(m).p_value >= WHITE and _small(search, m) for m in others):
         return
     for model in none:
-        model.physical, model.note = False, "no instrument reads like that"
+        model.physical, model.note = False, model.note or "no instrument reads like that"
         model.price, model.log_evidence = model.price + UNPHYSICAL, model.log_evidence + UNPHYSICAL
 
 

@@ -202,11 +202,12 @@ def _alike(first: str, second: str) -> int:
 
 
 def likeliest_with(ranking: Iterable[Any], terms: Iterable[str]) -> Any:
-    """The likeliest of the hypotheses with exactly these terms, wherever they act; None where there is none."""
+    """The likeliest sound hypothesis with exactly these terms, wherever they act; None where none has them."""
     wanted = frozenset(terms)
     same = [item for item in ranking if frozenset(item.terms) == wanted]
     refitted = [item for item in same if getattr(item, "refitted", True)]
-    return max(refitted or same, key=lambda item: finite(item.probability, -1.0), default=None)
+    sound = [item for item in refitted if item.physical and not getattr(item, "note", "")]
+    return max(sound or refitted or same, key=lambda item: finite(item.probability, -1.0), default=None)
 
 
 def join_terms(terms: Iterable[str]) -> str:
