@@ -299,9 +299,9 @@ def test_an_interruption_of_a_finished_search_changes_nothing(motion, monkeypatc
     module = sys.modules["torchcal.discovery.diagnose"]  # whose name is that of its function, too
     work = module.conclude
 
-    def interrupted(*args):
+    def interrupted(*args, **options):
         signal.raise_signal(signal.SIGINT)
-        return work(*args)
+        return work(*args, **options)
 
     monkeypatch.setattr(module, "conclude", interrupted)
     d = diagnose(motion, library()[-1:])
