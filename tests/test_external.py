@@ -18,6 +18,7 @@ from torchcal.errors import DomainError, ShapeError, SimulatorError
 from torchcal.likelihoods import ABC
 from torchcal.propagation import NISP
 from torchcal.simulators import ExternalSimulator, Parameter, Simulator
+from torchcal.terms import extend
 
 PARAMETERS = [Parameter("a", low=0.5, high=2.0), Parameter("b")]
 X = {"s": torch.tensor([0.1, 0.5, 0.5, 0.9]).double(), "t": torch.tensor([1.0, 2.0, 2.0, 3.0]).double()}
@@ -444,3 +445,11 @@ def test_a_black_box_is_searched_on_its_tangents():
     assert box.objective == pytest.approx(model.objective, rel=1e-6)
     torch.testing.assert_close(box.mean, model.mean, rtol=1e-4, atol=0)
     assert calls < 1_000_000  # with every start on the model itself ten million
+
+    calls = 0
+    tilt = Term("tilt", outputs={"y": lambda x, p, y: y + p["q"] * x}, parameters=[Parameter("q", low=-0.2, high=0.5)])
+    options = {"likelihood": abc, "num_samples": 0, "fixed": {"a": 2.0}}
+    bent = Recording(x=x, y=y + 0.05 * torch.sin(9 * x))
+    box, model = (calibrate(extend(one, [tilt]), bent, **options).map for one in simulators)
+    assert box.objective == pytest.approx(model.objective, rel=1e-6)
+    assert calls < 1_000_000  # with a term it is a black box still

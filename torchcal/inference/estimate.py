@@ -17,7 +17,7 @@ from torchcal.models import Problem
 from torchcal.propagation import NISP
 from torchcal.propagation.convergence import SETTLED
 from torchcal.results.in_time import NODE_TOLERANCE
-from torchcal.simulators import ExternalSimulator, Trajectories
+from torchcal.simulators import Trajectories
 
 __all__ = ["SAME_MEANS", "Estimate", "maximise"]
 
@@ -165,7 +165,7 @@ def _searched(problem: Problem, starts: Tensor, leading: Tensor, show: Callable[
     places = propagate.pattern.leading.nonzero()[:, 0].to(begin.device)
     dear = propagate.num_evaluations * outputs * begin.numel() > DEAR
     found: Minima | None = None
-    if isinstance(propagate.simulator, Trajectories | ExternalSimulator):
+    if propagate.simulator.dear:
         if len(begin) > 2:
             found = search(objective, propagate, begin, leading, progress=show)
     elif dear and problem.likelihood.needs != "samples" and (coarse := few_nodes(propagate)) is not None:

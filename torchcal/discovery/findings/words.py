@@ -379,8 +379,8 @@ def _ambiguous(d: Any) -> list[str]:
     if shared:
         parts.append(f"{'Both' if len(known) == 2 else 'All of them'} have {_and(shared)}.")
     if d.settings.get("doubt"):
-        doubt = re.sub(r"^It ", "The best of them ", d.settings["doubt"])
-        parts.append(re.sub(r"\bit ", "the best of them ", doubt, count=1) if doubt == d.settings["doubt"] else doubt)
+        best_of = {"It ": "The best of them ", "it ": "the best of them "}
+        parts.append(re.sub(r"^It |\bit ", lambda found: best_of[found[0]], d.settings["doubt"], count=1))
     if len(known) < len(d.tied):
         share = f"probability {unknown:.2f}"
         if unknown < LISTED:

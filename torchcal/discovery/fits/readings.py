@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.fits.problem import Problem
-from torchcal.simulators import Solution, Values
+from torchcal.simulators import Values
 from torchcal.terms import Term
 
 __all__ = ["Reading", "are_instruments"]
@@ -67,10 +67,11 @@ class Reading:
         return all(torch.allclose(shown, one, rtol=0, atol=0, equal_nan=True) for one in moved)
 
 
-def are_instruments(problem: Problem, terms: Sequence[Term], values: Tensor, warm: Solution | None) -> list[bool]:
-    """Which terms of a fit at ``values`` ``(P,)`` show a true value otherwise, and read nothing else but what has a
-    memory of its own, or counts from the first sample."""
-    drivers = problem.drivers_at_data(values[None], warm)
+def are_instruments(
+    problem: Problem, terms: Sequence[Term], values: Tensor, drivers: dict[str, Tensor]
+) -> list[bool]:
+    """Which terms of a problem show a true value otherwise, and read nothing else but what has a memory of its own, or
+    counts from the first sample: at ``values`` ``(P,)``, with drivers at the data ``(n,)``."""
     p = problem.parameters_at_data(values)
 
     def is_one(term: Term) -> bool:

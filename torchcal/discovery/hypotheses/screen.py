@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.fits.candidates import Candidate
-from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.local import SHORT, Span
 from torchcal.discovery.fits.readings import are_instruments
 from torchcal.discovery.misfit.channels import responses
@@ -175,7 +174,11 @@ def contributions(
         place = candidate.amplitudes[int(screening.amplitude[column])]
         extended = candidate.problem.simulator
         moves = any(term.rates or term.shifts for term in candidate.terms)
-        if states is None or not isinstance(extended, Trajectories) or not (moves or _is_instrument(candidate, found)):
+        if (
+            states is None
+            or not isinstance(extended, Trajectories)
+            or not (moves or _is_instrument(candidate, at_data))
+        ):
             tangent = candidate.tangents[int(screening.shape[column]), :, int(screening.amplitude[column])]
             parts[i] = tangent, at_data
         elif not any(term.outputs for term in candidate.terms):
@@ -188,7 +191,7 @@ def contributions(
     return dict(sorted(parts.items()))
 
 
-def _is_instrument(candidate: Candidate, found: Fitted) -> bool:
+def _is_instrument(candidate: Candidate, drivers: dict[str, Tensor]) -> bool:
     """Whether what changes outputs alone shows a true value otherwise, and reads nothing else."""
     low, high = candidate.problem.limits()
     values = candidate.begin.clone()
@@ -196,7 +199,7 @@ def _is_instrument(candidate: Candidate, found: Fitted) -> bool:
         size = 1.0 / float(candidate.tangents[:, :, a].abs().max().clamp_min(1e-300))
         up, down = float(high[place] - values[place]), float(values[place] - low[place])
         values[place] += min(size, up) if up >= min(size, down) else -min(size, down)
-    return any(are_instruments(candidate.problem, candidate.terms, values, found.warm))
+    return any(are_instruments(candidate.problem, candidate.terms, values, drivers))
 
 
 def windows(residual: Residual, candidates: Sequence[Candidate], screening: Screening) -> tuple[list[Window], Tensor]:

@@ -55,7 +55,8 @@ def only_instruments(model: Model) -> bool:
 def which_instruments(model: Model) -> list[bool]:
     """Which terms of a model are instruments, see `are_instruments`."""
     found = model.found
-    return are_instruments(found.problem, model.candidate.terms, found.values, found.warm)
+    drivers = found.problem.drivers_at_data(found.values[None], found.warm)
+    return are_instruments(found.problem, model.candidate.terms, found.values, drivers)
 
 
 def no_instrument(search: Search, model: Model) -> str:
