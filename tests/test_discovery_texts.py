@@ -600,3 +600,19 @@ def test_opposites_that_have_one_sign_each_are_not_the_same(low, told):
     wobble = 0.01 * torch.randn(40, generator=torch.Generator().manual_seed(0), dtype=F64)
     d = tc.diagnose(base, tc.Recording(x=x, y=1 / x + wobble, noise=0.01), [less, more], progress=False)
     assert any("less and more are nearly the same" in row for row in d.identifiability) is told
+
+
+def test_candidates_that_are_nearly_the_same_are_told_in_groups():
+    x = torch.linspace(0, 1, 40, dtype=F64)
+    base = tc.Simulator(lambda x, p: p["k"] + 0 * x, [tc.Parameter("k")])
+
+    def bump(name, power, amplitude):
+        return tc.Term(
+            name, outputs={"y": lambda x, p, y: y + p[amplitude] * x**power}, parameters=[tc.Parameter(amplitude)]
+        )
+
+    candidates = [bump("two", 2.0, "a"), bump("nine", 9.0, "b"), bump("more", 2.2, "c"), bump("most", 2.4, "d")]
+    wobble = 0.01 * torch.randn(40, generator=torch.Generator().manual_seed(0), dtype=F64)
+    d = tc.diagnose(base, tc.Recording(x=x, y=1 + 0.1 * x**2 + wobble, noise=0.01), candidates, progress=False)
+    (row,) = [row for row in d.identifiability if "nearly the same" in row]
+    assert row.startswith("two, more and most are nearly the same here (correlation from 0.99")

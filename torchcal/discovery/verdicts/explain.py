@@ -35,7 +35,9 @@ MIXED = 0.02
 UNSEEN = 1e-6
 #: Share of an estimate from which on its sd is so large that it may be told in a combination only.
 LOOSE = 0.1
-#: Log evidence between two candidates that are told apart.
+#: Correlation of what two candidates do from which on they are nearly the same, and log evidence by which refits tell
+#: them apart all the same.
+NEARLY = 0.99
 APART = 5.0
 #: Starts from which what is named is fitted again, and steps; a minimum that is higher by less than `RIVAL` in χ² and
 #: more than `ELSEWHERE` sd away is another one.
@@ -160,13 +162,28 @@ def identifiability(search: Search, best: Model | None) -> list[str]:
             own = best is not None and best.window is not None and i in best.numbers
             everywhere = ", where it acts everywhere," if own else ""
             rows.append(f"{candidate.name}{everywhere} cannot be told from the parameters of the base")
-        for j in range(i):
-            c = _alike(search, i, j)
-            if c > 0.99 and not _told_apart(search, i, j):
-                rows.append(
-                    f"{search.candidates[j].name} and {candidate.name} are nearly the same here (correlation {c:.3f})"
-                )
-    return [*([] if best is None else _one_law(best)), *rows][:12]
+    return [*([] if best is None else _one_law(best)), *rows, *_nearly_the_same(search)][:12]
+
+
+def _nearly_the_same(search: Search) -> list[str]:
+    """Groups of candidates of which every two do nearly the same to the data; every such pair is in one of them."""
+    pairs: dict[tuple[int, int], float] = {}
+    for j, i in itertools.combinations(range(len(search.candidates)), 2):
+        c = _alike(search, i, j)
+        if c > NEARLY and not _told_apart(search, i, j):
+            pairs[j, i] = c
+    open_, rows = dict(pairs), []
+    while open_:
+        group = list(next(iter(open_)))
+        for k in range(len(search.candidates)):
+            if k not in group and all((min(k, m), max(k, m)) in pairs for m in group):
+                group.append(k)
+        within = list(itertools.combinations(sorted(group), 2))
+        names = [search.candidates[k].name for k in sorted(group)]
+        least = f"correlation {'' if len(within) == 1 else 'from '}{min(pairs[pair] for pair in within):.3f}"
+        rows.append(f"{', '.join(names[:-1])} and {names[-1]} are nearly the same here ({least})")
+        open_ = {pair: c for pair, c in open_.items() if pair not in within}
+    return rows
 
 
 def _alike(search: Search, i: int, j: int) -> float:
