@@ -1,5 +1,6 @@
 """Experiments that are proposed where hypotheses are tied: which there are, and when more samples are asked for."""
 
+import re
 from types import SimpleNamespace
 
 import pytest
@@ -263,3 +264,39 @@ def test_bolder_experiments_are_tried_where_no_simple_one_tells_enough(monkeypat
     simple = 3.0
     found = experiment.propose(models, SimpleNamespace())
     assert (found.separation, found.description) == (9.0, "conditions with x above the recorded range, to 4")
+
+
+def test_a_temperature_is_multiplied_by_its_rise_and_not_from_absolute_zero():
+    ode = tc.ODESimulator(
+        lambda t, s, p, u: {"T": p["k"] * (u["Ta"] - s["T"]) + s["c"], "c": -s["c"]},
+        {"T": "K", "c": "mol/L"}, [tc.Parameter("k", initial=0.5)], observe=("T",),
+    )  # fmt: skip
+    t = torch.linspace(0, 20, 60, dtype=F64)
+    outside = 290.0 + 3.0 * torch.sin(t)
+    run = tc.Run(time=t, outputs={"T": 0 * t}, inputs={"Ta": outside}, initial={"T": 350.0, "c": 2.0})
+    problem = Problem.of(ode, tc.Recording(runs=[run], units={"Ta": "K"}))
+    model = SimpleNamespace(problem=problem, values=torch.tensor([0.5], dtype=F64), warm=None)
+    options = [*conditions.simple(model), *conditions.bolder(model)]
+    chosen = {text: conditions for text, _, conditions in options}
+    lowest = min(float(one["inputs"]["Ta"].min()) for one in chosen.values())
+    assert lowest > 260.0
+    (twice,) = [text for text in chosen if text.startswith("a run that starts from 2 times the initial states of the")]
+    told = float(re.search(r"\(T counted from ([\d.]+)\)", twice)[1])
+    assert 285.0 < told < 295.0
+    assert chosen[twice]["initial"]["T"] == pytest.approx(2 * 350.0 - told, abs=0.1)
+    assert chosen[twice]["initial"]["c"] == 4.0
+    counted = f"(Ta counted from {float(outside.min()):.4g})"
+    assert any(f"2 times the inputs of the first {counted}" in text for text in chosen)
+
+
+def test_a_constant_temperature_outside_is_no_input_to_multiply():
+    ode = tc.ODESimulator(
+        lambda t, s, p, u: {"T": p["k"] * (u["Ta"] - s["T"])}, {"T": "degC"}, [tc.Parameter("k", initial=0.5)]
+    )
+    t = torch.linspace(0, 20, 60, dtype=F64)
+    run = tc.Run(time=t, outputs={"T": 0 * t}, inputs={"Ta": 0 * t + 20.0}, initial={"T": 20.0})
+    problem = Problem.of(ode, tc.Recording(runs=[run], units={"Ta": "degC"}))
+    model = SimpleNamespace(problem=problem, values=torch.tensor([0.5], dtype=F64), warm=None)
+    texts = [text for text, _, _ in (*conditions.simple(model), *conditions.bolder(model))]
+    assert "the first run again" in texts
+    assert not [text for text in texts if "times the in" in text]

@@ -179,7 +179,7 @@ def test_an_experiment_asks_for_the_initial_states_that_were_not_given(given):
         lambda t, s, p, u: {"x": s["v"], "v": u["f"] - p["k"] * s["x"]}, {"x": None, "v": None},
         [tc.Parameter("k", low=0.0, initial=1.0)], initial={"v": 0.0}, observe=("x",),
     )  # fmt: skip
-    run = tc.Run(time=t, outputs={"x": t.cos()}, inputs={"f": 0 * t}, initial={"x": 1.0} if given else {})
+    run = tc.Run(time=t, outputs={"x": t.cos()}, inputs={"f": t.sin()}, initial={"x": 1.0} if given else {})
     problem = Problem.of(base, tc.Recording(runs=[run], noise=0.1))
     found = types.SimpleNamespace(
         problem=problem, values=torch.ones(len(problem.simulator.names), dtype=F64), warm=None

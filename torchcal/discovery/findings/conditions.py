@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -16,7 +17,11 @@ from torchcal.simulators import Trajectories
 __all__ = ["Option", "bolder", "denser", "simple"]
 
 #: Below which no temperature goes, by unit.
-ABSOLUTE_ZERO = {"degC": -273.15, "°C": -273.15, "degF": -459.67, "°F": -459.67}
+ABSOLUTE_ZERO = {
+    "K": 0.0, "kelvin": 0.0,
+    "degC": -273.15, "°C": -273.15, "celsius": -273.15, "degree_Celsius": -273.15,
+    "degF": -459.67, "°F": -459.67, "fahrenheit": -459.67, "degree_Fahrenheit": -459.67,
+}  # fmt: skip
 #: Multiples of initial states and inputs, those that are bolder, and that of one state alone.
 MULTIPLES, BOLD, ALONE = (2.0, 0.5, 3.0), (5.0,), 3.0
 #: How far beyond its range a condition goes, in the width of that, and how far in a bolder experiment.
@@ -30,6 +35,46 @@ Option = tuple[str, Recording, dict[str, Any]]
 """An experiment in words, a recording of it without data, and its conditions as `Experiment` holds them."""
 
 
+@dataclass(frozen=True)
+class _Begin:
+    """Where the first run begins.
+
+    Attributes:
+        values: Of every state that an experiment may choose.
+        zero: What multiples of it are counted from: 0, of a temperature the lowest in any run.
+        largest: Its value farthest from there in any run.
+        mirrored: Whether all of them may be mirrored.
+    """
+
+    values: dict[str, float]
+    zero: dict[str, float]
+    largest: dict[str, float]
+    mirrored: bool
+
+    @property
+    def moves(self) -> bool:
+        """Whether a multiple of them is another beginning."""
+        return any(value != self.zero[name] for name, value in self.values.items())
+
+    @property
+    def counted(self) -> str:
+        """What multiples are counted from where that is not 0, in words."""
+        return _counted({name: zero for name, zero in self.zero.items() if self.values[name] != zero})
+
+    def times(self, factor: float, names: Iterable[str] | None = None) -> dict[str, float]:
+        """Some multiple of all of them, or of some."""
+        chosen = set(self.values if names is None else names)
+        return {
+            name: self.zero[name] + factor * (value - self.zero[name]) if name in chosen else value
+            for name, value in self.values.items()
+        }
+
+
+def _counted(zero: Mapping[str, float]) -> str:
+    told = [f"{name} counted from {value:.4g}" for name, value in zero.items() if value]
+    return f" ({', '.join(told)})" if told else ""
+
+
 def simple(model: Fitted) -> list[Option]:
     """Experiments close to the recording.
 
@@ -39,15 +84,15 @@ def simple(model: Fitted) -> list[Option]:
     recording = model.problem.recording
     if not model.problem.in_time:
         return _static(recording)
-    begin, _, mirrored = _states(model)
-    ask = _ask(recording, begin)
-    options = [_run(recording, "the first run again" + ask, begin)]
-    options += _elsewhere(recording, begin, (*MULTIPLES, -1.0) if mirrored else MULTIPLES)
+    begin = _states(model)
+    ask = _ask(recording, begin.values)
+    options = [_run(recording, "the first run again" + ask, begin.values)]
+    options += _elsewhere(recording, begin, (*MULTIPLES, -1.0) if begin.mirrored else MULTIPLES)
     options += _stronger(recording, begin, ask, MULTIPLES)
-    options.append(_run(recording, f"a run three times as long as the first{ask}", begin, copies=3))
-    if any(begin.values()):
-        text = "a run that starts from 2 times the initial states and is twice as long"
-        options.append(_run(recording, text, _times(begin, 2.0), copies=2))
+    options.append(_run(recording, f"a run three times as long as the first{ask}", begin.values, copies=3))
+    if begin.moves:
+        text = f"a run that starts from 2 times the initial states{begin.counted} and is twice as long"
+        options.append(_run(recording, text, begin.times(2.0), copies=2))
     return options
 
 
@@ -60,23 +105,25 @@ def bolder(model: Fitted) -> list[Option]:
     recording = model.problem.recording
     if not model.problem.in_time:
         return _static_bolder(recording)
-    begin, largest, _ = _states(model)
-    ask = _ask(recording, begin)
+    begin = _states(model)
+    values, ask = begin.values, _ask(recording, begin.values)
     options = _elsewhere(recording, begin, BOLD)
-    for name, value in begin.items():
-        others = _ask(recording, [one for one in begin if one != name])
-        at_rest = abs(value) <= NOTHING * abs(largest[name])
-        if at_rest and largest[name]:
-            text = f"a run that starts from {name} = {largest[name]:.3g}, all else as in the first{others}"
-            options.append(_run(recording, text, {**begin, name: float(f"{largest[name]:.3g}")}))
-        elif not at_rest and len(begin) > 1:  # of one state alone this is a multiple of all initial states
-            text = f"a run that starts from {ALONE:g} times the initial {name} of the first, all else as there{others}"
-            options.append(_run(recording, text, {**begin, name: ALONE * value}))
+    for name, value in values.items():
+        others = _ask(recording, [one for one in values if one != name])
+        zero, largest = begin.zero[name], begin.largest[name]
+        at_rest = abs(value - zero) <= NOTHING * abs(largest - zero)
+        if at_rest and largest != zero:
+            text = f"a run that starts from {name} = {largest:.3g}, all else as in the first{others}"
+            options.append(_run(recording, text, {**values, name: float(f"{largest:.3g}")}))
+        elif not at_rest and len(values) > 1:  # of one state alone this is a multiple of all initial states
+            initial = f"the initial {name} of the first{_counted({name: zero})}"
+            text = f"a run that starts from {ALONE:g} times {initial}, all else as there{others}"
+            options.append(_run(recording, text, begin.times(ALONE, [name])))
     options += _stronger(recording, begin, ask, BOLD)
     if _runs(recording)[0].inputs:
-        options.append(_run(recording, f"a run with the inputs held at their largest{ask}", begin, change=_steady))
+        options.append(_run(recording, f"a run with the inputs held at their largest{ask}", values, change=_steady))
         for factor, text in ((2.0, "twice as slowly"), (0.5, "twice as fast")):
-            options.append(_run(recording, f"a run with the inputs of the first {text}{ask}", begin, slower=factor))
+            options.append(_run(recording, f"a run with the inputs of the first {text}{ask}", values, slower=factor))
     return options
 
 
@@ -99,20 +146,25 @@ def _runs(recording: Recording) -> tuple[Run, ...]:
     return tuple(recording.runs or ())
 
 
-def _states(model: Fitted) -> tuple[dict[str, float], dict[str, float], bool]:
-    """Of every state that an experiment may choose: where the first run begins, its value of the largest size in any
-    run, and whether all of them may be mirrored."""
+def _states(model: Fitted) -> _Begin:
+    """Of every state that an experiment may choose."""
     bound = model.problem.simulator
     if not isinstance(bound, Trajectories):
-        return {}, {}, False
+        return _Begin({}, {}, {}, False)
     states = bound.solve(model.values[None], model.warm)[0]
     places = {name: i for i, name in enumerate(bound.ode.states) if name not in bound.ode.initial}
     begin = {name: float(states[0, 0, i]) for name, i in places.items()}
     along = {name: states[..., i].flatten() for name, i in places.items()}
-    largest = {name: float(values[int(values.abs().argmax())]) for name, values in along.items()}
+    zero = {name: _zero(values, bound.ode.states[name]) for name, values in along.items()}
+    largest = {name: float(values[int((values - zero[name]).abs().argmax())]) for name, values in along.items()}
     # Only what has had either sign is mirrored: an absolute temperature or an amount cannot be.
     mirrored = bool(along) and all(bool((v < 0).any() and (v > 0).any()) for v in along.values())
-    return begin, largest, mirrored
+    return _Begin(begin, zero, largest, mirrored and not any(zero.values()))
+
+
+def _zero(values: Tensor, unit: str | None) -> float:
+    """What multiples of a quantity are counted from: twice a temperature means nothing, twice a rise of it does."""
+    return float(values.min()) if unit in ABSOLUTE_ZERO else 0.0
 
 
 def _ask(recording: Recording, begin: Iterable[str]) -> str:
@@ -121,36 +173,37 @@ def _ask(recording: Recording, begin: Iterable[str]) -> str:
     return f", with initial {', '.join(unsaid)} known from elsewhere" if unsaid else ""
 
 
-def _times(values: Mapping[str, float], factor: float) -> dict[str, float]:
-    return {name: factor * value for name, value in values.items()}
+def _elsewhere(recording: Recording, begin: _Begin, factors: tuple[float, ...]) -> list[Option]:
+    """Runs from multiples of the initial states; none where these are no others."""
+    text = "a run that starts from {:g} times the initial states of the first" + begin.counted
+    able = factors if begin.moves else ()
+    return [_run(recording, text.format(factor), begin.times(factor)) for factor in able]
 
 
-def _elsewhere(recording: Recording, begin: dict[str, float], factors: tuple[float, ...]) -> list[Option]:
-    """Runs from multiples of the initial states; none where all of these are 0."""
-    text = "a run that starts from {:g} times the initial states of the first"
-    able = factors if any(begin.values()) else ()
-    return [_run(recording, text.format(factor), _times(begin, factor)) for factor in able]
-
-
-def _stronger(recording: Recording, begin: dict[str, float], ask: str, factors: tuple[float, ...]) -> list[Option]:
+def _stronger(recording: Recording, begin: _Begin, ask: str, factors: tuple[float, ...]) -> list[Option]:
     """Runs with inputs of other sizes, and with inputs and initial states of other sizes."""
-    if not _runs(recording)[0].inputs:
+    inputs, units = _runs(recording)[0].inputs, _runs(recording)[0].units
+    zero = {name: _zero(values, units.get(name)) for name, values in inputs.items()}
+    if all(bool((values == zero[name]).all()) for name, values in inputs.items()):
         return []
+
+    def times(factor: float) -> Callable[[str, Tensor], Tensor]:
+        return lambda name, values: zero[name] + factor * (values - zero[name])
+
+    counted = _counted({name: zero[name] for name, values in inputs.items() if bool((values != zero[name]).any())})
     options = [
-        _run(recording, f"a run with {factor:g} times the inputs of the first{ask}", begin, change=_by(factor))
+        _run(recording, f"a run with {factor:g} times the inputs of the first{counted}{ask}", begin.values,
+             change=times(factor))
         for factor in factors
-    ]
-    for factor in factors if any(begin.values()) else ():
-        text = f"a run with {factor:g} times the inputs and initial states of the first"
-        options.append(_run(recording, text, _times(begin, factor), change=_by(factor)))
+    ]  # fmt: skip
+    both = _counted({**zero, **begin.zero})
+    for factor in factors if begin.moves else ():
+        text = f"a run with {factor:g} times the inputs and initial states of the first{both}"
+        options.append(_run(recording, text, begin.times(factor), change=times(factor)))
     return options
 
 
-def _by(factor: float) -> Callable[[Tensor], Tensor]:
-    return lambda values: factor * values
-
-
-def _steady(values: Tensor) -> Tensor:
+def _steady(name: str, values: Tensor) -> Tensor:
     return torch.full_like(values, float(values[int(values.abs().argmax())]))
 
 
@@ -159,7 +212,7 @@ def _run(
     text: str,
     initial: Mapping[str, float],
     *,
-    change: Callable[[Tensor], Tensor] | None = None,
+    change: Callable[[str, Tensor], Tensor] | None = None,
     copies: int = 1,
     slower: float = 1.0,
 ) -> Option:
@@ -169,7 +222,7 @@ def _run(
     step = span / (len(first.time) - 1)
     time = torch.cat([first.time + k * (span + step) for k in range(copies)])
     time = time[0] + slower * (time - time[0])
-    inputs = {k: (values if change is None else change(values)).repeat(copies) for k, values in first.inputs.items()}
+    inputs = {k: (values if change is None else change(k, values)).repeat(copies) for k, values in first.inputs.items()}
     conditions = {"time": time, "initial": dict(initial), "inputs": inputs}
     return text, Recording(runs=[_blank_run(recording, conditions)]), conditions
 
