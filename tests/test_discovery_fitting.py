@@ -422,3 +422,48 @@ def test_unknown_velocities_under_much_noise(star, seed):
     recording = tc.Recording(runs=[tc.Run(time=t, outputs={"x": noisy[0], "y": noisy[1]})], noise=0.07)
     base, _ = calibrate_base(Problem.of(star, recording), {}, 12, 0)
     assert base.chi2 < 308 + 5 * math.sqrt(2 * 308)
+
+
+def valley(steep):
+    """A bent valley, (1 − a)² + steep² (b − a²)², at its far end."""
+
+    def bent(x, p):
+        return torch.where(x < 1, steep * (p["b"] - p["a"] ** 2), torch.where(x < 2, 1 - p["a"], 0 * x))
+
+    x = torch.arange(4.0, dtype=F64)
+    return Problem.of(
+        tc.Simulator(bent, [tc.Parameter("a"), tc.Parameter("b")]), tc.Recording(x=x, y=0 * x, noise=1.0)
+    )
+
+
+@pytest.fixture
+def linearised(monkeypatch):
+    """How often slopes were worked out, in a list of one."""
+    count, plain = [0], Problem.evaluate
+
+    def counted(self, values, free, *args, **options):
+        count[0] += bool(free)
+        return plain(self, values, free, *args, **options)
+
+    monkeypatch.setattr(Problem, "evaluate", counted)
+    return count
+
+
+def test_a_step_that_bends_with_its_valley_is_taken_less_often(linearised):
+    problem, taken = valley(1000.0), []
+    for bend in (False, True):
+        linearised[0] = 0
+        found = fit(problem, white(problem, 1.0), torch.tensor([[-1.2, 1.0]], dtype=F64), [0, 1], max_steps=600,
+                    finish=0, bend=bend)  # fmt: skip
+        assert found.values.tolist() == pytest.approx([1.0, 1.0], abs=1e-6)
+        taken.append(linearised[0])
+    assert 2.5 * taken[1] < taken[0]
+
+
+@pytest.mark.parametrize(("aim", "early"), [(np.inf, False), (40.0, False), (1.0, True)])
+def test_a_fit_ends_early_where_its_pace_does_not_lead_to_where_it_is_wanted(linearised, aim, early):
+    problem = valley(10000.0)
+    found = fit(problem, white(problem, 1.0), torch.tensor([[-6.0, 36.001]], dtype=F64), [0, 1], max_steps=60,
+                finish=40, aim=aim)  # fmt: skip
+    assert (found.chi2 > 45.0) is early
+    assert (linearised[0] < 30) is early

@@ -1,6 +1,7 @@
 """Refits of many hypotheses, here or on the workers of an executor."""
 
 import dataclasses
+import math
 import pickle
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
@@ -29,6 +30,7 @@ class Refit:
         free: Places of what is fitted.
         shape: Those of the terms' shapes among them, held at first: while an amplitude is small they mean nothing.
         warm: Warm start, or None.
+        aim: χ² above which its end does not matter.
     """
 
     problem: Problem
@@ -37,6 +39,7 @@ class Refit:
     free: list[int]
     shape: list[int]
     warm: Solution | None
+    aim: float = math.inf
 
     def run(self) -> Fitted | None:
         """The fit; None where no start gives one."""
@@ -48,7 +51,7 @@ class Refit:
                 return None
             begin = first.ends[first.ends_chi2.argsort()[:2]]
             warm = None if first.warm is None else first.warm.repeated(len(begin))
-        return fit(self.problem, self.whitening, begin, self.free, warm=warm)
+        return fit(self.problem, self.whitening, begin, self.free, warm=warm, aim=self.aim)
 
 
 def refit_all(

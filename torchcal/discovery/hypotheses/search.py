@@ -38,7 +38,8 @@ WORTH, NEAR, ROUNDS = 3.0, 20.0, 3
 ASTRAY = 1.0
 #: Log evidence by which something unknown must explain the base's residual better than any noise, to be there.
 CLEARLY = 5.0
-#: Share of the best log evidence below which a model is not fitted again when the noise estimate has changed.
+#: Share of the best log evidence below which a model is not fitted again when the noise estimate has changed, nor on to
+#: its end where it falls slowly.
 HOPELESS = 0.5
 #: Log weight that a term's refit from another start must gain to take the place of the first.
 BETTER = 1.0
@@ -266,7 +267,7 @@ class Search:
             warm = candidate.problem.guess(self.base.warm, begin)
             shape = [i for i in candidate.own if i not in candidate.amplitudes]
             whitening = self.noise.whitening(candidate.problem)
-            jobs.append(Refit(candidate.problem, whitening, begin, candidate.free, shape, warm))
+            jobs.append(Refit(candidate.problem, whitening, begin, candidate.free, shape, warm, self._aim()))
         names = [" + ".join(term.name for term in one.candidate.terms) for one in wanted]
 
         def take(index: int, fitted: Fitted | None) -> None:
@@ -276,6 +277,11 @@ class Search:
         with self.stop.refitting():
             refit_all(jobs, take, self.executor)
         return found
+
+    def _aim(self) -> float:
+        """χ² above which a model plays no part beside what was found so far."""
+        best = max((self.gain(model.found.chi2) for model in self.models), default=0.0)
+        return math.inf if self.exact or best <= 0 else self.base.chi2 - 2 * (HOPELESS * best - NEAR)
 
     def _settled(self, found: Fitted) -> Fitted:
         """A fit with time steps that are short enough for it: what a term brings may be faster than the base."""
