@@ -19,7 +19,7 @@ from torchcal.discovery.fits import local
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.misfit.channels import Channel
 from torchcal.discovery.misfit.places import Place
-from torchcal.discovery.records import Estimate, Experiment, Hypothesis, Limit, Location, Table
+from torchcal.discovery.records import Estimate, Experiment, Hypothesis, Limit, Location, MissingRate, Table
 from torchcal.discovery.verdicts import doubts, explain
 from torchcal.report import diagnosis_page
 
@@ -475,7 +475,7 @@ def test_two_terms_that_do_much_the_same_may_stand_for_one_law(second, told):
         ),
         candidate=SimpleNamespace(terms=terms, own=[1, 2], amplitudes=[1, 2], neutral=torch.zeros(2, dtype=F64)),
     )  # fmt: skip
-    rows = explain._one_law(model)
+    rows = explain.one_law(model)
     assert [row.startswith("one and two do much the same here (correlation 0.9") for row in rows] == [True] * told
 
 
@@ -616,3 +616,45 @@ def test_candidates_that_are_nearly_the_same_are_told_in_groups():
     d = tc.diagnose(base, tc.Recording(x=x, y=1 + 0.1 * x**2 + wobble, noise=0.01), candidates, progress=False)
     (row,) = [row for row in d.identifiability if "nearly the same" in row]
     assert row.startswith("two, more and most are nearly the same here (correlation from 0.99")
+
+
+@pytest.mark.parametrize(
+    ("rates", "told"),
+    [((0.30, 0.31, 0.29), "is the same in every run: one constant change there removes 50 %"),
+     ((0.30, 0.10, 0.29), "differs from run to run"), ((0.001, -0.002, 0.0), "differs from run to run")],
+)  # fmt: skip
+def test_one_change_for_all_runs_does_not_differ_from_run_to_run(rates, told):
+    place = Location("equation", "w", "run", ((0.0, 2.0),), 0.5, 20.0)
+    runs = torch.tensor([0.0, 0.0, 1.0, 1.0, 2.0], dtype=F64)
+    rate = torch.tensor(rates, dtype=F64)[runs.long()]
+    missing = MissingRate("equation", "w", "run", runs, rate, torch.full_like(rate, 0.01), None, runs, rate)
+    text = where_in_words(finding("unexplained", where=[place], missing=missing))
+    assert f"The mismatch sits in the equation w and {told}" in text
+    assert ("What differs between the runs" in text) is ("differs" in told)
+    assert "What differs" not in where_in_words(finding("ambiguous", tied=[["drag"]], where=[place], missing=missing))
+
+
+def test_a_best_term_that_removes_nothing_is_not_told():
+    rows = [row(("drag",), 0.1, misfit_removed=0.0), row(words.NONE, 0.9)]
+    assert "The best of the library" not in said(finding("unexplained", ranking=rows))
+    rows = [row(("drag",), 0.1, misfit_removed=0.5), row(words.NONE, 0.9)]
+    assert "The best of the library, drag, removes 50 %" in said(finding("unexplained", ranking=rows))
+
+
+def test_another_name_of_a_term_in_a_window_is_told_with_the_window():
+    x = torch.linspace(0, 10, 80, dtype=F64)
+    wobble = 0.05 * torch.randn(80, generator=torch.Generator().manual_seed(1), dtype=F64)
+    base = tc.Simulator(lambda x, p: p["a"] * torch.exp(-p["k"] * x), [tc.Parameter("a", initial=1.0),
+                                                                     tc.Parameter("k", initial=0.3)])  # fmt: skip
+    y = 2 * torch.exp(-0.3 * x) + torch.where(x > 6, 0.1 * x, 0 * x) + wobble
+    one, other = (
+        tc.Term(name, outputs={"y": lambda x, p, y, b=b: y + p[b] * x}, parameters=[tc.Parameter(b)])
+        for name, b in (("slope", "b"), ("drift", "d"))
+    )
+    d = tc.diagnose(base, tc.Recording(x=x, y=y, noise=0.05), [one, other], progress=False)
+    assert ["slope"] in d.tied
+    assert ["drift"] in d.tied
+    regions = {r.terms[0]: (r.region, r.probability) for r in reversed(d.ranking) if r.region}
+    assert regions["slope"] == regions["drift"]
+    assert f"drift where {regions['drift'][0]}" in " ".join(str(d).split())
+    assert sum(r.probability for r in d.ranking) == pytest.approx(1.0)

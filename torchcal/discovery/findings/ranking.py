@@ -1,5 +1,6 @@
 """The ranking of a diagnosis: every hypothesis with its probability, what it explains and what it leaves."""
 
+import dataclasses
 import math
 
 from torch import Tensor
@@ -9,7 +10,7 @@ from torchcal.discovery.hypotheses.model import PRIOR, Model
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.records import Hypothesis, Table
 from torchcal.discovery.verdicts import explain
-from torchcal.discovery.verdicts.decision import Decision
+from torchcal.discovery.verdicts.decision import Decision, other_names
 from torchcal.display import NONE
 
 __all__ = ["ranking"]
@@ -38,9 +39,13 @@ def ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[Hy
     rows: list[Hypothesis] = []
     alike: dict[int, tuple[Model, float]] = {}
     for place, model in enumerate(listed):
-        others = search.aliases.get(model.numbers[0], []) if model in search.plain.values() else []
+        others = _others(search, decision, model)
         share = decision.probability.get(id(model), 0.0) / (1 + len(others))  # nothing tells which of them it is
-        alike |= {j: (model, share) for j in others}
+        if model.window is None:
+            alike |= {j: (model, share) for j in others}
+        else:
+            rows += [dataclasses.replace(_alias(search, j, model, share), estimates=(), refitted=False,
+                                         region=model.where) for j in others]  # fmt: skip
         scored = model is decision.best or (place < SCORED and share > PROBABLE)
         rows.append(_refitted(search, model, share, others, _held_out(search, model, mask) if scored else None))
     fitted = {m.numbers for m in search.models}
@@ -58,6 +63,14 @@ def ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[Hy
         rows.append(Hypothesis(NONE, evidence, decision.none, note=decision.none_note))
     rows.sort(key=lambda row: (-row.probability, -row.log_evidence))
     return Table(rows, COLUMNS)
+
+
+def _others(search: Search, decision: Decision, model: Model) -> list[int]:
+    """Numbers of the candidates that a model could as well be called after, in its window too where that is tied."""
+    if model in search.plain.values():
+        return search.aliases.get(model.numbers[0], [])
+    local = model.window is not None and len(model.numbers) == 1 and model in decision.tied_models
+    return [number for number, _, _ in other_names(search, model)] if local else []
 
 
 def _held_out(search: Search, model: Model, mask: Tensor | None) -> float | None:

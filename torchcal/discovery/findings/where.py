@@ -76,7 +76,7 @@ def locate(search: Search, best: Model | None, *, named: bool = False) -> Table[
         low = w.low if math.isfinite(w.low) else float(drivers.min())
         high = w.high if math.isfinite(w.high) else float(drivers.max())
         kind, target = _acts_on(local)
-        share, evidence, extent = removed(search, local), local.log_evidence, _extent(drivers)
+        share, evidence, extent = removed(search, local), _evidence(search, local), _extent(drivers)
         rows.append(Location(kind, target, w.driver, ((low, high),), share, evidence, extent=extent))
     sensor = best is not None and _acts_on(best)[0] == "output"  # then it has been shown to be the output
     places = [
@@ -174,8 +174,13 @@ def _contributed(search: Search, model: Model, drivers: Sequence[str]) -> Locati
     values, which = at_data[driver].unique(return_inverse=True)
     largest = torch.zeros_like(values).scatter_reduce(0, which, size.to(values), "amax")
     kind, target = _acts_on(model)
-    spans, share, evidence = _ranges(values, largest), removed(search, model), model.log_evidence
+    spans, share, evidence = _ranges(values, largest), removed(search, model), _evidence(search, model)
     return Location(kind, target, driver, spans, share, evidence, extent=_extent(values))
+
+
+def _evidence(search: Search, model: Model) -> float:
+    """Log evidence of a model under the noise in use, as that of a place is."""
+    return search.gain(model.found.chi2) + model.price
 
 
 def _acts_on(model: Model) -> tuple[str, str]:

@@ -13,6 +13,8 @@ __all__ = ["share_in_words", "where_in_words"]
 CLOSE = 3.0
 #: Share of a driver's range from which on spans say nothing.
 EVERYWHERE = 0.9
+#: Sd up to which the changes of all runs are one, and from which on that is none of 0.
+SAME = 2.0
 
 
 def share_in_words(share: float) -> str:
@@ -28,9 +30,14 @@ def where_in_words(d: Any) -> str:
     spans = ", ".join(between(place.spans[:3], "to", place.extent))
     everywhere = _everywhere(d, place)
     if place.driver == RUN:
+        if _alike(d, place):
+            return (
+                f"The mismatch sits in the {place.kind} {place.target} and is the same in every run: one constant "
+                f"change there {_does(place)}.{_embedded(d)}"
+            )
         largest = "" if everywhere else f" (largest in {spans}, counted from 0)"
-        advice = "" if d.terms else " What differs between the runs and was not recorded looks like this."
-        if not d.terms and place.kind == "parameter":
+        advice = "" if d.terms or d.tied else " What differs between the runs and was not recorded looks like this."
+        if advice and place.kind == "parameter":
             advice = " With per_run=True that parameter would take it up."
         return (
             f"The mismatch sits in the {place.kind} {place.target} and differs from run to run{largest}: one change "
@@ -46,6 +53,18 @@ def where_in_words(d: Any) -> str:
         f"The mismatch sits in the {place.kind} {place.target} and varies with {place.driver}{largest}: a smooth "
         f"change there {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
     )
+
+
+def _alike(d: Any, place: Any) -> bool:
+    """Whether a change for each run is one for all of them, within its sd, as far as it was estimated."""
+    m = d.missing
+    if m is None or (m.kind, m.target, m.driver) != (place.kind, place.target, RUN):
+        return False
+    _, which = m.values.unique(return_inverse=True)
+    first = [int((which == k).nonzero()[0]) for k in range(int(which.max()) + 1)]
+    rate, weight = m.rate[first], m.sd[first].clamp_min(1e-300).square().reciprocal()
+    mean = (weight * rate).sum() / weight.sum()
+    return bool(((rate - mean).abs() <= SAME * m.sd[first]).all() and (mean.abs() > SAME * m.sd[first]).all())
 
 
 def _does(place: Any) -> str:

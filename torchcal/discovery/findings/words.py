@@ -97,7 +97,7 @@ def _hypothesis(d: Any, terms: Sequence[str]) -> str:
         return "something that is not in this library"
     if not terms:
         return "the base alone"
-    rows = [row for row in d.ranking if row.refitted and set(row.terms) == set(terms)]
+    rows = [row for row in d.ranking if (row.refitted or row.region) and set(row.terms) == set(terms)]
     best = max(rows, key=lambda row: row.probability, default=None)
     return " with ".join(terms) + (f" where {best.region}" if best is not None and best.region else "")
 
@@ -409,7 +409,7 @@ def _would_tell(d: Any, terms: Sequence[str]) -> str:
 def _unexplained(d: Any) -> list[str]:
     parts = [where_in_words(d)]
     best = next((row for row in d.ranking if row.terms and row.refitted), None)
-    if best is not None:
+    if best is not None and not best.misfit_removed < LITTLE:
         parts.append(
             f"The best of the library, {_hypothesis(d, best.terms)}, removes "
             f"{share_in_words(min(best.misfit_removed, NEARLY_ALL))} of the misfit beyond noise{_no_name(d, best)}."

@@ -16,6 +16,7 @@ from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.verdicts.explain import misfit_size, stated_sd
 from torchcal.discovery.verdicts.given import as_good
 from torchcal.discovery.verdicts.instruments import no_instrument, unnatural
+from torchcal.discovery.verdicts.together import only_together
 from torchcal.errors import TorchcalError
 from torchcal.simulators import Trajectories
 from torchcal.terms import Term
@@ -44,29 +45,14 @@ FREE = 2
 WRONG_WAY, MORE = 2.0, 1 / 3
 #: Log odds against a nameless change from which on a term in a window is there for its own shape.
 CLEARLY = 3.0
-#: Share of the squared misfit that two terms leave at most, where few data show them together alone.
-NEXT_TO_NOTHING = 1e-3
 #: Share of the largest effect of the base's parameters below which a direction of them moves no datum.
 UNSEEN = 1e-7
 
 
 def doubt(search: Search, model: Model) -> str:
     """Why a model is no name, however probable, in a sentence; empty if it may be one."""
-    found = _no_better(search, model) or unfit(search, model) or by_hold(search, model) or _pair_of_many(search, model)
+    found = _no_better(search, model) or unfit(search, model) or by_hold(search, model) or only_together(search, model)
     return found or ("" if search.exact else _noise_or_physics(search, model))
-
-
-def _pair_of_many(search: Search, model: Model) -> str:
-    """Why terms that show together alone, in few data, are no name unless they leave next to nothing."""
-    if not search.paired:
-        return ""
-    left, whole = (float(found.residual.square().sum()) for found in (model.found, search.base))
-    if left <= NEXT_TO_NOTHING * whole:
-        return ""
-    return (
-        "So few data with noise of unknown size show it by two terms together alone, as two others may do: more data, "
-        "replicates or a known noise sd would tell."
-    )
 
 
 def unfit(search: Search, model: Model) -> str:

@@ -21,6 +21,7 @@ __all__ = [
     "fit_record",
     "identifiability",
     "misfit_size",
+    "one_law",
     "other_minima",
     "removed",
     "stated_sd",
@@ -162,7 +163,7 @@ def identifiability(search: Search, best: Model | None) -> list[str]:
             own = best is not None and best.window is not None and i in best.numbers
             everywhere = ", where it acts everywhere," if own else ""
             rows.append(f"{candidate.name}{everywhere} cannot be told from the parameters of the base")
-    return [*([] if best is None else _one_law(best)), *rows, *_nearly_the_same(search)][:12]
+    return [*([] if best is None else one_law(best)), *rows, *_nearly_the_same(search)][:12]
 
 
 def _nearly_the_same(search: Search) -> list[str]:
@@ -196,7 +197,7 @@ def _alike(search: Search, i: int, j: int) -> float:
     return c * math.prod(sides) if all(sides) else abs(c)
 
 
-def _one_law(model: Model) -> list[str]:
+def one_law(model: Model) -> list[str]:
     """Pairs of accepted terms that do nearly the same to the data: a law between them looks like their sum."""
     found, candidate = model.found, model.candidate
     names = [q.name for q in found.problem.parameters]

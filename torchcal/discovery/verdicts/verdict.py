@@ -17,6 +17,7 @@ from torchcal.discovery.verdicts.decision import Decision, certain, groups_of, o
 from torchcal.discovery.verdicts.doubts import by_hold, doubt, unfit
 from torchcal.discovery.verdicts.instruments import no_instrument, only_instruments
 from torchcal.discovery.verdicts.proof import prove
+from torchcal.discovery.verdicts.together import only_together
 from torchcal.display import NONE
 
 __all__ = ["base_alone", "decide"]
@@ -180,7 +181,7 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     rival = any(m.weight > best.weight - BEHIND for m in search.nameless)
     local = rival and all(model.window is not None for model in decision.tied_models)
     told = decision.tied_models[0] if decision.tied_models else best
-    decision.doubt = unfit(search, told) or by_hold(search, told)
+    decision.doubt = unfit(search, told) or by_hold(search, told) or only_together(search, told)
     # Windows, instruments and several terms, of which they share none, bend to what no term of the list explains.
     shared = set(best.names).intersection(*(m.names for m in decision.tied_models))
     pliant = all(
@@ -261,6 +262,11 @@ def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) 
     shown = best if alone else _wherever(search, best)
     decision.doubt = doubt(search, shown)
     if not alone:
+        decision.doubt = decision.doubt or only_together(search, max(holding, key=lambda m: m.weight))
+        if not decision.doubt and search.examine(shown).p_value < PLAINLY_WHITE:
+            decision.doubt = (
+                "It is not enough, and what acts beside it is not told: something else may do what both do."
+            )
         _tie_larger(search, decision, holding, sure)
     if sure < SURE or decision.doubt or not shown.physical:
         decision.verdict = "ambiguous"
