@@ -40,6 +40,8 @@ FEW_DATA = 0.1
 #: Times the level up to which a misfit that noise alone gives counts as more than that where the base, beside the
 #: refitted candidates, is as improbable as the level: a statistic for all kinds of misfit sees each kind less well.
 OFTEN = 5.0
+#: Log odds by which outliers may fall short of models, with those of all data, for a search without them to begin.
+SHORT = 20.0
 #: Probability of the base beside the refitted candidates below which there is more than noise, whatever is left looks
 #: like: noise that grows with the value can take up what a term explains far better.
 HOPELESS = 1e-6
@@ -68,10 +70,21 @@ def _without_isolated(
     if apart is None or float(kept.sum()) < (1 - MOST) * observed.n:
         return search, detected
     fewer = _of(search, observed.keeping(kept))
+    if not _may_be_alone(fewer, search, confidence):
+        return search, detected
     still = _refit(fewer, confidence)
     if not search.stop.is_set() and outliers_alone(fewer, search, still):
         return fewer, still
     return search, detected
+
+
+def _may_be_alone(fewer: Search, search: Search, confidence: float) -> bool:
+    """Whether outliers are nearly as likely a reason, as far as the models of one search, fitted to the other, tell."""
+    known = dataclasses.replace(fewer)
+    known.base, known.noise, known.tangents, known.models = fewer.base, fewer.noise, fewer.tangents, []
+    known.screen_all()
+    known.take_over(search.models)
+    return search.stop.is_set() or outliers_alone(known, search, known.p_detect < 1.0 - confidence, short=SHORT)
 
 
 def _again(search: Search, observed: Problem, detected: bool, confidence: float) -> tuple[Search, bool]:

@@ -267,19 +267,20 @@ def _likeliest(search: "Search", detected: bool) -> float:
     return value if best is None else max(value, _density(search, best.found) + best.prior)
 
 
-def outliers_alone(fewer: "Search", search: "Search", detected: bool) -> bool:
+def outliers_alone(fewer: "Search", search: "Search", detected: bool, *, short: float = 0.0) -> bool:
     """Whether outliers are a likelier reason for what a search has detected than its models or something unknown.
 
     Args:
         fewer: The search without the supposed outliers.
         search: That with them.
         detected: Whether ``fewer`` has more than noise.
+        short: Log odds by which they may fall short of that.
     """
     known, best = _likeliest(fewer, detected), search.physical_leader
     unknown = [_density(search, search.base) + _unknown(search, search.base)]
     if best is not None:
         unknown.append(_density(search, best.found) + best.prior + _unknown(search, best.found))
-    return max(max(unknown) + math.log(PRIOR["none"]) - known, outdone(fewer, search, detected)[0]) < 0
+    return max(max(unknown) + math.log(PRIOR["none"]) - known, outdone(fewer, search, detected)[0]) < short
 
 
 def _unknown(search: "Search", found: Fitted) -> float:
