@@ -1,6 +1,7 @@
 """Simulators: parameters, models written in torch, external codes, polynomial surrogates."""
 
 from torchcal.simulators.build import build_surrogate
+from torchcal.simulators.careful import careful
 from torchcal.simulators.design import Evaluations
 from torchcal.simulators.external import ExternalSimulator
 from torchcal.simulators.held_out import HeldOutError
@@ -38,6 +39,7 @@ __all__ = [
     "Values",
     "asks_for_numbers",
     "build_surrogate",
+    "careful",
     "check_parameters",
     "check_slopes",
     "focused",

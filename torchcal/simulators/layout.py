@@ -10,6 +10,7 @@ from torch import Tensor
 from torchcal.data import Recording, Run
 from torchcal.display import raised
 from torchcal.errors import RecordingError, SimulatorError
+from torchcal.simulators.careful import careful
 from torchcal.simulators.parameter import Parameter, in_run
 
 if TYPE_CHECKING:
@@ -63,6 +64,7 @@ class Layout:
 
     def __init__(self, ode: "ODESimulator", recording: Recording, runs: Sequence[Run]) -> None:
         self._states = tuple(ode.states)
+        self._seen = ode.seen
         start = [float(run.time[0]) for run in runs]
         self._first = min(start)
         self._start = torch.tensor(start, dtype=torch.float64) if max(start) > self._first else None
@@ -185,7 +187,10 @@ class Layout:
                     if isinstance(value, str):
                         entries[state] = entries[value]
                     elif callable(value):
-                        entries[state] = value(entries, own) + torch.zeros_like(values[..., :1])
+                        found = careful(self._seen, f"the initial value of {state!r}", value, s=entries, p=own)
+                        entries[state] = found + torch.zeros_like(values[..., :1])
+                except SimulatorError:
+                    raise
                 except Exception as error:
                     raise SimulatorError(
                         f"Expected the initial value of {state!r} from those of {list(entries)}, which are known by "

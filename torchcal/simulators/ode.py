@@ -73,6 +73,7 @@ class ODESimulator(Simulator):
         self.states: dict[str, str | None] = dict(states) if isinstance(states, Mapping) else dict.fromkeys(states)
         self.parameters = check_parameters(parameters)
         self.degree = None
+        self.seen = set()
         self.initial = dict(initial or {})
         self.max_step = max_step
         self.stiff = stiff

@@ -14,6 +14,7 @@ from torchcal.checks import whole
 from torchcal.data import Recording
 from torchcal.display import raised
 from torchcal.errors import DomainError, ShapeError, SimulatorError
+from torchcal.simulators.careful import careful
 from torchcal.simulators.dual import Still, still
 from torchcal.simulators.parameter import Parameter, spans
 from torchcal.simulators.solution import Solution
@@ -76,7 +77,8 @@ class Simulator:
 
     The function is called as ``function(x, p)``. ``x`` is a tensor ``(n,)``, or a dict of them where there are
     several conditions; ``p[name]`` has shape ``(*batch, 1)``. Elementwise code is therefore batched code. It
-    returns a tensor ``(*batch, n)``, or a dict of them where there are several outputs.
+    returns a tensor ``(*batch, n)``, or a dict of them where there are several outputs, and leaves the tensors that it
+    is given as they are.
 
     Args:
         function: ``function(x, p)``.
@@ -110,6 +112,7 @@ class Simulator:
         self.function = function
         self.parameters = check_parameters(parameters)
         self.degree = None if degree is None else whole("degree", degree, 0, also="or None")
+        self.seen: set[int] = set()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -131,12 +134,14 @@ class Simulator:
             ``(*batch, n_outputs * n)`` with one output after another.
         """
         n = _length(x)
+        # A copy: whatever the function does, the recording stays as it is.
+        x = {name: value.clone() for name, value in x.items()} if isinstance(x, Mapping) else x.clone()
 
         def evaluate(values: Tensor) -> Tensor:
             check_values(values, self.names)
             p = {name: values[..., i : i + 1] for i, name in enumerate(self.names)}
             try:
-                result = self.function(x, p)
+                result = careful(self.seen, "the simulator", self.function, x=x, p=p)
             except SimulatorError:
                 raise
             except Exception as error:

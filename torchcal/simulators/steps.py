@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchcal.display import raised
 from torchcal.errors import SimulatorError
+from torchcal.simulators.careful import careful
 from torchcal.simulators.grid import Grid
 from torchcal.simulators.layout import Layout, Values
 from torchcal.simulators.parameter import spans
@@ -58,7 +59,7 @@ class Steps:
         names = tuple(self.ode.states)
         named = {name: s[..., i] for i, name in enumerate(names)}
         try:
-            rates = self.ode.rates(t, named, p, u)
+            rates = careful(self.ode.seen, "rates(t, s, p, u)", self.ode.rates, t=t, s=named, p=p.copy(), u=u)
         except SimulatorError:
             raise
         except Exception as error:

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchcal.data import Recording
 from torchcal.display import raised
 from torchcal.errors import DomainError, RecordingError, SimulatorError
+from torchcal.simulators.careful import careful
 from torchcal.simulators.grid import Grid
 from torchcal.simulators.implicit import ImplicitSteps
 from torchcal.simulators.layout import Layout
@@ -290,7 +291,15 @@ class Trajectories(Simulator):
         parts = []
         for name in outputs:
             try:
-                value = self.ode.observe[name](self.grid.sample_t, s, p, self.grid.sample_u)
+                value = careful(
+                    self.ode.seen,
+                    f"the function of the output {name!r}",
+                    self.ode.observe[name],
+                    t=self.grid.sample_t,
+                    s=s,
+                    p=p.copy(),
+                    u=self.grid.sample_u,
+                )
             except SimulatorError:
                 raise
             except Exception as error:

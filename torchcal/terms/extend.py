@@ -108,11 +108,10 @@ def _extend_ode(simulator: ODESimulator, terms: Sequence[Term]) -> ODESimulator:
 
     def rates(t: Any, s: dict[str, Tensor], p: dict[str, Tensor], u: dict[str, Tensor]) -> dict[str, Any]:
         p = shifted(t, s, p, u)
-        found = dict(plain.rates(t, s, p, u))
+        found = dict(plain.rates(t, dict(s), p.copy(), dict(u)))
         for term in every:
-            own = term.own(p)
             for state, function in term.rates.items():
-                value = term.call(function, t, s, own, u)
+                value = term.call(function, t, s, term.own(p), u)
                 found[state] = value if state in term.states else found[state] + value
         return found
 
@@ -142,7 +141,7 @@ def _initial_of(term: Term, value: Any) -> Any:
 def _sensed(name: str, function: Function, sensors: Sequence[Term], shifted: Function) -> Function:
     def observe(t: Any, s: dict[str, Tensor], p: dict[str, Tensor], u: dict[str, Tensor]) -> Any:
         p = shifted(t, s, p, u)
-        y = function(t, s, p, u)
+        y = function(t, dict(s), p.copy(), dict(u))
         for term in sensors:
             y = term.call(term.outputs[name], t, s, term.own(p), u, y)
         return y

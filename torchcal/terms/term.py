@@ -16,6 +16,7 @@ from torchcal.simulators import (
     Parameter,
     Values,
     asks_for_numbers,
+    careful,
     is_value_of,
 )
 
@@ -101,6 +102,7 @@ class Term:
     elapsed: str | None = None
     takes: str | None = None
     expected: dict[str, tuple[float, float]] = field(default_factory=dict)
+    seen: set[int] = field(init=False, default_factory=set)
 
     def __init__(
         self,
@@ -205,6 +207,7 @@ class Term:
         put(self, "scales", dict(scales or {}))
         put(self, "elapsed", elapsed)
         put(self, "takes", takes)
+        put(self, "seen", set())
         put(self, "expected", {key: (float(value), float(sd)) for key, (value, sd) in (expected or {}).items()})
 
     def __repr__(self) -> str:
@@ -248,7 +251,10 @@ class Term:
             t, s, p, *more = given
             given = (t - self.began(p), s, p, *more)
         try:
-            result = function(*given)
+            letters = ("t", "s", "p", "u", "y") if len(given) > 3 else ("x", "p", "y")
+            result = careful(
+                self.seen, f"the term {self.name!r}", function, **dict(zip(letters, given, strict=False))
+            )
         except TorchcalError:
             raise
         except Exception as error:

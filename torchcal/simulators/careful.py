@@ -1,0 +1,76 @@
+"""Calls of functions that users write, which are to leave what they are given as it is."""
+
+import copy
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchcal.errors import SimulatorError
+from torchcal.simulators.dual import transformed
+
+__all__ = ["careful"]
+
+
+def careful(seen: set[int], what: str, function: Callable[..., Any], **given: Any) -> Any:
+    """``function(*given)``; the first time on copies, to see that it changes none of them in place.
+
+    Plain dicts are always copies: what a function puts into one is its own.
+
+    Args:
+        seen: Of a simulator or term, those of its functions that have been called before.
+        what: Whose function it is, in words.
+        function: It.
+        given: Its arguments, by their usual letters.
+
+    Raises:
+        SimulatorError: If it changed one in place.
+    """
+    if id(function) in seen:
+        return function(*(dict(value) if type(value) is dict else value for value in given.values()))
+    copies = {letter: _copied(value) for letter, value in given.items()}
+    # What it puts into a dict is not to hide what it has changed there.
+    result = function(*(copy.copy(value) if isinstance(value, dict) else value for value in copies.values()))
+    changed = [
+        name
+        for letter, value in given.items()
+        for (name, before), after in zip(_named(letter, value), _named(letter, copies[letter]), strict=True)
+        if _is_changed(before, after[1])
+    ]
+    if changed:
+        raise SimulatorError(
+            f"Expected {what} to leave what it is given as it is. Got {', '.join(changed)} changed in place, as by += "
+            f"or clamp_(). Work on a copy, {changed[0]}.clone(), or write x = x + 1 for x += 1 and x.clamp() for "
+            "x.clamp_()."
+        )
+    seen.add(id(function))
+    return result
+
+
+def _copied(value: Any) -> Any:
+    if isinstance(value, Tensor):
+        return value.clone()
+    if not isinstance(value, dict):
+        return value
+    twin = copy.copy(value)
+    for name, one in value.items():
+        twin[name] = _copied(one)
+    return twin
+
+
+def _named(letter: str, value: Any) -> list[tuple[str, Any]]:
+    if isinstance(value, Mapping):
+        return [(f"{letter}[{name!r}]", one) for name, one in value.items()]
+    return [(letter, value)]
+
+
+def _is_changed(before: Any, after: Any) -> bool:
+    if not isinstance(before, Tensor):
+        return False
+    if not after.is_inference() and after._version > 0:
+        return True
+    if transformed(before) or before.shape != after.shape:
+        return before.shape != after.shape
+    with torch.no_grad():  # arrays of NumPy's on the same memory leave no trace but their numbers
+        return not bool(((before == after) | (before != before)).all())
