@@ -97,7 +97,11 @@ def test_zero_noise_is_told_how_to_say_that_there_is_none():
         pytest.param(lambda: tc.likelihoods.ABC(epsilon=-0.1), DomainError, id="negative epsilon"),
         pytest.param(lambda: tc.likelihoods.ABC(epsilon=0.1, gamma=0.0), DomainError, id="zero gamma"),
         pytest.param(lambda: tc.likelihoods.ABC(epsilon=0.1, gamma=-1.0), DomainError, id="negative gamma"),
+        pytest.param(lambda: tc.likelihoods.ABC(epsilon=0.1, gamma=torch.ones(3)), DomainError, id="gammas"),
         pytest.param(lambda: tc.likelihoods.ABCMean(epsilon=math.nan), DomainError, id="nan epsilon"),
+        pytest.param(lambda: tc.likelihoods.Marginal(bandwidth=torch.ones(3)), DomainError, id="bandwidths"),
+        pytest.param(lambda: tc.likelihoods.Marginal(floor=-1.0), DomainError, id="negative floor"),
+        pytest.param(lambda: tc.likelihoods.Full(floor="small"), DomainError, id="floor in words"),
     ],
 )
 def test_pieces(make, error):
@@ -204,6 +208,7 @@ EXACT_Y = 1 + 2 * X
         pytest.param({"order": 0}, DomainError, id="order 0"),
         pytest.param({"rule": "gauss"}, DomainError, id="rule in words"),
         pytest.param({"likelihood": tc.likelihoods.ABC(epsilon=torch.ones(3))}, TorchcalError, id="epsilon"),
+        pytest.param({"likelihood": tc.likelihoods.Marginal(floor=torch.ones(3))}, DomainError, id="floor"),
         pytest.param({"prior": lambda module: "flat"}, DomainError, id="prior of the wrong kind"),
         pytest.param({"starts": torch.zeros(3, 4)}, ShapeError, id="shape of starts"),
         pytest.param({"calibrate": tc.calibrate_additive, "x": X[:2], "y": Y[:2]}, ImproperPosteriorError, id="N = d"),
@@ -238,8 +243,17 @@ def test_options_that_fall_through(options):
 def test_a_prior_that_is_already_made_is_refused():
     """`prior=Flat(propagate)` for `prior=Flat` is an easy mistake."""
     module = tc.NISP(tc.Simulator(line, AB), tc.embeddings.Gaussian(), X)
-    with pytest.raises((TorchcalError, TypeError)):
-        attempt(prior=tc.priors.Flat(module))
+    for kind in (tc.priors.Flat, tc.priors.Normal):
+        with pytest.raises(DomainError, match=rf"Got an instance.*prior=torchcal\.priors\.{kind.__name__},"):
+            attempt(prior=kind(module))
+
+
+@pytest.mark.parametrize("calibrate", [tc.calibrate, tc.calibrate_additive])
+@pytest.mark.parametrize("scale", [1e200, 1e-200])
+def test_data_whose_squares_are_no_numbers_are_refused(calibrate, scale):
+    with pytest.raises(DomainError, match=r"squares of others are 0 or inf.*other units, in which they are near 1\.$"):
+        attempt(calibrate=calibrate, y=scale * Y)
+    attempt(calibrate=calibrate, y=Y * scale**0.5)
 
 
 @pytest.mark.parametrize(

@@ -342,6 +342,8 @@ def test_parameter_density_at_zero_spread(line):
         ({"draws": ALPHA.expand(4, 5)[:, :4]}, r"\(S, 5\)"),
         ({"alpha_map": ALPHA[:3]}, "alpha_map"),
         ({"alpha_map": ALPHA * math.nan}, "finite"),
+        ({"alpha_map": None}, "Got None"),
+        ({"propagate": ALPHA}, r"propagation first.*Got Tensor first"),
     ],
 )
 def test_parameter_density_refuses(line, changes, message):
@@ -459,6 +461,7 @@ def test_corner_on_given_axes():
         ({"names": "ab"}, "2 names"),
         ({"draws": normal(4, 10, 2)}, "dimension"),
         ({"draws": normal(2, 2)}, "at least 3 draws"),
+        ({"draws": None}, r"Got None \(without samples, num_samples=0, a calibration has no draws\)\.$"),
         ({"draws": normal(9, 2) / 0}, "finite"),
         ({"map_point": [0.0]}, "map_point"),
         ({"axes": "all"}, "axes"),

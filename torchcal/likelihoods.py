@@ -51,6 +51,13 @@ def _positive(value: float | Tensor, name: str) -> None:
         raise DomainError(f"Expected {name} > 0 and finite. Got {value!r}.")
 
 
+def _number(value: float, name: str) -> None:
+    _positive(value, name)
+    if not isinstance(value, float | int) and torch.as_tensor(value).ndim:
+        shape = tuple(torch.as_tensor(value).shape)
+        raise DomainError(f"Expected {name} as one number for all outputs. Got numbers of shape {shape}.")
+
+
 def _check_shapes(y: Tensor, **values: Tensor | None) -> None:
     """Raise where the last dimension is not that of the data, which broadcasting would hide."""
     if y.ndim != 1:
@@ -60,10 +67,10 @@ def _check_shapes(y: Tensor, **values: Tensor | None) -> None:
             raise ShapeError(f"Expected {name} of shape (..., {len(y)}), as y. Got {tuple(value.shape)}.")
 
 
-def _tolerance(epsilon: float | Tensor, y: Tensor) -> Tensor:
-    value = torch.as_tensor(epsilon, dtype=y.dtype, device=y.device)
+def _per_output(number: float | Tensor, y: Tensor, name: str) -> Tensor:
+    value = torch.as_tensor(number, dtype=y.dtype, device=y.device)
     if value.ndim and value.shape != y.shape:
-        raise ShapeError(f"Expected epsilon as a number or of shape {tuple(y.shape)}. Got {tuple(value.shape)}.")
+        raise ShapeError(f"Expected {name} as a number or of shape {tuple(y.shape)}. Got {tuple(value.shape)}.")
     return value
 
 
@@ -104,9 +111,9 @@ def abc_log_prob(
     -2.000
     """
     _positive(epsilon, "epsilon")
-    _positive(gamma, "gamma")
+    _number(gamma, "gamma")
     _check_shapes(y, mean=mean, sd=sd, noise=noise)
-    epsilon = _tolerance(epsilon, y)
+    epsilon = _per_output(epsilon, y, "epsilon")
     squared = (mean - y).square()
     unexplained = squared if noise is None else (squared - noise.square()).clamp_min(0)
     wanted = gamma * (unexplained + (SMOOTHING * epsilon).square()).sqrt()
@@ -157,7 +164,7 @@ class ABC(Likelihood):
     def __post_init__(self) -> None:
         if self.epsilon is not None:
             _positive(self.epsilon, "epsilon")
-        _positive(self.gamma, "gamma")
+        _number(self.gamma, "gamma")
 
     def resolve(
         self, y: Tensor, spread: Tensor, num_embedded: int, noise: Tensor | None = None
@@ -203,7 +210,7 @@ class ABCMean(Likelihood):
     ) -> Tensor:
         """Log-likelihood up to a constant, ``(*batch,)``. Noise adds its variance to ε²."""
         epsilon = _default_epsilon(y) if self.epsilon is None else self.epsilon
-        epsilon = _tolerance(epsilon, y)
+        epsilon = _per_output(epsilon, y, "epsilon")
         _check_shapes(y, mean=mean, noise=noise)
         variance = epsilon.square() if noise is None else epsilon.square() + noise.square()
         return -0.5 * ((mean - y).square() / variance).sum(-1)
@@ -261,7 +268,7 @@ class Marginal(Likelihood):
     name = "marginal"
 
     def __post_init__(self) -> None:
-        _check_samples(self.num_samples, self.bandwidth)
+        _check_samples(self.num_samples, self.bandwidth, self.floor)
 
     def resolve(
         self, y: Tensor, spread: Tensor, num_embedded: int, noise: Tensor | None = None
@@ -304,7 +311,7 @@ class Full(Likelihood):
     name = "full"
 
     def __post_init__(self) -> None:
-        _check_samples(self.num_samples, self.bandwidth)
+        _check_samples(self.num_samples, self.bandwidth, self.floor)
 
     def resolve(
         self, y: Tensor, spread: Tensor, num_embedded: int, noise: Tensor | None = None
@@ -352,7 +359,7 @@ def _floor_variance(floor: float | Tensor | None, y: Tensor) -> Tensor:
     if floor is None:
         spread = y.std() if len(y) > 1 else y.abs().max()
         floor = _KERNEL_FLOOR * torch.where(spread > 0, spread, torch.ones_like(spread))
-    return torch.as_tensor(floor, dtype=y.dtype, device=y.device).square()
+    return _per_output(floor, y, "floor").square()
 
 
 _BY_NAME: dict[str, type[Likelihood]] = {
@@ -396,7 +403,9 @@ def _default_epsilon(y: Tensor) -> float:
     return DEFAULT_TOLERANCE * spread
 
 
-def _check_samples(num_samples: int, bandwidth: float | None) -> None:
+def _check_samples(num_samples: int, bandwidth: float | None, floor: float | Tensor | None) -> None:
     whole("num_samples", num_samples, 2)
     if bandwidth is not None:
-        _positive(bandwidth, "bandwidth")
+        _number(bandwidth, "bandwidth")
+    if floor is not None:
+        _positive(floor, "floor")

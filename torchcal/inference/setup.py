@@ -29,8 +29,8 @@ __all__ = ["PriorMaker", "check_dtype", "check_inputs", "check_run", "embedded_p
 
 PriorMaker = Callable[[NISP], CoefficientPrior]
 
-SINGLE = (1e-15, 1e17)
-"""Spread at least, and values at most, of data whose likelihood single precision can hold."""
+RANGES = {torch.float32: (1e-15, 1e17), torch.float64: (1e-140, 1e150)}
+"""Spread at least, and values at most, of data whose likelihood a dtype can hold."""
 
 NODES_IN_TIME = 3
 """Gauss nodes for each germ with which the search for trajectories begins; at the maximum they are refined."""
@@ -95,17 +95,17 @@ def check_inputs(
 
 
 def check_dtype(recording: Recording, dtype: torch.dtype) -> None:
-    """Raise for data whose squares, and those of what is small beside them, single precision cannot hold."""
-    if dtype != torch.float32:
-        return
+    """Raise for data whose squares, and those of what is small beside them, a dtype cannot hold."""
     seen = recording.observed
     size, spread = float(recording.y[seen].abs().max()), float(recording.spread[seen].min())
-    if spread < SINGLE[0] or size > SINGLE[1]:
-        raise DomainError(
-            f"Expected data between {SINGLE[0]:g} and {SINGLE[1]:g} for dtype=torch.float32, which holds no squares "
-            f"of others. Got a spread of {spread:.3g} and values up to {size:.3g}. Use other units, or "
-            "dtype=torch.float64."
-        )
+    for wanted, instead in ((torch.float64, ""), (dtype, ", or dtype=torch.float64")):
+        smallest, largest = RANGES[wanted]
+        if spread < smallest or size > largest:
+            raise DomainError(
+                f"Expected data between {smallest:g} and {largest:g} for {wanted}: squares of others are 0 or infinite "
+                f"there. Got a spread of {spread:.3g} and values up to {size:.3g}. Use other units, in which they are "
+                f"near 1{instead}."
+            )
 
 
 def check_run(num_starts: int, device: torch.device | str | None) -> None:
@@ -202,19 +202,28 @@ def embedded_problem(
     likelihood = likelihood.resolve(
         y[observed], recording.spread[observed], germs, None if noise is None else noise[observed]
     )
+    for name in ("epsilon", "floor"):
+        value = getattr(likelihood, name, None)
+        given = torch.as_tensor(0.0 if value is None else value)
+        if given.ndim and given.shape != y[observed].shape:
+            raise DomainError(
+                f"Expected {name} as a number or of shape {tuple(y[observed].shape)}, one for each observed "
+                f"output. Got {tuple(given.shape)}."
+            )
     epsilon = getattr(likelihood, "epsilon", None)
     if epsilon is not None:
-        epsilon = torch.as_tensor(epsilon, dtype=torch.float64)
-        if epsilon.ndim and epsilon.shape != y[observed].shape:
-            raise DomainError(
-                f"Expected epsilon as a number or of shape {tuple(y[observed].shape)}, one for each observed "
-                f"output. Got {tuple(epsilon.shape)}."
-            )
-        propagate.sd_floor = likelihoods.SMOOTHING * float(epsilon.min())
+        propagate.sd_floor = likelihoods.SMOOTHING * float(torch.as_tensor(epsilon, dtype=torch.float64).min())
     else:
         # Likelihoods without a tolerance are singular at zero spread; the floor is where that is cut off.
         propagate.sd_floor = 1e-6 * float(recording.spread.min())
     propagate = propagate.to(device=device)
+    if isinstance(prior, CoefficientPrior):
+        kind = type(prior).__name__
+        raise DomainError(
+            f"Expected prior as a function from a NISP to a torchcal prior, such as torchcal.priors.{kind} itself. Got "
+            f"an instance, {kind}(...). Write prior=torchcal.priors.{kind}, or with options prior=lambda propagate: "
+            f"torchcal.priors.{kind}(propagate, ...)."
+        )
     if not callable(prior):
         raise DomainError(
             "Expected prior as a function from a NISP to a torchcal prior, such as torchcal.priors.Flat. "

@@ -78,6 +78,11 @@ def parameter_density(
 
     Source: Sargsyan, Najm & Ghanem (2015), Eq. 44, Figs. 12, 18.
     """
+    if not isinstance(propagate, NISP):
+        raise DomainError(
+            f"Expected the propagation first, then α: parameter_density(result.propagate, result.map.alpha). Got "
+            f"{type(propagate).__name__} first."
+        )
     pair = _pair(propagate, names)
     levels = check_levels(levels)
     if grid < 16:

@@ -210,6 +210,9 @@ def array(value: Any, what: str, ndim: int | Sequence[int]) -> np.ndarray:
         ShapeError: If it is no array of real numbers, or has another number of dimensions.
         DomainError: If a number is not finite.
     """
+    if value is None:
+        why = " (without samples, num_samples=0, a calibration has no draws)" if "draws" in what else ""
+        raise ShapeError(f"Expected {what}: an array of real numbers. Got None{why}.")
     allowed = (ndim,) if isinstance(ndim, int) else tuple(ndim)
     try:
         given = value if isinstance(value, Tensor) else torch.as_tensor(np.asarray(value))
