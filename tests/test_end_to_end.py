@@ -328,6 +328,22 @@ def test_a_tolerance_that_swamps_the_model_error_is_reported():
     assert (result.predict().sd > 3 * result.predict().map.sd).all()
 
 
+@pytest.mark.parametrize(
+    ("noise", "epsilon", "advice"),
+    [
+        (None, 5.0, r"Use a smaller epsilon=, unless"),
+        (0.2, 5.0, r"Use a smaller epsilon=, but not far below the noise, unless"),
+        (4.0, 0.1, r"noise that was given suffices .* a smaller epsilon= finds none"),
+    ],
+)
+def test_noise_that_suffices_asks_for_no_smaller_tolerance(noise, epsilon, advice):
+    recording = tc.Recording(x=X, y=Y, noise=noise)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        with pytest.warns(ToleranceWarning, match=advice):
+            tc.calibrate(line(), recording, likelihood=ABC(epsilon=epsilon), **TINY)
+
+
 def test_a_parameter_that_the_data_do_not_see_is_reported():
     parameters = [tc.Parameter("a"), tc.Parameter("b"), tc.Parameter("idle")]
     simulator = tc.Simulator(lambda x, p: p["a"] + p["b"] * x + 0 * p["idle"], parameters)

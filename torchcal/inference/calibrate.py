@@ -197,7 +197,7 @@ def calibrate(
         map_variance=mean_square(prediction.map.sd, recording),
     )
     if propagate.pattern.num_germs:
-        warn_of_tolerance(quality, problem.likelihood)
+        warn_of_tolerance(quality, problem.likelihood, recording, prediction.map.sd)
     warn_of_box(simulator, propagate, estimate.alpha)
     warn_of_bounds(problem, estimate.alpha)
     warn_of_spike(problem, estimate.alpha)

@@ -23,6 +23,7 @@ from torchcal.inference.fitting import LeastSquares
 from torchcal.models import Problem
 from torchcal.propagation import NISP, PropagationCheck
 from torchcal.results import Diagnostics, Quality
+from torchcal.results.additive import NEGLIGIBLE
 from torchcal.results.diagnostics import ess_threshold, r_hat_threshold
 from torchcal.simulators import Simulator, Trajectories
 
@@ -154,22 +155,35 @@ def warn_of_chains(quality: Diagnostics) -> None:
         )
 
 
-def warn_of_tolerance(quality: Diagnostics, likelihood: likelihoods.Likelihood) -> None:
+def warn_of_tolerance(
+    quality: Diagnostics, likelihood: likelihoods.Likelihood, recording: Recording, sd: Tensor
+) -> None:
     """Warn where ε rather than the model error sets the width of the prediction: the paper's own criterion.
 
     The posterior predictive variance E[σ²] + V[μ] then exceeds the MAP's σ² by far, because both its terms grow with
-    ε and the MAP's does not (Figs. 10 and 12).
+    ε and the MAP's does not (Figs. 10 and 12). Where a known noise explains all that the model leaves of the data, the
+    MAP's ``sd`` is 0, and no ε makes it more.
     """
     if getattr(likelihood, "epsilon", None) is None or not quality.posterior_variance > 0:
         return
     total = quality.model_error_variance + quality.posterior_variance
-    if total > 2 * quality.map_variance:
-        warn(
-            f"The tolerance ε sets the width of the prediction: E[σ²] = {quality.model_error_variance:.3g} and V[μ] = "
-            f"{quality.posterior_variance:.3g} against σ² = {quality.map_variance:.3g} at the MAP, means over the "
-            "data. Use a smaller epsilon=, unless the model is as good as exact.",
-            ToleranceWarning,
+    if not total > 2 * quality.map_variance:
+        return
+    told = (
+        f"The tolerance ε sets the width of the prediction: E[σ²] = {quality.model_error_variance:.3g} and V[μ] = "
+        f"{quality.posterior_variance:.3g} against σ² = {quality.map_variance:.3g} at the MAP, means over the data."
+    )
+    noise = recording.noise_sd
+    if noise is None:
+        advice = "Use a smaller epsilon=, unless the model is as good as exact."
+    elif bool((sd.to(noise) <= NEGLIGIBLE * noise)[recording.observed].all()):
+        advice = (
+            "The noise that was given suffices for what the model leaves of the data: there is no model error to see, "
+            "and a smaller epsilon= finds none."
         )
+    else:
+        advice = "Use a smaller epsilon=, but not far below the noise, unless the model is as good as exact."
+    warn(f"{told} {advice}", ToleranceWarning)
 
 
 def warn_of_bounds(problem: Problem, alpha: Tensor) -> None:
@@ -190,9 +204,13 @@ def warn_of_bounds(problem: Problem, alpha: Tensor) -> None:
             if not there <= here:  # nor where it has no answer
                 told.append(f"{q.name} at its {side} bound {value:g}")
     if told:
+        germs = propagate.pattern.num_germs
+        best = "density" if germs else "estimate"
+        instead = ", and the spreads make up for it" if germs else ""
+        instead = ", and sigma makes up for it" if problem.likelihood.name == "additive" else instead
         warn(
-            f"The best density has {', '.join(told)}: the bound decides it, and the spreads make up for it. Widen "
-            "bounds that are not physical; others say that the model lacks something.",
+            f"The best {best} has {', '.join(told)}: the bound decides it{instead}. Widen bounds that are not "
+            "physical; others say that the model lacks something.",
             IdentifiabilityWarning,
         )
 
