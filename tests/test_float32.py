@@ -149,3 +149,16 @@ def test_units_beyond_single_precision_are_told(scale, told):
             warnings.simplefilter("ignore", tc.errors.TorchcalWarning)
             found = calibrate(line, recording, **options)
         assert bool(found.samples.isfinite().all())
+
+
+def test_a_tolerance_that_single_precision_cannot_resolve_is_refused_before_the_warm_up():
+    x = torch.linspace(-1, 1, 21, dtype=torch.float64)
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    recording = tc.Recording(x=x, y=1 + 1.2 * x + 0.2 * x**2)
+    options = {"num_samples": 4, "num_warmup": 20, "num_chains": 2, "num_starts": 8, "dtype": torch.float32}
+    with pytest.raises(DomainError, match=r"differences of about 0\.5 can be told in torch\.float32.*float64"):
+        tc.calibrate(line, recording, likelihood=tc.likelihoods.ABC(epsilon=5e-5), **options)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        tc.calibrate(line, recording, likelihood=tc.likelihoods.ABC(epsilon=3e-4), **options)
+    assert any("distorts the draws. Use dtype=torch.float64" in str(w.message) for w in told)

@@ -29,6 +29,9 @@ _FEWEST_CHAINS, _MOST_CHAINS, _DRAWS_EACH = 32, 400, 120
 MOST_DRAWS = 20_000
 """Draws of a chain at which a search for a wanted sample size gives up."""
 
+FELT, LOST = 0.05, 0.2
+"""Rounding of a log-density that distorts draws, and that hides differences of about 0.5, which a sampler goes by."""
+
 
 @dataclass(frozen=True)
 class Plan:
@@ -119,8 +122,8 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
             f"{', '.join(estimate.improper)}, under a flat prior. Hold a parameter with fixed=, use a Uniform prior, "
             "or num_samples=0 for the maximum alone."
         )
+    _check_rounding(estimate, plan.dtype)
     modes = modes_of(problem, estimate)
-    _warn_of_rounding(estimate, plan.dtype)
     cast = problem.cast(plan.dtype)
     worth = [k for k, mode in enumerate(modes) if k == 0 or (mode.weight >= WORTH_CHAINS and plan.sampler != "pyro")]
     starts = [modes[k].to(plan.dtype) for k in worth]
@@ -224,12 +227,22 @@ def _draw_with_pyro(problem: Problem, mode: Laplace, model: Any, plan: Plan) -> 
     )
 
 
-def _warn_of_rounding(estimate: Estimate, dtype: torch.dtype) -> None:
-    """Differences of a log-density are known to its magnitude times the dtype's resolution; 0.05 of one matters."""
-    error = abs(estimate.posterior_objective) * torch.finfo(dtype).eps
-    if error > 0.05:
+def _check_rounding(estimate: Estimate, dtype: torch.dtype) -> None:
+    """Differences of a log-density are known to its magnitude times the dtype's resolution.
+
+    Where that is `FELT`, draws are distorted; where it is `LOST`, no step is short enough, and the warm-up has no end.
+    """
+    size = abs(estimate.posterior_objective)
+    error = size * torch.finfo(dtype).eps
+    instead = "a larger epsilon=" if dtype == torch.float64 else "dtype=torch.float64, or a larger epsilon="
+    if error > LOST:
+        raise DomainError(
+            f"Expected a log-posterior whose differences of about 0.5 can be told in {dtype}. Got one of size "
+            f"{size:.3g} at the mode, known to {error:.2g} only. Use {instead}, or num_samples=0 for the maximum alone."
+        )
+    if error > FELT:
         warn(
-            f"In {dtype} the log-posterior, {estimate.posterior_objective:.3g} at the mode, is known to "
-            f"{error:.2g} only, which distorts the draws. Use dtype=torch.float64, or a larger epsilon.",
+            f"In {dtype} the log-posterior, of size {size:.3g} at the mode, is known to {error:.2g} only, which "
+            f"distorts the draws. Use {instead}.",
             ConvergenceWarning,
         )
