@@ -11,10 +11,11 @@ import pytest
 import torch
 from scipy import integrate, stats
 
-from torchcal import NISP, Parameter, Simulator, polychaos
+from torchcal import NISP, ExternalSimulator, Parameter, Recording, Simulator, calibrate, polychaos
 from torchcal.embeddings import Gaussian, IndependentGaussian, PolynomialChaos, Uniform
 from torchcal.errors import DomainError, EmbeddingError, PropagationWarning, ShapeError, SimulatorError
 from torchcal.inference.summary import warn_of_moments
+from torchcal.likelihoods import ABC
 from torchcal.propagation.pieces import CACHED, MOST
 from torchcal.terms import Term, extend
 
@@ -729,6 +730,62 @@ def test_refine_adds_nodes_until_moments_settle():
     assert float(mean) == pytest.approx(math.exp(m + v / 2), rel=1e-6)
     assert float(variance) == pytest.approx(math.exp(2 * m + v) * math.expm1(v), rel=1e-6)
     assert not found.refine(alpha)
+
+
+def coarse_saturation(digits, calls=None):
+    """A code of v x / (k + x) that rounds its outputs; to single precision with ``digits`` None."""
+    names = [Parameter("v", low=0.5, high=5.0), Parameter("k", low=0.3, high=8.0, transform="log")]
+
+    def function(x, p):
+        if calls is not None:
+            calls.append(1)
+        y = p["v"] * x / (p["k"] + x)
+        return y.astype(np.float32).astype(float) if digits is None else np.round(y, digits)
+
+    return ExternalSimulator(function, names, vectorized=True)
+
+
+SATURATED = torch.linspace(0.2, 6.0, 15, dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("digits", "error", "most", "told"),
+    [(None, 2e-7, 8, False), (6, 1e-6, 16, False), (4, 1e-4, 5, True), (2, 1e-2, 5, True)],
+)
+def test_outputs_that_are_rounded_take_few_nodes(digits, error, most, told):
+    calls = []
+    found = NISP(coarse_saturation(digits, calls), Gaussian(), SATURATED, trial_spread=0.2)
+    assert found.rule_choice.size <= 4
+    assert len(calls) < 1000
+    alpha = tensor(-0.07, 0.08, 0.17, 0.1, 0.1)
+    found.refine(alpha)
+    assert found.rule_choice.size <= most
+    exact = NISP(coarse_saturation(15), Gaussian(), SATURATED, rule=20)
+    for one, other in zip(found(alpha), exact(alpha), strict=True):
+        assert float((one - other).abs().max()) < error
+    if not told:
+        found.check(alpha)  # without a warning
+        return
+    with pytest.warns(PropagationWarning, match="Somewhat more nodes do not lessen that: the outputs look rounded"):
+        found.check(alpha)
+
+
+def test_a_calibration_of_rounded_outputs_asks_for_little_more_than_of_exact_ones():
+    asked = []
+    for digits in (15, None):
+        calls = []
+        y = 2 * SATURATED**1.6 / (1.5 + SATURATED**1.6)
+        found = calibrate(
+            coarse_saturation(digits, calls),
+            Recording(x=SATURATED, y=y),
+            likelihood=ABC(epsilon=0.03),
+            num_samples=0,
+            num_starts=8,
+            progress=False,
+        )
+        asked.append((len(calls), found))
+    assert asked[1][0] < 4 * asked[0][0]
+    torch.testing.assert_close(asked[1][1].map.mean, asked[0][1].map.mean, rtol=1e-3, atol=0)
 
 
 def test_refine_stops_at_max_nodes():

@@ -8,6 +8,7 @@ from torch import Tensor
 from torchcal import polychaos
 from torchcal.checks import whole
 from torchcal.errors import DomainError, ShapeError
+from torchcal.propagation.convergence import first_as_good, has_stalled
 from torchcal.propagation.rules import RuleChoice, gauss_counts, sparse_or_random
 
 if TYPE_CHECKING:
@@ -59,13 +60,15 @@ def _by_trial(propagate: "NISP", counts: list[int]) -> RuleChoice:
     """The smallest tensor rule whose moments at a few trial densities agree with the next one's.
 
     Where no two rules agree, as with a kink, or a pole that more nodes only come nearer to, it is one of `ENOUGH` nodes
-    a germ; and where outputs cease to be finite as the nodes spread, the largest rule before. The maximum that is found
-    with it is refined.
+    a germ; where finer rules cease to change the moments less, as of rounded outputs, the smallest of these; and where
+    outputs cease to be finite as the nodes spread, the largest rule before. The maximum that is found with it is
+    refined.
     """
     alpha = _trial_alpha(propagate)
     order, propagate.order = propagate.order, None
     previous: tuple[Tensor, Tensor] | None = None
     dead: Tensor | None = None
+    changes: list[float] = []
     try:
         for count, smaller in zip(counts, [0, *counts], strict=False):
             propagate.set_rule(RuleChoice("tensor", count))
@@ -81,6 +84,9 @@ def _by_trial(propagate: "NISP", counts: list[int]) -> RuleChoice:
                 change = torch.maximum((mean - previous[0]).abs(), (sd - previous[1]).abs())
                 if bool((change <= 1e-9 * scale)[~dead].all()):
                     return RuleChoice("tensor", smaller)
+                changes.append(float((change / scale)[~dead].max()))
+                if has_stalled(propagate, changes):
+                    return RuleChoice("tensor", counts[first_as_good(changes)], stalled=True)
             previous = (mean, sd)
     finally:
         propagate.order = order

@@ -333,11 +333,15 @@ class NISP(nn.Module):
         """
         result = convergence.compare(self, alpha)
         if warn:
-            convergence.warn_unsettled(result, self.order, tolerance, order_tolerance)
+            convergence.warn_unsettled(
+                result, self.order, tolerance, order_tolerance, stalled=self._choice.stalled
+            )
         return result
 
     def refine(self, alpha: Tensor, *, tolerance: float = convergence.SETTLED) -> bool:
         """Take more nodes until the moments at α settle, or the outermost of more are values that f does not bear.
+
+        Where finer rules cease to change them less, as where outputs are rounded, the smallest of these stays.
 
         Args:
             alpha: Where they are to settle, ``(*batch, P)``.
@@ -346,19 +350,24 @@ class NISP(nn.Module):
         Returns:
             Whether the rule has changed.
         """
-        changed = False
-        germs = self.pattern.num_germs
+        before, germs = self._choice.size, self.pattern.num_germs
+        sizes: list[int] = []
+        changes: list[float] = []
         while germs and self._choice.kind == "tensor" and choice.exact_count(self) is None:
             finer = self._choice.finer(germs, self.pattern.basis)
             if finer is None or finer.size**germs > self.max_nodes:
                 break
             result = self.check(alpha, warn=False)
-            changes = (result.mean_change, result.sd_change)
-            if max(changes) <= tolerance or not all(map(math.isfinite, changes)):
+            change = max(result.mean_change, result.sd_change)
+            if change <= tolerance or not math.isfinite(result.mean_change + result.sd_change):
+                break
+            sizes.append(self._choice.size)
+            changes.append(change)
+            if convergence.has_stalled(self, changes):
+                self.set_rule(RuleChoice("tensor", sizes[convergence.first_as_good(changes)], stalled=True))
                 break
             self.set_rule(finer)
-            changed = True
-        return changed
+        return self._choice.size != before
 
     # --- inside ------------------------------------------------------------------------------------------
 

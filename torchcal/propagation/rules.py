@@ -22,6 +22,7 @@ class RuleChoice:
         seed: Of the scrambling of quasi-Monte Carlo points.
         given: The user's own rule.
         asked: Whether a user asked for this size, so that a calibration keeps to it.
+        stalled: Whether more nodes did not lessen the change of the moments.
     """
 
     kind: str
@@ -29,6 +30,7 @@ class RuleChoice:
     seed: int = 0
     given: polychaos.Rule | None = None
     asked: bool = False
+    stalled: bool = False
 
     def build(self, basis: polychaos.Basis, germs: int) -> polychaos.Rule:
         """Nodes and weights."""
