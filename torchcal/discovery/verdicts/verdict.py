@@ -263,10 +263,6 @@ def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) 
     decision.doubt = doubt(search, shown)
     if not alone:
         decision.doubt = decision.doubt or only_together(search, max(holding, key=lambda m: m.weight))
-        if not decision.doubt and search.examine(shown).p_value < PLAINLY_WHITE:
-            decision.doubt = (
-                "It is not enough, and what acts beside it is not told: something else may do what both do."
-            )
         _tie_larger(search, decision, holding, sure)
     if sure < SURE or decision.doubt or not shown.physical:
         decision.verdict = "ambiguous"
