@@ -165,3 +165,21 @@ def test_terms_may_put_into_their_dicts():
 
     terms = [Term(name, parameters=[tc.Parameter("g")], equation="c", rate=scaled) for name in ("one", "two")]
     torch.testing.assert_close(solved(extend(bound(), terms)), solved(bound()))
+
+
+def test_a_first_call_in_a_transform_shows_nothing_and_counts_for_none():
+    def doubles(x, p):
+        return p["b"].mul_(2) * x
+
+    simulator = tc.Simulator(doubles, [tc.Parameter("b")])
+    x = torch.linspace(0, 1, 5, dtype=torch.float64)
+    evaluate = simulator.at(x, ("y",))
+    torch.func.vmap(evaluate)(torch.tensor([[1.0], [2.0]], dtype=torch.float64))
+    with pytest.raises(SimulatorError, match=r"p\['b'\] changed in place"):
+        evaluate(torch.tensor([[1.0], [-1.0]], dtype=torch.float64))
+
+
+def test_conditions_may_be_arrays():
+    simulator = tc.Simulator(lambda x, p: p["b"] * x, [tc.Parameter("b")])
+    found = simulator.at(np.linspace(0, 1, 5), ("y",))(torch.tensor([2.0], dtype=torch.float64))
+    assert found.tolist() == pytest.approx([0.0, 0.5, 1.0, 1.5, 2.0])

@@ -289,6 +289,21 @@ def test_a_temperature_is_multiplied_by_its_rise_and_not_from_absolute_zero():
     assert any(f"2 times the inputs of the first {counted}" in text for text in chosen)
 
 
+def test_temperatures_are_counted_from_the_lowest_in_any_run_and_faded_differences_from_nothing():
+    ode = tc.ODESimulator(
+        lambda t, s, p, u: {"dT": p["k"] * (u["Ta"] - 290) - s["dT"]}, {"dT": "K"}, [tc.Parameter("k", initial=0.5)]
+    )
+    t = torch.linspace(0, 20, 60, dtype=F64)
+    runs = [tc.Run(time=t, outputs={"dT": 0 * t}, inputs={"Ta": 0 * t + outside}, initial={"dT": 20.0})
+            for outside in (320.0, 290.0)]  # fmt: skip
+    problem = Problem.of(ode, tc.Recording(runs=runs, units={"Ta": "K"}))
+    model = SimpleNamespace(problem=problem, values=torch.tensor([0.0], dtype=F64), warm=None)
+    options = {text: chosen for text, _, chosen in conditions.simple(model)}
+    doubled = options["a run with 2 times the inputs of the first (Ta counted from 290)"]
+    assert doubled["inputs"]["Ta"].unique().tolist() == [350.0]
+    assert options["a run that starts from 2 times the initial states of the first"]["initial"] == {"dT": 40.0}
+
+
 def test_a_constant_temperature_outside_is_no_input_to_multiply():
     ode = tc.ODESimulator(
         lambda t, s, p, u: {"T": p["k"] * (u["Ta"] - s["T"])}, {"T": "degC"}, [tc.Parameter("k", initial=0.5)]

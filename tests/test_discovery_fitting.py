@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 import torchcal as tc
 from torchcal.discovery.fits.fitting import fit, refit, starts
@@ -12,6 +13,7 @@ from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.base import calibrate_base
 from torchcal.discovery.misfit.noise import GRID, Noise
 from torchcal.discovery.misfit.residual import Residual, _noise_draws
+from torchcal.simulators.dual import transformed
 
 F64 = torch.float64
 
@@ -467,3 +469,25 @@ def test_a_fit_ends_early_where_its_pace_does_not_lead_to_where_it_is_wanted(lin
                 finish=40, aim=aim)  # fmt: skip
     assert (found.chi2 > 45.0) is early
     assert (linearised[0] < 30) is early
+
+
+def test_a_look_ahead_goes_no_farther_than_steps_do_along_a_flat_logarithm():
+    farthest = [0.0]
+
+    def flat(x, p):
+        if not transformed(p["k"]):
+            farthest[0] = max(farthest[0], float(forward_ad.unpack_dual(p["k"]).primal.abs().max()))
+        bent = torch.where(x < 1, 1000.0 * (p["b"] - p["a"] ** 2), torch.where(x < 2, 1 - p["a"], 0 * x))
+        return torch.where(x == 2, p["k"] / (1 + p["k"]), bent)
+
+    x = torch.arange(6.0, dtype=F64)
+    simulator = tc.Simulator(flat, [tc.Parameter("a"), tc.Parameter("b"), tc.Parameter("k", transform="log")])
+    problem = Problem.of(simulator, tc.Recording(x=x, y=2.0 * (x == 2), noise=1.0))
+    reached = []
+    for bend in (False, True):
+        farthest[0] = 0.0
+        found = fit(problem, white(problem, 1.0), torch.tensor([[-1.2, 1.0, 1e4]], dtype=F64), [0, 1, 2], max_steps=25,
+                    finish=0, bend=bend)  # fmt: skip
+        assert math.isfinite(found.chi2)
+        reached.append(math.log(farthest[0] / 1e4))
+    assert max(reached) <= 2.0 * 26

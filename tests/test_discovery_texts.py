@@ -656,5 +656,7 @@ def test_another_name_of_a_term_in_a_window_is_told_with_the_window():
     assert ["drift"] in d.tied
     regions = {r.terms[0]: (r.region, r.probability) for r in reversed(d.ranking) if r.region}
     assert regions["slope"] == regions["drift"]
+    assert d.ranking[0].terms == ("slope",)
+    assert d.ranking[0].refitted
     assert f"drift where {regions['drift'][0]}" in " ".join(str(d).split())
     assert sum(r.probability for r in d.ranking) == pytest.approx(1.0)

@@ -94,7 +94,7 @@ def test_an_offset_that_the_base_can_do_alone_makes_no_name_of_what_it_stands_be
     assert not named
 
 
-def test_what_all_likely_hypotheses_share_is_no_name_where_they_are_none():
+def test_what_all_likely_hypotheses_share_is_no_name_where_the_best_of_them_is_none():
     for seed in range(2000, 2006):
         d = conductivities(0.108, seed)
         assert d.verdict in ("ambiguous", "unexplained")

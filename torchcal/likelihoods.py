@@ -52,6 +52,8 @@ def _positive(value: float | Tensor, name: str) -> None:
 
 
 def _number(value: float, name: str) -> None:
+    if isinstance(value, str) or value is None:
+        raise DomainError(f"Expected {name} as a positive number. Got {value!r}.")
     _positive(value, name)
     if not isinstance(value, float | int) and torch.as_tensor(value).ndim:
         shape = tuple(torch.as_tensor(value).shape)

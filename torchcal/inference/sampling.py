@@ -230,7 +230,7 @@ def _draw_with_pyro(problem: Problem, mode: Laplace, model: Any, plan: Plan) -> 
 def _check_rounding(estimate: Estimate, dtype: torch.dtype) -> None:
     """Differences of a log-density are known to its magnitude times the dtype's resolution.
 
-    Where that is `FELT`, draws are distorted; where it is `LOST`, no step is short enough, and the warm-up has no end.
+    Where that is `FELT`, draws are distorted; where it is `LOST`, no step is short enough, and the warm-up hardly ends.
     """
     size = abs(estimate.posterior_objective)
     error = size * torch.finfo(dtype).eps

@@ -53,7 +53,7 @@ class RuleChoice:
         if self.kind == "qmc":
             return replace(self, size=2 * self.size, seed=self.seed + 1)
         size = int(min(max(self.size + 2, math.ceil(1.3 * self.size)), most))
-        return replace(self, size=size) if size > self.size else None
+        return replace(self, size=size, stalled=False) if size > self.size else None
 
     def coarser(self) -> "RuleChoice":
         """A rule of fewer nodes, to hold a tensor rule against that is the finest."""

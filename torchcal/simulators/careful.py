@@ -44,7 +44,8 @@ def careful(seen: set[int], what: str, function: Callable[..., Any], **given: An
             f"or clamp_(). Work on a copy, {changed[0]}.clone(), or write x = x + 1 for x += 1 and x.clamp() for "
             "x.clamp_()."
         )
-    seen.add(id(function))
+    if not any(transformed(value) for one in given.values() for _, value in _named("", one)):  # there it cannot be seen
+        seen.add(id(function))
     return result
 
 

@@ -135,7 +135,10 @@ class Simulator:
         """
         n = _length(x)
         # A copy: whatever the function does, the recording stays as it is.
-        x = {name: value.clone() for name, value in x.items()} if isinstance(x, Mapping) else x.clone()
+        if isinstance(x, Mapping):
+            x = {name: torch.as_tensor(value).clone() for name, value in x.items()}
+        else:
+            x = torch.as_tensor(x).clone()
 
         def evaluate(values: Tensor) -> Tensor:
             check_values(values, self.names)

@@ -121,7 +121,12 @@ def bolder(model: Fitted) -> list[Option]:
             options.append(_run(recording, text, begin.times(ALONE, [name])))
     options += _stronger(recording, begin, ask, BOLD)
     if _runs(recording)[0].inputs:
-        options.append(_run(recording, f"a run with the inputs held at their largest{ask}", values, change=_steady))
+        lowest = _zeros(recording)
+
+        def steady(name: str, given: Tensor) -> Tensor:
+            return torch.full_like(given, float(given[int((given - lowest[name]).abs().argmax())]))
+
+        options.append(_run(recording, f"a run with the inputs held at their largest{ask}", values, change=steady))
         for factor, text in ((2.0, "twice as slowly"), (0.5, "twice as fast")):
             options.append(_run(recording, f"a run with the inputs of the first {text}{ask}", values, slower=factor))
     return options
@@ -164,7 +169,8 @@ def _states(model: Fitted) -> _Begin:
 
 def _zero(values: Tensor, unit: str | None) -> float:
     """What multiples of a quantity are counted from: twice a temperature means nothing, twice a rise of it does."""
-    return float(values.min()) if unit in ABSOLUTE_ZERO else 0.0
+    lowest = float(values.min()) if unit in ABSOLUTE_ZERO else 0.0
+    return 0.0 if abs(lowest) <= NOTHING * float(values.abs().max()) else lowest  # a difference that has faded
 
 
 def _ask(recording: Recording, begin: Iterable[str]) -> str:
@@ -182,8 +188,7 @@ def _elsewhere(recording: Recording, begin: _Begin, factors: tuple[float, ...]) 
 
 def _stronger(recording: Recording, begin: _Begin, ask: str, factors: tuple[float, ...]) -> list[Option]:
     """Runs with inputs of other sizes, and with inputs and initial states of other sizes."""
-    inputs, units = _runs(recording)[0].inputs, _runs(recording)[0].units
-    zero = {name: _zero(values, units.get(name)) for name, values in inputs.items()}
+    inputs, zero = _runs(recording)[0].inputs, _zeros(recording)
     if all(bool((values == zero[name]).all()) for name, values in inputs.items()):
         return []
 
@@ -203,8 +208,12 @@ def _stronger(recording: Recording, begin: _Begin, ask: str, factors: tuple[floa
     return options
 
 
-def _steady(name: str, values: Tensor) -> Tensor:
-    return torch.full_like(values, float(values[int(values.abs().argmax())]))
+def _zeros(recording: Recording) -> dict[str, float]:
+    """What multiples of every input are counted from."""
+    runs = _runs(recording)
+    return {
+        name: _zero(torch.cat([run.inputs[name] for run in runs]), runs[0].units.get(name)) for name in runs[0].inputs
+    }
 
 
 def _run(

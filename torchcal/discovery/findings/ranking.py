@@ -43,11 +43,11 @@ def ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[Hy
         share = decision.probability.get(id(model), 0.0) / (1 + len(others))  # nothing tells which of them it is
         if model.window is None:
             alike |= {j: (model, share) for j in others}
-        else:
-            rows += [dataclasses.replace(_alias(search, j, model, share), estimates=(), refitted=False,
-                                         region=model.where) for j in others]  # fmt: skip
         scored = model is decision.best or (place < SCORED and share > PROBABLE)
         rows.append(_refitted(search, model, share, others, _held_out(search, model, mask) if scored else None))
+        if model.window is not None:
+            rows += [dataclasses.replace(_alias(search, j, model, share), estimates=(), refitted=False,
+                                         region=model.where) for j in others]  # fmt: skip
     fitted = {m.numbers for m in search.models}
     for i in range(len(search.candidates)):
         if i in alike:
@@ -66,10 +66,11 @@ def ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[Hy
 
 
 def _others(search: Search, decision: Decision, model: Model) -> list[int]:
-    """Numbers of the candidates that a model could as well be called after, in its window too where that is tied."""
+    """Numbers of the candidates that a model could as well be called after, in its windows too where one is tied."""
     if model in search.plain.values():
         return search.aliases.get(model.numbers[0], [])
-    local = model.window is not None and len(model.numbers) == 1 and model in decision.tied_models
+    tied = {one.numbers for one in decision.tied_models if one.window is not None and len(one.numbers) == 1}
+    local = model.window is not None and model.numbers in tied
     return [number for number, _, _ in other_names(search, model)] if local else []
 
 

@@ -279,9 +279,10 @@ def fit(
             held = torch.where(over, torch.where(log, (wall / now).log(), wall - now), held)
             stuck = stuck | over
         if bend:
+            change = torch.where(log, change.clamp(-2, 2), change)
             ahead = values.clone()
             ahead[:, free] = torch.where(log, now * (AHEAD * change).exp(), now + AHEAD * change).clamp(low, high)
-            rise = whitening.vector(problem.evaluate(ahead, [], warm)[0] - y) / AHEAD
+            rise = whitening.vector(problem.evaluate(ahead, [], warm, march=False)[0] - y) / AHEAD
             second = 2.0 / AHEAD * (rise - (slope @ change.unsqueeze(-1))[..., 0])
             along = (u.transpose(-1, -2) @ second.unsqueeze(-1))[..., 0]
             turn = -(v.transpose(-1, -2) @ (shrink * along).unsqueeze(-1))[..., 0] / unit

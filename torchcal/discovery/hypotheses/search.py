@@ -280,7 +280,7 @@ class Search:
 
     def _aim(self) -> float:
         """χ² above which a model plays no part beside what was found so far."""
-        best = max((self.gain(model.found.chi2) for model in self.models), default=0.0)
+        best = max((model.log_evidence for model in self.models if model.physical), default=0.0)
         return math.inf if self.exact or best <= 0 else self.base.chi2 - 2 * (HOPELESS * best - NEAR)
 
     def _settled(self, found: Fitted) -> Fitted:
