@@ -21,6 +21,7 @@ from torchcal.discovery.misfit.channels import Channel
 from torchcal.discovery.misfit.places import Place
 from torchcal.discovery.records import Estimate, Experiment, Hypothesis, Limit, Location, MissingRate, Table
 from torchcal.discovery.verdicts import doubts, explain
+from torchcal.plots.discovery.pieces import likeliest_with
 from torchcal.report import diagnosis_page
 
 F64 = torch.float64
@@ -656,6 +657,7 @@ def test_another_name_of_a_term_in_a_window_is_told_with_the_window():
     assert ["drift"] in d.tied
     regions = {r.terms[0]: (r.region, r.probability) for r in reversed(d.ranking) if r.region}
     assert regions["slope"] == regions["drift"]
+    assert likeliest_with(d.ranking, ["drift"]).region == regions["drift"][0]
     assert d.ranking[0].terms == ("slope",)
     assert d.ranking[0].refitted
     assert f"drift where {regions['drift'][0]}" in " ".join(str(d).split())

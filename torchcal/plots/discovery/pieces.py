@@ -205,9 +205,10 @@ def likeliest_with(ranking: Iterable[Any], terms: Iterable[str]) -> Any:
     """The likeliest sound hypothesis with exactly these terms, wherever they act; None where none has them."""
     wanted = frozenset(terms)
     same = [item for item in ranking if frozenset(item.terms) == wanted]
-    refitted = [item for item in same if getattr(item, "refitted", True)]
-    sound = [item for item in refitted if item.physical and not getattr(item, "note", "")]
-    return max(sound or refitted or same, key=lambda item: finite(item.probability, -1.0), default=None)
+    fitted = [item for item in same if getattr(item, "refitted", True)]
+    sound = [item for item in fitted if item.physical and not getattr(item, "note", "")]
+    named_after = [item for item in same if item not in fitted and getattr(item, "region", None)]  # another's fit
+    return max([*sound, *named_after] or fitted or same, key=lambda item: finite(item.probability, -1.0), default=None)
 
 
 def join_terms(terms: Iterable[str]) -> str:
