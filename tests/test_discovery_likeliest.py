@@ -165,7 +165,9 @@ def oscillator(rho, size, seed, n=250):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
+)
 def test_correlated_noise_is_estimated_beside_the_term_that_is_there(seed):
     base, data = oscillator(0.75, 0.02, seed)
     library = [term for term in tc.terms.mechanics() if term.name in TERMS]

@@ -198,7 +198,7 @@ def test_the_evidence_of_a_wave_is_that_of_the_linear_model(size):
     assert removed == pytest.approx(float(y.square().sum() - (y - profile).square().sum()), rel=1e-8)
 
 
-@pytest.mark.parametrize("seed", [0, 6])
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), 6])
 def test_no_wave_stands_in_for_a_term_where_samples_come_in_bursts(seed):
     g = torch.Generator().manual_seed(seed)
     t = bursts()

@@ -437,7 +437,7 @@ def test_what_no_instrument_does_is_no_rival_of_one():
     assert row.probability < 1e-3
 
 
-@pytest.mark.parametrize("seed", [5, 8])
+@pytest.mark.parametrize("seed", [5, pytest.param(8, marks=pytest.mark.slow)])
 def test_a_name_that_has_another_is_none_though_it_may_act_in_a_window(seed):
     # A source of heat in a body that cools is an offset of its thermometer; in a window it is nearly as likely.
     t = np.linspace(0, 105, 90)

@@ -601,7 +601,7 @@ def test_runs_of_two_samples_tell_nothing_of_growing_noise():
 # --- windows of few levels, limits within bounds, and noise that takes a misfit up -------------------------
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_window_of_one_row_of_a_grid_is_no_name(seed):
     inverse, rate = (a.ravel() for a in np.meshgrid(1000 / np.linspace(260, 400, 12), np.geomspace(0.1, 100, 6)))
     y = -8.0 + 3.0 * inverse

@@ -97,7 +97,7 @@ def test_what_one_datum_shows_alone_is_told_and_no_name(tertiary, place, unit):
     assert ("may also be explained by tertiary" in " ".join(str(d).split())) == bool(tertiary)
 
 
-@pytest.mark.parametrize("seed", [4, 8])
+@pytest.mark.parametrize("seed", [4, pytest.param(8, marks=pytest.mark.slow)])
 def test_a_fit_along_a_bent_valley_goes_on_to_its_minimum(seed):
     # The two diodes can nearly take each other's place: 60 steps ended 3 to 4 of χ² above the minimum.
     x, y, _ = curve(seed, 0.0, J=3.68, J0=0.31, n=1.45, J2=2.0)
@@ -381,7 +381,9 @@ def resonant(seed, noise, *, height=2.0, spike=0.0):
     return diagnose(base, tc.Recording(x=x, y=y, noise=noise), terms)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(
+    "seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
+)
 def test_what_sticks_out_of_the_best_term_may_be_what_a_second_one_is_seen_by(seed):
     d = resonant(seed, 0.1)  # of the curve alone the three samples of the resonance stick out
     assert set(d.terms) == {"quadratic", "resonance"}
@@ -390,7 +392,7 @@ def test_what_sticks_out_of_the_best_term_may_be_what_a_second_one_is_seen_by(se
     assert abs(known["resonance.c"].value - 2.0) < 4 * known["resonance.c"].sd
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_wild_sample_where_a_second_term_would_be_seen_stays_one(seed):
     d = resonant(seed, 0.1, height=0.0, spike=2.0)
     assert d.terms == ["quadratic"]

@@ -36,7 +36,7 @@ def cleared(seed, store, lag=0.0, noise=0.02):
     return model, tc.Recording(runs=[tc.Run(time=t, outputs={"C": y}, initial={"C": 2.0})], noise=noise)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_store_that_is_in_no_list_is_no_lag_of_an_instrument(seed):
     # Half of the signal late, and the rest at once, is no instrument.
     terms = [term for term in tc.terms.sensor("C") if term.name.split(" of ")[0] in ("lag", "delay", "offset")]
@@ -62,7 +62,7 @@ def rate(seed, offset=0.0, saturates=None, noise=0.01, known=0.0):
     return base, tc.Recording(x={"S": s}, y={"v": y}, noise=noise)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_an_offset_that_is_in_no_list_is_no_saturation_below_all_data(seed):
     terms = [term for term in tc.terms.sensor("v", static=True) if "offset" not in term.name]
     for known in (0.0, 290.0):  # far from 0 it had been looked for bends elsewhere

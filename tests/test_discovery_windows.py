@@ -347,7 +347,9 @@ def dip(seed):
     return base, tc.Recording(x={"V": v, "T": temperature}, y=y), terms
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "seed", [pytest.param(0, marks=pytest.mark.slow), 1, pytest.param(2, marks=pytest.mark.slow)]
+)
 def test_a_term_that_bends_to_a_dip_is_no_name(seed):
     d = diagnose(*dip(seed))
     assert d.verdict == "unexplained" or ["none of these"] in d.tied
