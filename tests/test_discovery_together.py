@@ -1,9 +1,13 @@
 """Several terms that explain a recording together, and are no names: they bend to what is in no list."""
 
+from types import SimpleNamespace
+
 import numpy as np
+import pytest
 import torch
 
 import torchcal as tc
+from torchcal.discovery.verdicts.together import only_together
 
 F64 = torch.float64
 X = torch.linspace(0.2, 5, 60, dtype=F64)
@@ -99,3 +103,13 @@ def test_what_all_likely_hypotheses_share_is_no_name_where_the_best_of_them_is_n
         d = conductivities(0.108, seed)
         assert d.verdict in ("ambiguous", "unexplained")
         assert d.verdict == "unexplained" or ["none of these"] in d.tied
+
+
+@pytest.mark.parametrize("names", [("a",), ("a", "b")])
+@pytest.mark.parametrize(("left", "doubted"), [(0.5, True), (0.01, False)])
+def test_what_only_pairs_have_shown_in_few_data_is_no_name_of_one_either(names, left, doubted):
+    fit = SimpleNamespace(residual=torch.full((10,), left))
+    base = SimpleNamespace(residual=torch.ones(10))
+    search = SimpleNamespace(paired=True, exact=True, base=base)
+    told = only_together(search, SimpleNamespace(names=names, found=fit))
+    assert ("So few data" in told) is doubted

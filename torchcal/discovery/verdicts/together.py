@@ -13,14 +13,12 @@ NEXT_TO_NOTHING = 1e-3
 
 def only_together(search: Search, model: Model) -> str:
     """Why several terms may do what one that is in no list does, in a sentence; empty if nothing says so."""
-    if len(model.names) < 2:
-        return ""
     if search.paired and not _leaves_nothing(search, model):
         return (
             "So few data with noise of unknown size show it by two terms together alone, as two others may do: more "
             "data, replicates or a known noise sd would tell."
         )
-    if search.exact:
+    if search.exact or len(model.names) < 2:
         return ""
     if alike := one_law(model):
         return f"Of its terms {alike[0]}."
