@@ -250,10 +250,10 @@ class Term:
         if self.elapsed is not None:
             t, s, p, *more = given
             given = (t - self.began(p), s, p, *more)
+        letters = (("t", "s", "p", "u", "y") if len(given) > 3 else ("x", "p", "y"))[: len(given)]
         try:
-            letters = ("t", "s", "p", "u", "y") if len(given) > 3 else ("x", "p", "y")
             result = careful(
-                self.seen, f"the term {self.name!r}", function, **dict(zip(letters, given, strict=False))
+                self.seen, f"the term {self.name!r}", function, **dict(zip(letters, given, strict=True))
             )
         except TorchcalError:
             raise
@@ -263,7 +263,7 @@ class Term:
             known = "; ".join(", ".join(part) for part in given if isinstance(part, Mapping) and part)
             raise SimulatorError(
                 f"Expected a tensor from every function of the term {self.name!r}. One of them raised "
-                f"{raised(error)}. It was given {len(given)} arguments, with {known}.{advice}"
+                f"{raised(error)}. It was given ({', '.join(letters)}), with {known}.{advice}"
             ) from error
         if isinstance(result, np.ndarray | np.generic):
             result = torch.as_tensor(result)

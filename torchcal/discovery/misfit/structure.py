@@ -19,6 +19,7 @@ from torchcal.discovery.misfit.lines import Lines, lines_of
 from torchcal.discovery.misfit.noise import quantisation
 from torchcal.discovery.misfit.places import SIZES, Change, Place, evidence_of
 from torchcal.discovery.misfit.residual import Residual
+from torchcal.discovery.misfit.steps import Steps
 from torchcal.discovery.misfit.waves import wave_places
 
 __all__ = ["Structure", "analyse", "evidences", "responses_of"]
@@ -110,22 +111,27 @@ def _line_place(lines: Lines, residual: Residual) -> Place:
 
 
 def evidences(
-    residual: Residual, looks: Sequence[_Look], available: Sequence[Channel]
+    residual: Residual, looks: Sequence[_Look], available: Sequence[Channel], steps: Sequence[Steps]
 ) -> tuple[list[float], Tensor | None]:
-    """Log evidence for a smooth change of each channel against each driver, and for oscillations of each output.
+    """Log evidence for a smooth change of each channel against each driver, and oscillations and steps of each output.
 
-    Also returns the oscillation ``(n,)`` that the residual has where one is likelier than all else.
+    Also returns the oscillation or step ``(n,)`` that the residual has where one is likelier than all else.
     """
     smooth: dict[int, float] = {}
     for key, _, change in _changes(residual, looks, residual.e[:, None]):
         smooth[key] = max(smooth.get(key, -math.inf), float(evidence_of(change.along[:, None], change.s)[0]))
-    found, wave = list(smooth.values()), None
+    found, rough = list(smooth.values()), None
     for lines in _lines(residual, available):
         evidence, number = lines.evidence(residual.e[:, None], SIZES)
         if float(evidence[0]) > max([0.0, *found]):
-            wave = lines.wave(residual.found.residual, residual.e, number, SIZES)[0]
+            rough = lines.wave(residual.found.residual, residual.e, number, SIZES)[0]
         found.append(float(evidence[0]))
-    return found, wave
+    for each in steps:
+        of_step, step = each.evidence(residual)
+        if of_step > max([0.0, *found]):
+            rough = step
+        found.append(of_step)
+    return found, rough
 
 
 def _changes(residual: Residual, looks: Sequence[_Look], residuals: Tensor) -> Iterator[tuple[int, _Look, Change]]:
