@@ -1,4 +1,4 @@
-"""Steps of an output, which slow noise may take as well as physics."""
+"""Steps and bumps, which slow noise may take as well as physics."""
 
 import math
 
@@ -14,7 +14,8 @@ from torchcal.discovery.misfit.channels import channels
 from torchcal.discovery.misfit.likeliest import Tangents, settled, with_unknown
 from torchcal.discovery.misfit.places import SIZES
 from torchcal.discovery.misfit.residual import Residual
-from torchcal.discovery.misfit.steps import LEAST, MOST, Steps, steps_of
+from torchcal.discovery.misfit.steps import LEAST, MOST, SURER, Sudden, stepwise, sudden_changes
+from torchcal.discovery.misfit.structure import analyse
 
 X = np.linspace(0, 10, 60)
 
@@ -39,23 +40,21 @@ def stepped(seed, size=1.0, at=6.0, sd=0.1, x=X):
 
 
 def only(found):
-    (steps,) = steps_of(found.problem, channels(found.problem, found))
-    return steps
+    (sudden,) = sudden_changes(found.problem, channels(found.problem, found))
+    return sudden
 
 
-def test_the_evidence_of_a_step_is_the_ratio_of_two_normal_densities():
+def test_the_evidence_of_a_sudden_change_is_the_ratio_of_two_normal_densities():
     found, noise = calibrated(stepped(0, size=0.3), noise=0.1)
-    steps, residual = only(found), Residual(found, noise, draws=0)
-    places = range(LEAST, len(X) - LEAST + 1)
-    assert steps.functions.shape == (60, len(places))
-    evidence, step = steps.evidence(residual)
-    # Within what the line does not make up for, of white noise: the residual with and without a step of a normal size.
+    sudden, residual = only(found), Residual(found, noise, draws=0)
+    evidence, step = sudden.evidence(residual)
+    # Within what the line does not make up for, of white noise: the residual with and without one of a normal size.
     rho = float(noise.correlation[0])
     white = np.linalg.inv(np.linalg.cholesky(0.01 * toeplitz(rho ** np.arange(60))))
     q = np.linalg.qr(white @ np.stack([np.ones(60), X], axis=1), mode="complete")[0][:, 2:]
     e, each = q.T @ white @ found.residual.numpy(), []
-    for k in places:
-        h = q.T @ white @ (np.arange(60) >= k)
+    for function in sudden.functions.T.numpy():
+        h = q.T @ white @ function
         h = h / np.linalg.norm(h)
         for size in SIZES.tolist():
             larger = np.eye(58) + size**2 * np.outer(h, h)
@@ -68,27 +67,40 @@ def test_the_evidence_of_a_step_is_the_ratio_of_two_normal_densities():
 def test_noise_alone_has_no_more_evidence_than_it_should():
     """A ratio of likelihoods has the mean 1 under noise, so that at most a share 1/c of it is larger than c."""
     found, noise = calibrated(stepped(1, size=0.0), noise=0.1)
-    steps, residual = only(found), Residual(found, noise, draws=2000)
+    sudden, residual = only(found), Residual(found, noise, draws=2000)
     ratio = []
     for e in residual.null.T:
         residual.e = e
-        ratio.append(math.exp(steps.evidence(residual)[0]))
+        ratio.append(math.exp(sudden.evidence(residual)[0]))
     for c in (2.0, 5.0, 20.0):
         assert np.mean(np.array(ratio) > c) < 1 / c + 4 * math.sqrt(1 / c / 2000)
     assert np.median(ratio) > 0.05
 
 
-def test_steps_are_of_one_output_in_one_run_between_different_conditions():
+def split(functions):
+    """How many steps and bumps there are."""
+    steps = ((functions == 0) | (functions == 1)).all(0)
+    return int(steps.sum()), int((~steps).sum())
+
+
+def test_sudden_changes_are_of_one_output_in_one_run_between_different_conditions():
+    found, _ = calibrated(stepped(2), noise=0.1)
+    functions = only(found).functions
+    assert split(functions) == (51, 72)
+    assert int((functions != 0).sum(0).min()) >= LEAST
+    bumps = functions[:, 51:]
+    widths = sorted({round(float(w), 2) for w in bumps.sum(0) / math.sqrt(2 * math.pi) * X[1]}, reverse=True)
+    assert widths[0] == pytest.approx(8 * 1.5 * X[1] / 2, rel=0.05)  # of whole bumps: 1.5, 3 and 6 gaps
     x = X.copy()
     x[20:24] = x[20]  # replicates are on one side
     found, _ = calibrated(stepped(2, x=x), x, noise=0.1)
-    assert only(found).functions.shape[1] == 51 - 3
+    assert split(only(found).functions)[0] == 51 - 3
     long = np.linspace(0, 10, 1000)
     found, _ = calibrated(stepped(2, x=long), long, noise=0.1)
-    assert only(found).functions.shape == (1000, 199)
-    assert only(found).functions.shape[1] <= MOST
+    assert split(only(found).functions)[0] == MOST
+    assert split(only(found).functions)[1] < 1.5 * MOST
     few, _ = calibrated(stepped(2)[:9], X[:9], noise=0.1)
-    assert steps_of(few.problem, channels(few.problem, few)) == []
+    assert sudden_changes(few.problem, channels(few.problem, few)) == []
     two = tc.ODESimulator(
         rates=lambda t, s, p, u: {"T": -p["k"] * s["T"], "S": -p["k"] * s["S"]},
         states={"T": "K", "S": "K"}, parameters=[tc.Parameter("k", low=0, initial=0.3)],
@@ -97,18 +109,22 @@ def test_steps_are_of_one_output_in_one_run_between_different_conditions():
     runs = [tc.Run(time=t, outputs={"T": size * torch.exp(-0.3 * t), "S": torch.exp(-0.3 * t)},
                    initial={"T": size, "S": 1.0}) for size in (5.0, 3.0)]  # fmt: skip
     found, _ = calibrate_base(Problem.of(two, tc.Recording(runs=runs, noise=0.1)), {}, 2, 0)
-    each = steps_of(found.problem, channels(found.problem, found))
-    assert [steps.functions.shape for steps in each] == [(80, 22), (80, 22)]
-    for k, steps in enumerate(each):
+    each = sudden_changes(found.problem, channels(found.problem, found))
+    assert [split(one.functions)[0] for one in each] == [22, 22]
+    for k, sudden in enumerate(each):
         output, run = found.problem.output_of, found.problem.recording.x["run"][found.problem.condition_of]
-        for column in steps.functions.T:
+        for column in sudden.functions.T:
             assert set(output[column != 0].tolist()) == {k}
             assert len(run[column != 0].unique()) == 1
+    many, _ = calibrated(stepped(2), np.repeat([1.0, 2.0], 30), noise=0.1)
+    assert split(only(many).functions) == (1, 0)  # between the two
+    same, _ = calibrated(stepped(2), np.repeat([1.0], 60), noise=0.1)
+    assert sudden_changes(same.problem, channels(same.problem, same)) == []
     x = {"x": torch.as_tensor(X), "z": torch.as_tensor(np.random.default_rng(0).uniform(0, 1, 60))}
     simulator = tc.Simulator(lambda x, p: p["a"] + p["b"] * x["x"] + 0 * x["z"], parameters())
     several = Problem.of(simulator, tc.Recording(x=x, y=torch.as_tensor(stepped(3)), noise=0.1))
     found, _ = calibrate_base(several, {}, 2, 0)
-    assert [Steps.of(several, c) for c in channels(several, found) if c.kind == "output"] == [None]
+    assert [Sudden.of(several, c) for c in channels(several, found) if c.kind == "output"] == [None]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -121,6 +137,19 @@ def test_a_step_in_white_noise_is_no_slow_noise(seed):
     assert float(unknown.sd[0]) == pytest.approx(0.1, rel=0.35)
 
 
+def test_a_bump_in_white_noise_is_no_slow_noise():
+    clear = []
+    for seed in range(6):
+        bump = 0.9 * np.exp(-0.5 * ((X - 6) / 0.3) ** 2)
+        found, noise = calibrated(stepped(seed, size=0.0) + bump)
+        unknown, evidence = with_unknown(found, None, Tangents.of(found, noise), noise.unit)
+        clear.append(evidence > settled(found, noise, Tangents.of(found, noise))[1] + 5)
+        if clear[-1]:
+            assert float(unknown.correlation[0]) <= 0.5  # alone 0.65 to 0.8, of an sd of 0.2
+            assert float(unknown.sd[0]) == pytest.approx(0.1, rel=0.35)
+    assert sum(clear) >= 4
+
+
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_a_step_that_is_in_no_list_is_something_missing_where_the_noise_is_unknown(seed):
     simulator = tc.Simulator(line, parameters())
@@ -129,3 +158,79 @@ def test_a_step_that_is_in_no_list_is_something_missing_where_the_noise_is_unkno
     d = tc.diagnose(simulator, recording, [bend], seed=0, progress=False)
     assert d.verdict == "unexplained"
     assert float(d.noise.sd["y"]) < 0.2
+
+
+def place_of(y, driver="x", target="y", function=line, free=parameters, **options):
+    """The smooth change of an output along a condition, and the residual it was found in."""
+    recording = tc.Recording(x=torch.as_tensor(X), y=torch.as_tensor(y), **{"noise": 0.1, **options})
+    found, noise = calibrate_base(Problem.of(tc.Simulator(function, free()), recording), {}, 2, 0)
+    residual = Residual(found, noise)
+    places = analyse(residual, every=True).places
+    return residual, next(p for p in places if (p.channel.target, p.driver) == (target, driver) and p.period is None)
+
+
+def test_a_change_between_two_steps_is_found_with_its_edges_and_its_size():
+    inside = (X > 3) & (X < 7)
+    residual, smooth = place_of(1 + 0.3 * X + 0.8 * inside + 0.1 * np.random.default_rng(0).standard_normal(60))
+    found = stepwise(residual, smooth)
+    assert found.evidence > smooth.evidence + SURER
+    assert found.edges == pytest.approx((3.0, 7.0), abs=0.2)
+    wanted = 0.8 * inside
+    for k in (10, 30, 50):
+        assert float(found.profile[k]) == pytest.approx(wanted[k], abs=0.1 + 2 * float(found.sd[k]))
+    assert float(found.sd.max()) < 0.3
+    assert found.share > 0.9
+
+
+def test_what_is_smooth_stays_smooth_and_so_does_what_few_points_show():
+    noise = 0.1 * np.random.default_rng(1).standard_normal(60)
+    for change in (np.sin(2 * X), 0.05 * (X - 5) ** 2):
+        residual, smooth = place_of(1 + 0.3 * X + change + noise)
+        assert smooth.evidence > 10
+        assert stepwise(residual, smooth) is smooth
+    residual, smooth = place_of(1 + 0.3 * X + 1.5 * (X > 9.6) + noise)
+    found = stepwise(residual, smooth, surer=-math.inf)
+    low, high = found.edges if len(found.edges) > 1 else (found.edges[0], math.inf)
+    assert 5 <= int(((X > low) & (X < high)).sum()) <= 55
+
+
+def test_a_step_is_of_the_fewer_points_where_a_constant_tells_nothing():
+    noise = 0.1 * np.random.default_rng(2).standard_normal(60)
+    for at, side in ((6.0, X > 6), (2.0, X > 2)):
+        residual, smooth = place_of(1 + 0.3 * X + 0.8 * side + noise)
+        found = stepwise(residual, smooth)
+        assert found.edges == pytest.approx((at,), abs=0.2)
+        wanted = 0.8 * side if side.mean() < 0.5 else 0.8 * side - 0.8
+        assert float((found.profile - torch.as_tensor(wanted)).abs().median()) < 0.15
+    # Through the origin a constant tells.
+    residual, smooth = place_of(
+        0.3 * X + 0.8 * (X > 2) + noise, function=lambda x, p: p["b"] * x, free=lambda: [tc.Parameter("b", initial=0.5)]
+    )
+    found = stepwise(residual, smooth)
+    assert found.edges == pytest.approx((2.0,), abs=0.2)
+    assert float((found.profile - torch.as_tensor(0.8 * (X > 2))).abs().median()) < 0.15
+
+
+def test_a_source_that_begins_at_some_time_is_told_with_the_time_and_its_rate():
+    rng = np.random.default_rng(0)
+    t = torch.linspace(0, 40, 120, dtype=torch.float64)
+    k, source, begins = 0.8, 0.6, 22.0
+    on = (t - begins).clamp_min(0)
+    after = source / k * (1 - torch.exp(-k * on))
+    truth = 20 + 30 * torch.exp(-k * t) + after
+    body = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"T": -p["k"] * (s["T"] - 20)}, states={"T": "degC"},
+        parameters=[tc.Parameter("k", unit="1/s", low=0.0, initial=0.2)],
+    )  # fmt: skip
+    data = truth + 0.3 * torch.as_tensor(rng.standard_normal(120))
+    recording = tc.Recording(runs=[tc.Run(time=t, outputs={"T": data})], noise=0.3, units={"time": "s", "T": "degC"})
+    d = tc.diagnose(body, recording, [], seed=0, progress=False)
+    assert d.verdict == "unexplained"
+    place = d.where[0]
+    assert (place.kind, place.target, place.driver) == ("equation", "T", "t")
+    assert place.edges == pytest.approx((begins,), abs=1.0)
+    text = str(d).replace("\n", " ")
+    assert "jumps with t (at 2" in text
+    assert "one constant change on one side removes" in text
+    wanted = source * (d.missing.time > begins).double()
+    assert float((d.missing.along - wanted).norm() / wanted.norm()) < 0.25

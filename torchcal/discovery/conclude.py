@@ -12,7 +12,7 @@ from torchcal.discovery.findings.limits import limits
 from torchcal.discovery.findings.ranking import ranking
 from torchcal.discovery.findings.result import Diagnosis
 from torchcal.discovery.findings.symptoms import more_than_replicates, symptoms, unlike
-from torchcal.discovery.findings.where import locate, missing_rate, needed_shifts
+from torchcal.discovery.findings.where import locate, missing_rate, needed_shifts, sharpened
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.hypotheses import verify
 from torchcal.discovery.hypotheses.model import Model
@@ -112,13 +112,14 @@ def conclude(
                 more = [name for name in larger.names if name not in best.names]
                 other = explain.estimates(larger.found, larger.found.free)
                 depends = explain.depends(final.estimates, other, more)
+    places = [] if decision.verdict == "consistent" else sharpened(search)
     return Diagnosis(
         verdict=decision.verdict,
         terms=_in_order(search, best) if best else [],
         tied=decision.tied,
         where=Table([], ("kind", "target"))
         if decision.verdict == "consistent"
-        else locate(search, shown, named=best is not None),
+        else locate(search, places, shown, named=best is not None),
         ranking=ranking(search, decision, mask),
         detection_limit=limits(search, 1.0 - asked.confidence, POWER, contained),
         remaining=remaining,
@@ -135,8 +136,8 @@ def conclude(
             embed_each(search.base, search.noise, _embeddable(search)),
             ("parameter", "sd", "output_sd", "log_likelihood"),
         ),
-        shifts=needed_shifts(search) if decision.verdict != "consistent" else [],
-        missing=missing_rate(search) if decision.verdict != "consistent" else None,
+        shifts=needed_shifts(places),
+        missing=missing_rate(search, places),
         experiment=propose(decision.tied_models, search.noise) if decision.tied_models else None,
         equations=explain.formulas(best) if best else [],
         identifiability=explain.identifiability(search, best)

@@ -202,9 +202,10 @@ class Location:
         driver: What the mismatch varies with: a condition, ``"t"``, a state, an input, or ``"run"``, counted from 0.
         spans: Ranges of the driver in which it sits, ``((low, high), …)``.
         share: Share of the misfit beyond noise that a change there, varying with the driver, can remove.
-        evidence: Log evidence of an unknown change there, smooth or an oscillation, against none.
-        period: Of an oscillation, in units of the driver; None of a smooth change.
+        evidence: Log evidence of an unknown change there, smooth, an oscillation or in steps, against none.
+        period: Of an oscillation, in units of the driver; None of any other change.
         extent: How far the driver extends in the recording; None where nobody knows.
+        edges: Of a change in steps, the values of the driver where it begins or ends; none of any other change.
     """
 
     kind: str
@@ -215,6 +216,7 @@ class Location:
     evidence: float
     period: float | None = None
     extent: float | None = None
+    edges: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

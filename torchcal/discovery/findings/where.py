@@ -9,13 +9,14 @@ from torch import Tensor
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.places import Place
+from torchcal.discovery.misfit.steps import SURER, stepwise
 from torchcal.discovery.records import Location, MissingRate, NeededShift, Table
 from torchcal.discovery.verdicts.explain import removed
 from torchcal.errors import TorchcalError
 from torchcal.simulators import is_value_of
 from torchcal.terms import Term
 
-__all__ = ["locate", "missing_rate", "needed_shifts"]
+__all__ = ["locate", "missing_rate", "needed_shifts", "sharpened"]
 
 #: Shares of the evidence for an output, and for a parameter of several equations, that count beside an equation's.
 OUTPUT_SHARE, SEVERAL_SHARE = 0.8, 0.9
@@ -25,6 +26,8 @@ SURELY = 2.0
 SPAN_LEVEL = 0.3
 #: Share of the points up to which a gap between spans is none, nor a span beside wider ones.
 SLIVER = 0.02
+#: Digits of log evidence to which two changes are as likely.
+TIED = 4
 #: Log evidence from which on a place is listed, and how many are.
 LEAST_EVIDENCE, LISTED = 2.0, 8
 
@@ -58,11 +61,38 @@ def _ranges(values: Tensor, change: Tensor) -> tuple[tuple[float, float], ...]:
     return tuple((float(along[low]), float(along[high])) for low, high in (wide or found)[:6])
 
 
-def locate(search: Search, best: Model | None, *, named: bool = False) -> Table[Location]:
+def sharpened(search: Search) -> list[Place]:
+    """The places that a search found, by falling evidence, with steps in the stead of smooth changes where these are
+    likelier; they are where a constant change in a window has been found to be."""
+    known = _place_of_unnamed(search)
+    found = [
+        stepwise(search.residual, place, surer=0.0 if _key(place) == known else SURER)
+        if place.evidence >= LEAST_EVIDENCE else place
+        for place in search.structure.places
+    ]  # fmt: skip
+    # Steps along two drivers that rise together are one: then the smooth change tells which of the two.
+    return sorted(found, key=lambda place: -round(place.evidence, TIED))
+
+
+def _key(place: Place) -> tuple[str, str, str]:
+    """Kind, target and driver."""
+    return place.channel.kind, place.channel.target, place.driver
+
+
+def _place_of_unnamed(search: Search) -> tuple[str, str, str] | None:
+    """Kind, target and driver of the likeliest change in a window that has no name, where there is one."""
+    unnamed = search.unnamed
+    return None if unnamed is None or unnamed.window is None else (*_acts_on(unnamed), unnamed.window.driver)
+
+
+def locate(
+    search: Search, found: Sequence[Place], best: Model | None, *, named: bool = False
+) -> Table[Location]:
     """Where the mismatch sits; a local term says it best, and of a name what it acts on comes first.
 
     Args:
         search: The finished one.
+        found: Its places.
         best: The accepted model, or the likeliest of those that are tied; None where there is none.
         named: Whether it is accepted.
     """
@@ -77,11 +107,12 @@ def locate(search: Search, best: Model | None, *, named: bool = False) -> Table[
         high = w.high if math.isfinite(w.high) else float(drivers.max())
         kind, target = _acts_on(local)
         share, evidence, extent = removed(search, local), _evidence(search, local), _extent(drivers)
-        rows.append(Location(kind, target, w.driver, ((low, high),), share, evidence, extent=extent))
+        edges = tuple(end for end in (w.low, w.high) if math.isfinite(end)) if local is search.unnamed else ()
+        rows.append(Location(kind, target, w.driver, ((low, high),), share, evidence, extent=extent, edges=edges))
     sensor = best is not None and _acts_on(best)[0] == "output"  # then it has been shown to be the output
     places = [
         place
-        for place in (search.structure.places if sensor else _by_plausibility(search))
+        for place in (found if sensor else _by_plausibility(search, found))
         if place.evidence >= LEAST_EVIDENCE
     ]
     if named and best is not None and best.window is None:
@@ -92,12 +123,12 @@ def locate(search: Search, best: Model | None, *, named: bool = False) -> Table[
     seen: set[tuple[str, str]] = set()
     told = {(row.kind, row.target, row.driver) for row in rows}
     for place in places:
-        key = (place.channel.kind, place.channel.target)
-        if key in seen or (*key, place.driver) in told:
+        key = _key(place)
+        if key[:2] in seen or key in told:
             continue
-        seen.add(key)
+        seen.add(key[:2])
         extent = _extent(place.channel.drivers[place.driver])
-        rows.append(Location(*key, place.driver, _spans(place), place.share, place.evidence, place.period, extent))
+        rows.append(Location(*key, _spans(place), place.share, place.evidence, place.period, extent, place.edges))
         if len(seen) >= LISTED:
             break
     return Table(rows[:LISTED], ("kind", "target", "driver", "spans", "share", "evidence"))
@@ -202,10 +233,10 @@ def _equations(term: Term) -> list[str]:
     return [name for name in term.rates if name not in term.states] or list(term.rates)
 
 
-def needed_shifts(search: Search) -> list[NeededShift]:
-    """The shift of each parameter against the driver that it varies with most."""
+def needed_shifts(found: Sequence[Place]) -> list[NeededShift]:
+    """The shift of each parameter against the driver that it varies with most, of the places that were found."""
     rows: dict[str, Place] = {}
-    for place in search.structure.places:
+    for place in found:
         if place.channel.kind == "parameter" and place.channel.target not in rows and place.evidence > 0:
             rows[place.channel.target] = place
     result = []
@@ -226,7 +257,7 @@ def _ranks(values: Tensor) -> Tensor:
     return (counts.cumsum(0) - 0.5 * (counts - 1).double())[number]
 
 
-def _by_plausibility(search: Search) -> list[Place]:
+def _by_plausibility(search: Search, found: Sequence[Place]) -> list[Place]:
     """Places by falling evidence, where it counts in full in time only for one equation.
 
     A change of an output can copy whatever any equation does to that output, and instruments err in simple ways: but a
@@ -236,7 +267,7 @@ def _by_plausibility(search: Search) -> list[Place]:
     def weight(place: Place) -> float:
         return place.evidence * (_plausible(search, place) if search.problem.in_time else 1.0)
 
-    return sorted(search.structure.places, key=lambda place: -weight(place))
+    return sorted(found, key=lambda place: -weight(place))
 
 
 def _plausible(search: Search, place: Place) -> float:
@@ -269,20 +300,17 @@ def _possible(search: Search, place: Place) -> bool:
 
 def _first_unnamed(search: Search, places: list[Place]) -> list[Place]:
     """Places with that of the likeliest change that has no name first, where there is one."""
-    unnamed = search.unnamed
-    if unnamed is None or unnamed.window is None:
-        return places
-    there = (*_acts_on(unnamed), unnamed.window.driver)
-    return sorted(places, key=lambda place: (place.channel.kind, place.channel.target, place.driver) != there)
+    there = _place_of_unnamed(search)
+    return sorted(places, key=lambda place: _key(place) != there)
 
 
-def missing_rate(search: Search) -> MissingRate | None:
-    """The best unknown change, smooth or a wave, of one equation, output or parameter.
+def missing_rate(search: Search, found: Sequence[Place]) -> MissingRate | None:
+    """The best unknown change of one equation, output or parameter, of the places that were found.
 
     A parameter that changes in time and acts in one equation is a missing rate of that equation, in one run: what it
     does to the rate depends on the states too, which differ between runs at the same time.
     """
-    for place in _first_unnamed(search, _by_plausibility(search)):
+    for place in _first_unnamed(search, _by_plausibility(search, found)):
         channel = place.channel
         if place.evidence <= 0:
             continue

@@ -49,6 +49,13 @@ def where_in_words(d: Any) -> str:
             f"The mismatch sits in the {place.kind} {place.target} and oscillates with {place.driver} (period "
             f"{place.period:.3g}): a wave there {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
         )
+    if place.edges:
+        between_them = "in between" if len(place.edges) > 1 else "on one side"
+        at = " and ".join(between([(edge, edge) for edge in place.edges], "to", place.extent))
+        return (
+            f"The mismatch sits in the {place.kind} {place.target} and jumps with {place.driver} (at {at}): one "
+            f"constant change {between_them} {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
+        )
     return (
         f"The mismatch sits in the {place.kind} {place.target} and varies with {place.driver}{largest}: a smooth "
         f"change there {_does(place)}{_elsewhere(d)}.{_embedded(d)}"

@@ -18,14 +18,14 @@ from torchcal.discovery.misfit.channels import channels
 from torchcal.discovery.misfit.curves import orthonormal
 from torchcal.discovery.misfit.noise import GRID, LEAST, Noise, estimate, least, log_prior, mine
 from torchcal.discovery.misfit.residual import Residual
-from torchcal.discovery.misfit.steps import steps_of
+from torchcal.discovery.misfit.steps import sudden_changes
 from torchcal.discovery.misfit.structure import evidences, responses_of
 
 __all__ = ["Tangents", "alone", "log_likelihood", "log_normal", "settled", "with_unknown"]
 
 #: Places in `GRID` of the coefficients that are tried beside something unknown, and how often for every output.
 TRIED, ROUNDS = (0, 8, 16, 24, 30, 36), 2
-#: Waves and steps that are taken out of what is left, one after another.
+#: Waves and sudden changes that are taken out of what is left, one after another.
 ROUGH = 4
 #: Shares of the noise sd beyond smooth curves that are tried where there are several conditions: these curves may not
 #: bend as much there as what is unknown.
@@ -160,7 +160,7 @@ def with_unknown(
 ) -> tuple[Noise, float]:
     """The likeliest noise beside a model and something unknown, and the log evidence of the two.
 
-    That is smooth, a wave or a step.
+    That is smooth, a wave, a step or a bump.
 
     Args:
         model: The model's fit.
@@ -170,10 +170,10 @@ def with_unknown(
     """
     problem = model.problem
     available = [c for c in channels(problem, model) if c.kind in problem.kinds]
-    looks, steps = responses_of(problem, available), steps_of(problem, available)
+    looks, sudden = responses_of(problem, available), sudden_changes(problem, available)
 
     def likeliest(peeled: list[Fitted]) -> tuple[Noise, float, Tensor | None]:
-        """Beside what is unknown and the waves and steps taken out so far, near what is estimated without these."""
+        """Beside what is unknown, and the waves and sudden changes taken out so far, near what is estimated without."""
         noise = estimate(problem, peeled[-1].residual, model.jacobian, given, unit)
         found: dict[_Places, tuple[Noise, float, Tensor | None]] = {}
 
@@ -182,9 +182,9 @@ def with_unknown(
                 tried = _at(model, noise, *at)
                 w = tried.whitening(problem)
                 residuals = [Residual(weighed(one, w), tried, draws=0) for one in peeled]
-                seen, rough = evidences(residuals[-1], looks, available, steps)
+                seen, rough = evidences(residuals[-1], looks, available, sudden)
                 gain = max(seen) - math.log(len(seen)) if seen else -math.inf
-                gain += sum(max(evidences(one, (), available, steps)[0], default=0.0) for one in residuals[:-1])
+                gain += sum(max(evidences(one, (), available, sudden)[0], default=0.0) for one in residuals[:-1])
                 like = _log_density(w, residuals[0].e, tried, tangents, problem)
                 found[at] = tried, like + gain, rough
             return found[at][1]
@@ -205,7 +205,7 @@ def with_unknown(
 
     peeled = [model]
     noise, evidence, rough = likeliest(peeled)
-    while rough is not None and len(peeled) <= ROUGH:  # no noise is estimated from a wave or a step
+    while rough is not None and len(peeled) <= ROUGH:  # no noise is estimated from these
         peeled.append(dataclasses.replace(peeled[-1], y=peeled[-1].y + rough))
         fresh, more, rough = likeliest(peeled)
         if more <= evidence:

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchcal.discovery.misfit.channels import Channel
 from torchcal.discovery.misfit.residual import Residual
 
-__all__ = ["SIZES", "SMALL", "Change", "Place", "evidence_of"]
+__all__ = ["SIZES", "SMALL", "Change", "Place", "evidence_of", "is_unseen"]
 
 #: Singular values below this share of the largest are none.
 SMALL = 1e-6
@@ -21,7 +21,7 @@ SIZES = torch.logspace(-0.3, 3.0, 14, dtype=torch.float64)
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """An unknown change of one channel against one driver: smooth, or an oscillation.
+    """An unknown change of one channel against one driver: smooth, an oscillation, or in steps.
 
     Attributes:
         channel: Where.
@@ -31,7 +31,8 @@ class Place:
         profile: Estimated change at the channel's points, ``(K,)``; its median is 0 where the base's parameters make
             up for one that is the same everywhere.
         sd: Its standard deviation there.
-        period: Of an oscillation, in units of the driver; None of a smooth change.
+        period: Of an oscillation, in units of the driver; None of any other change.
+        edges: Of a change in steps, where these are.
     """
 
     channel: Channel
@@ -41,6 +42,7 @@ class Place:
     profile: Tensor
     sd: Tensor
     period: float | None = None
+    edges: tuple[float, ...] = ()
 
 
 def evidence_of(u: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:
@@ -93,7 +95,7 @@ class Change:
         removed = float(((1 - (1 - shrink).square()) * self.along.square()).sum())
         share = residual.share(removed, float(shrink.sum()))
         features, profile = self.features, self.features @ weights
-        if _is_unseen(channel, residual):
+        if is_unseen(channel, residual):
             features, profile = features - features.mean(0), profile - profile.median()
         within = (features @ self.v) / (1 + gain).sqrt()
         # What the data say nothing about keeps its prior sd.
@@ -102,7 +104,7 @@ class Change:
         return Place(channel, driver, float(evidence[0]), share, profile, sd)
 
 
-def _is_unseen(channel: Channel, residual: Residual) -> bool:
+def is_unseen(channel: Channel, residual: Residual) -> bool:
     """Whether the base's parameters make up for a change that is the same everywhere, so that it may be any."""
     change = channel.response(channel.time.new_ones(len(channel.time), 1))
     return float(residual.tangent(change).norm()) <= SAME * float(residual.found.whitening(change).norm())

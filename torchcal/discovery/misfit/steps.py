@@ -1,9 +1,10 @@
-"""Steps of an output from one datum to the next: an instrument that was exchanged, or switched its range.
+"""Sudden changes: an instrument that was exchanged or switched its range, something that began, or acted for a while.
 
-Slow noise may take a step as well as physics, and what is left beyond smooth curves is hardly larger for it. One number
-says what a step does, and smooth functions need dozens.
+Few numbers say what a step or a bump does, and smooth functions need dozens. Slow noise may take it as well as physics,
+and what is left beyond smooth curves is hardly larger for it.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,68 +13,194 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.fits.problem import Problem
-from torchcal.discovery.misfit.channels import Channel
-from torchcal.discovery.misfit.places import SIZES
+from torchcal.discovery.misfit.channels import RUN, Channel
+from torchcal.discovery.misfit.places import SIZES, Place, is_unseen
 from torchcal.discovery.misfit.residual import Residual
 
-__all__ = ["Steps", "steps_of"]
+__all__ = ["SURER", "Sudden", "stepwise", "sudden_changes"]
 
-#: Data that there are at least on either side of a step: fewer may be outliers.
+#: Data, or points of a channel, that there are at least on either side of a step: fewer may be outliers.
 LEAST = 5
-#: Places of a step that are tried in an output, evenly among its data.
+#: Steps that are tried in an output, evenly among its data, and about how many bumps.
 MOST = 200
-#: Share of its norm that the base's tangents leave of a step at least, for it to be seen.
+#: Sd of the narrowest bump, in usual gaps between data, and of the widest, as a share of a run.
+NARROW, WIDE = 1.5, 0.125
+#: Places of the two steps along a driver that are tried in all pairs, and around each of the best two.
+COARSE, FINE = 40, 12
+#: Log evidence by which steps must be likelier than a smooth change: they are the rarer.
+SURER = 3.0
+#: Share of its norm that the base's tangents leave of a step's effect at least, for it to be seen.
 SEEN = 1e-6
 
 
+def _logs(along: Tensor) -> Tensor:
+    """Log evidence of effects of unit norm for each of `SIZES`, ``(sizes, …)``, by the residual along them."""
+    shrink = _shrink().reshape(-1, *(1 for _ in along.shape))
+    return 0.5 * (shrink * along.square() + torch.log1p(-shrink))
+
+
+def _shrink() -> Tensor:
+    """Share of what the residual has along an effect that is taken for the effect, for each of `SIZES`."""
+    return SIZES.square() / (1 + SIZES.square())
+
+
 @dataclass(frozen=True, eq=False)
-class Steps:
-    """Steps of one output, each in one of its runs, at any of some places.
+class Sudden:
+    """Steps and bumps of one output, each in one of its runs, at any of some places.
 
     Attributes:
-        functions: 0 before a step, 1 from there on to the end of its run, ``(n, K)``.
+        functions: 0 before a step, 1 from there on to the end of its run; normal curves; ``(n, K)``.
     """
 
     functions: Tensor
 
     @classmethod
-    def of(cls, problem: Problem, channel: Channel) -> "Steps | None":
+    def of(cls, problem: Problem, channel: Channel) -> "Sudden | None":
         """Of an output; None where its data follow in nothing, or are too few."""
         if problem.order is None:
             return None
         number, along = problem.recording.outputs.index(channel.target), problem.order[problem.condition_of]
-        found = []
-        for places in problem.sequences:
-            if int(problem.output_of[places[0]]) != number:
-                continue
-            apart = along[places].diff() > 0
-            found += [places[k:] for k in range(LEAST, len(places) - LEAST + 1) if bool(apart[k - 1])]
-        if not found:
-            return None
-        chosen = found[:: math.ceil(len(found) / MOST)]
-        functions = torch.zeros(problem.n, len(chosen), dtype=torch.float64)
-        for column, after in enumerate(chosen):
-            functions[after, column] = 1.0
-        return cls(functions)
+        own = [p for p in problem.sequences if int(problem.output_of[p[0]]) == number and len(p) >= 2 * LEAST]
+        found = [torch.zeros(problem.n, 0, dtype=torch.float64)]
+        for places in own:
+            most = max(MOST // len(own), 1)
+            each = torch.cat([_steps(along[places], most), _bumps(along[places], most)], dim=1)
+            found.append(torch.zeros(problem.n, each.shape[1], dtype=torch.float64).index_copy_(0, places, each))
+        functions = torch.cat(found, dim=1)
+        return cls(functions) if functions.shape[1] else None
 
     def evidence(self, residual: Residual) -> tuple[float, Tensor]:
-        """Log evidence of a step against none, with all places and `SIZES` as likely, and the likeliest step ``(n,)``.
+        """Log evidence of one of them against none, with all and all `SIZES` as likely, and the likeliest ``(n,)``.
 
-        The size is that of the step's whitened effect beyond what the base's parameters make up for.
+        The size is that of its whitened effect beyond what the base's parameters make up for.
         """
         whitened = residual.found.whitening(self.functions)
         columns = residual.project(whitened)
         norm = columns.norm(dim=0)
         seen = norm > SEEN * whitened.norm(dim=0)
         along = (columns.T @ residual.e / norm).where(seen, 0.0)
-        shrink = (SIZES.square() / (1 + SIZES.square()))[:, None]
-        logs = 0.5 * (shrink * along.square() + torch.log1p(-shrink))  # (sizes, K)
+        logs = _logs(along)
         size, place = divmod(int(logs.argmax()), logs.shape[1])
-        step = float(shrink[size, 0] * along[place] / norm[place]) if bool(seen[place]) else 0.0
-        return float(logs.logsumexp((0, 1))) - math.log(logs.numel()), step * self.functions[:, place]
+        height = float(_shrink()[size] * along[place] / norm[place]) if bool(seen[place]) else 0.0
+        return float(logs.logsumexp((0, 1))) - math.log(logs.numel()), height * self.functions[:, place]
 
 
-def steps_of(problem: Problem, available: Sequence[Channel]) -> list[Steps]:
-    """Of all outputs."""
-    found = (Steps.of(problem, channel) for channel in available if channel.kind == "output")
-    return [steps for steps in found if steps is not None]
+def sudden_changes(problem: Problem, available: Sequence[Channel]) -> list[Sudden]:
+    """Steps and bumps of all outputs."""
+    found = (Sudden.of(problem, channel) for channel in available if channel.kind == "output")
+    return [sudden for sudden in found if sudden is not None]
+
+
+def _steps(along: Tensor, most: int) -> Tensor:
+    """Steps between values ``(m,)`` that rise, with enough of them on either side, ``(m, K)``."""
+    number = torch.arange(LEAST, len(along) - LEAST + 1)
+    number = number[along[number] > along[number - 1]]
+    return (torch.arange(len(along))[:, None] >= _evenly(number, most)).double()
+
+
+def _bumps(along: Tensor, most: int) -> Tensor:
+    """Normal curves over values ``(m,)`` that rise, of widths that double, with centres a width apart, ``(m, K)``."""
+    span, gap = float(along[-1] - along[0]), float(along.diff().median())
+    width, found = NARROW * max(gap, span / most), []
+    while gap > 0 and width <= WIDE * span:
+        centres = torch.linspace(float(along[0]), float(along[-1]), round(span / width) + 1, dtype=torch.float64)
+        found.append(torch.exp(-0.5 * ((along[:, None] - centres) / width).square()))
+        width *= 2.0
+    return torch.cat(found, dim=1) if found else torch.zeros(len(along), 0, dtype=torch.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Between:
+    """Constant changes of a channel between any of some lower and any of some upper ends, the lower one included.
+
+    Attributes:
+        inside: Which points are in between, bool ``(L, U, K)``.
+        there: Which pairs of ends have enough points in between and outside, and are seen, bool ``(L, U)``.
+        norm: Of their effects, ``(L, U)``.
+        along: The residual along their effects, scaled to unit norm, ``(L, U)``.
+    """
+
+    inside: Tensor
+    there: Tensor
+    norm: Tensor
+    along: Tensor
+
+    @classmethod
+    def of(cls, residual: Residual, channel: Channel, values: Tensor, low: Tensor, high: Tensor) -> "_Between":
+        """Between ends ``(L,)`` and ``(U,)`` of the values ``(K,)`` of a driver."""
+        from_low, from_high = ((values >= ends[:, None]) for ends in (low, high))
+        inside = from_low[:, None] & ~from_high
+        count = inside.sum(-1)
+        lower, upper = (residual.tangent(channel.response(one.double().T)) for one in (from_low, from_high))
+        square = lower.square().sum(0)[:, None] + upper.square().sum(0) - 2 * lower.T @ upper
+        whole = residual.found.whitening(channel.response(torch.ones(len(values), 1, dtype=torch.float64)))
+        seen = square > max(SEEN * float(whole.norm()), 1e-150) ** 2
+        there = (low[:, None] < high) & (count >= LEAST) & (len(values) - count >= LEAST) & seen
+        norm = square.where(there, 1.0).sqrt()
+        along = ((lower.T @ residual.e)[:, None] - upper.T @ residual.e) / norm
+        return cls(inside, there, norm, along.where(there, 0.0))
+
+    def logs(self) -> Tensor:
+        """Log evidence of each, ``(sizes, L, U)``; −∞ of such as there are none."""
+        return _logs(self.along).where(self.there, -math.inf)
+
+
+def stepwise(residual: Residual, place: Place, *, surer: float = SURER) -> Place:
+    """A smooth change of a place, or in its stead a constant one that begins, ends, or both, where that is likelier.
+
+    Its profile is the mean over all ends around the likeliest, by how likely they are, so that its edges are as sharp
+    as the data tell. Where the base's parameters make up for a constant, it is 0 at the more points.
+
+    Args:
+        residual: The fit's.
+        place: Of a smooth change.
+        surer: Log evidence by which the other must be likelier.
+    """
+    channel, values = place.channel, place.channel.drivers[place.driver]
+    levels = values.unique()
+    cuts = 0.5 * (levels[1:] + levels[:-1])
+    if place.period is not None or place.driver == RUN or len(cuts) < 2 * LEAST:
+        return place
+    coarse, open_end = _evenly(cuts, COARSE), torch.full((1,), math.inf, dtype=torch.float64)
+    low, high = torch.cat([-open_end, coarse]), torch.cat([coarse, open_end])
+    every = _Between.of(residual, channel, values, low, high)
+    if not bool(every.there.any()) or not bool(torch.isfinite(every.along).all()):
+        return place
+    logs = every.logs()
+    i, j = divmod(int(logs.amax(0).argmax()), len(high))
+    low, high = _around(cuts, low, i), _around(cuts, high, j)
+    near = _Between.of(residual, channel, values, low, high)
+    closer = near.logs()
+    tried = len(SIZES) * int(every.there.sum())
+    evidence = max(float(logs.logsumexp((0, 1, 2))), float(closer.logsumexp((0, 1, 2))) - math.log(near.there.sum()))
+    evidence -= math.log(tried)
+    if evidence < place.evidence + surer:
+        return place
+    weight, shrink = (closer - closer.logsumexp((0, 1, 2))).exp(), _shrink()[:, None, None]
+    mean, inside = shrink * near.along / near.norm, near.inside
+    if is_unseen(channel, residual):
+        most = inside.double().mean(-1) > 0.5
+        mean, inside = torch.where(most, -mean, mean), inside ^ most[..., None]
+    inside = inside.double()
+    profile = torch.einsum("slu,luk->k", weight * mean, inside)
+    square = torch.einsum("slu,luk->k", weight * (mean.square() + shrink / near.norm.square()), inside)
+    sd = (square - profile.square()).clamp_min(0.0).sqrt()
+    size, i, j = (int(at) for at in torch.unravel_index(closer.argmax(), closer.shape))
+    removed = float((1 - (1 - _shrink()[size]).square()) * near.along[i, j].square())
+    edges = tuple(end for end in (float(low[i]), float(high[j])) if math.isfinite(end))
+    share = residual.share(removed, 1.0 + len(edges))
+    return dataclasses.replace(place, evidence=evidence, share=share, profile=profile, sd=sd, edges=edges)
+
+
+def _evenly(cuts: Tensor, count: int) -> Tensor:
+    """At most so many of some ascending values, evenly among them."""
+    return cuts[torch.linspace(0, len(cuts) - 1, min(count, len(cuts))).round().long().unique()]
+
+
+def _around(cuts: Tensor, ends: Tensor, number: int) -> Tensor:
+    """Of all cuts such as lie between the neighbours of one end; an open end stays."""
+    end = ends[number]
+    if not math.isfinite(end):
+        return end[None]
+    near = cuts[(cuts >= ends[max(number - 1, 0)]) & (cuts <= ends[min(number + 1, len(ends) - 1)])]
+    return torch.cat([end[None], _evenly(near[near != end], FINE)]).sort().values

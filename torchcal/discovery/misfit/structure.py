@@ -19,7 +19,7 @@ from torchcal.discovery.misfit.lines import Lines, lines_of
 from torchcal.discovery.misfit.noise import quantisation
 from torchcal.discovery.misfit.places import SIZES, Change, Place, evidence_of
 from torchcal.discovery.misfit.residual import Residual
-from torchcal.discovery.misfit.steps import Steps
+from torchcal.discovery.misfit.steps import Sudden
 from torchcal.discovery.misfit.waves import wave_places
 
 __all__ = ["Structure", "analyse", "evidences", "responses_of"]
@@ -111,11 +111,12 @@ def _line_place(lines: Lines, residual: Residual) -> Place:
 
 
 def evidences(
-    residual: Residual, looks: Sequence[_Look], available: Sequence[Channel], steps: Sequence[Steps]
+    residual: Residual, looks: Sequence[_Look], available: Sequence[Channel], sudden: Sequence[Sudden]
 ) -> tuple[list[float], Tensor | None]:
-    """Log evidence for a smooth change of each channel against each driver, and oscillations and steps of each output.
+    """Log evidence for a smooth change of each channel against each driver, and oscillations and sudden changes of
+    each output.
 
-    Also returns the oscillation or step ``(n,)`` that the residual has where one is likelier than all else.
+    Also returns the oscillation or sudden change ``(n,)`` that the residual has where one is likelier than all else.
     """
     smooth: dict[int, float] = {}
     for key, _, change in _changes(residual, looks, residual.e[:, None]):
@@ -126,11 +127,11 @@ def evidences(
         if float(evidence[0]) > max([0.0, *found]):
             rough = lines.wave(residual.found.residual, residual.e, number, SIZES)[0]
         found.append(float(evidence[0]))
-    for each in steps:
-        of_step, step = each.evidence(residual)
-        if of_step > max([0.0, *found]):
-            rough = step
-        found.append(of_step)
+    for each in sudden:
+        likely, curve = each.evidence(residual)
+        if likely > max([0.0, *found]):
+            rough = curve
+        found.append(likely)
     return found, rough
 
 

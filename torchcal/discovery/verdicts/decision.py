@@ -42,7 +42,7 @@ class Decision:
         self.none = 0.0
         self.base = 1.0
         self.none_evidence = 0.0
-        self.none_note = "something unknown and smooth"
+        self.none_note = "something unknown"
         self.beside: tuple[str, ...] = ()
         self.withdrawn = ""
         self.doubt = ""
