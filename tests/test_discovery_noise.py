@@ -485,3 +485,30 @@ def test_what_acts_in_one_of_several_sweeps_is_told_where_it_was_taken_for_slow_
 def test_noise_that_is_alike_in_all_sweeps_is_not_told_to_differ(phi):
     found = [swept(seed, 0.0, phi=phi) for seed in range(10)]
     assert sum(any("not alike" in row for row in d.symptoms) for d in found) <= most(10, 0.01)
+
+
+@pytest.mark.parametrize("counts", [False, True])
+def test_noise_that_is_given_as_a_share_of_what_was_read_is_no_misfit(counts):
+    """An error bar of 5 % of each reading, or of the root of each count: what is left beyond smooth curves in units of
+    the noise had been nothing, as a constant and a tangent of the output are that noise."""
+    x = np.geomspace(0.5, 50, 60)
+    base = tc.Simulator(
+        lambda x, p: p["a"] * x["x"] ** p["n"],
+        [tc.Parameter("a", low=0.0, initial=1.0), tc.Parameter("n", low=0.0, high=2.0, initial=0.5)],
+    )
+    bent = tc.Term("bent", shifts={"n": lambda x, p: p["q"] * torch.log(x["x"])}, parameters=[tc.Parameter("q")])
+    terms = [bent, *tc.terms.sensor(outputs=("y",), static=True)]
+    p, correlations = [], []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        mean = 400 * x**0.3 if counts else 4 * x**0.7
+        y = rng.poisson(mean).astype(float) if counts else mean * (1 + 0.05 * rng.standard_normal(60))
+        sd = np.sqrt(y) if counts else 0.05 * y
+        recording = tc.Recording(x={"x": torch.tensor(x)}, y=torch.tensor(y), noise=torch.tensor(sd))
+        d = tc.diagnose(base, recording, terms, seed=0, progress=False)
+        assert not any("fastest part" in one for one in d.symptoms)
+        p.append(d.p_detect)
+        correlations.append(float(d.noise.correlation["y"]))
+    assert min(p) > 0.01 / 6 / 2
+    assert np.median(p) > 0.1
+    assert sum(c > 0.2 for c in correlations) <= 2  # of white noise

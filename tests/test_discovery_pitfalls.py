@@ -826,3 +826,51 @@ def test_a_term_may_free_what_differs_from_run_to_run():
     assert next(q.initial for q in d.improved.parameters if q.name == "pull") == pytest.approx(0.05, abs=0.05)
     with pytest.raises(tc.errors.DomainError, match="without the parameters that candidates free"):
         diagnose(base, tc.Recording(runs=runs, noise=0.02), [tilt], fixed={"pull[0]": 0.0})
+
+
+def test_what_varies_with_the_output_itself_is_found_where_that_follows_from_several_conditions():
+    """Ground that freezes and thaws keeps near 0 °C, at every depth at another time."""
+    depth, day = np.meshgrid([0.2, 0.5, 1.0, 2.0, 3.5], np.linspace(0, 365, 25), indexing="ij")
+    x = {"z": torch.tensor(depth.ravel()), "t": torch.tensor(day.ravel())}
+
+    def ground(x, p):
+        return p["T0"] + p["A"] * torch.exp(-x["z"] / p["d"]) * torch.sin(0.0172142 * x["t"] - x["z"] / p["d"])
+
+    base = tc.Simulator(
+        ground,
+        [tc.Parameter("T0", low=-20.0, high=10.0, initial=0.0), tc.Parameter("A", low=0.0, initial=8.0),
+         tc.Parameter("d", low=0.1, initial=1.5)],
+    )  # fmt: skip
+    T = ground(x, {"T0": torch.tensor(-2.0), "A": torch.tensor(12.0), "d": torch.tensor(2.2)})
+    rng = np.random.default_rng(0)
+    y = T - 0.8 * T * torch.exp(-((T / 1.5) ** 2)) + 0.25 * torch.tensor(rng.standard_normal(125))
+    d = tc.diagnose(base, tc.Recording(x=x, y=y), tc.terms.sensor(outputs=("y",), static=True), seed=0, progress=False)
+    assert d.verdict == "unexplained"
+    assert (d.where[0].kind, d.where[0].driver) == ("output", "y itself")
+    assert d.missing.driver == "y itself"
+    near = [abs(end) < 4 for span in d.where[0].spans for end in span]
+    assert sum(near) > len(near) / 2
+    assert float(d.missing.rate[d.missing.values.abs() < 2].abs().mean()) > 0.15
+    assert float(d.missing.rate[d.missing.values < -5].abs().mean()) < 0.15
+
+
+def test_a_lag_that_is_half_late_and_not_determined_is_no_name():
+    """A valve that creeps open is in no list. A lag of a third of the signal does as well, where its time constant is
+    that of the vessel: there share and time have no sd."""
+    t = torch.linspace(0, 90, 91, dtype=torch.float64)
+    runs, rng = [], np.random.default_rng(1)
+    for first in (8.0, 4.0):
+        p = first * torch.exp(-0.04 * (t + 0.0036 * ((t - 30) ** 2 - 900) / 2))
+        read = p + 0.04 * torch.tensor(rng.standard_normal(91))
+        runs.append(tc.Run(time=t, outputs={"p": read}, initial={"p": first}))
+    vessel = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"p": -p["k"] * s["p"]}, states={"p": "bar"},
+        parameters=[tc.Parameter("k", unit="1/s", low=0.0, initial=0.02)],
+    )  # fmt: skip
+    lag = [term for term in tc.terms.sensor(outputs=("p",)) if term.name == "lag of p"]
+    d = tc.diagnose(vessel, tc.Recording(runs=runs, noise=0.04), lag, seed=0, progress=False)
+    best = next(row for row in d.ranking if row.terms == ("lag of p",))
+    share = best.estimates[0]
+    assert abs(share.value - 1) > 0.3
+    assert not share.sd < 1
+    assert d.verdict != "named"

@@ -72,7 +72,7 @@ def located(term, *, inside=(), named=True):
         window=None, candidate=SimpleNamespace(terms=[term]), structure=SimpleNamespace(channels=list(inside))
     )
     with mock.patch.object(where, "_reads", return_value=set()):
-        return [(place.kind, place.target) for place in where.locate(search, model, named=named)]
+        return [(place.kind, place.target) for place in where.locate(search, places, model, named=named)]
 
 
 def rate(t, s, p, u):
@@ -109,9 +109,9 @@ def captured(monkeypatch, base, recording, terms):
     seen = []
     locate = where.locate
 
-    def spy(search, shown, **kwargs):
+    def spy(search, places, shown, **kwargs):
         seen.append((search, shown))
-        return locate(search, shown, **kwargs)
+        return locate(search, places, shown, **kwargs)
 
     monkeypatch.setattr(sys.modules["torchcal.discovery.conclude"], "locate", spy)
     tc.diagnose(base, recording, terms, progress=False)
@@ -128,7 +128,7 @@ def test_a_parameter_that_was_dormant_is_where_its_contribution_is_large(monkeyp
     recording = tc.Recording(x={"x": x, "z": z}, y=1 + x + 2 * z**4 + 0.05 * noise, noise=0.05)
     search, best = captured(monkeypatch, base, recording, [tc.Term("bowl", frees=("c",))])
     assert best.names == ("bowl",)
-    first = where.locate(search, best, named=True)[0]
+    first = where.locate(search, search.structure.places, best, named=True)[0]
     assert (first.kind, first.target, first.driver) == ("parameter", "c", "z")
     assert first.share > 0.95
     # What no constant and slope can do: z⁴ without its mean is large at the end, and small near 0.67.
@@ -156,8 +156,8 @@ def test_a_name_acts_by_what_it_is_a_function_of(monkeypatch):
     along = {place.driver: place for place in mine}
     # However likely the other condition is: the term is no function of it.
     search.structure.places[:] = [dataclasses.replace(along["Pr"], evidence=900.0), *search.structure.places]
-    assert where.locate(search, best, named=True)[0].driver == "Re"
-    assert where.locate(search, best)[0].driver == "Pr"
+    assert where.locate(search, search.structure.places, best, named=True)[0].driver == "Re"
+    assert where.locate(search, search.structure.places, best)[0].driver == "Pr"
 
 
 def test_what_a_term_in_time_is_a_function_of():
@@ -217,6 +217,15 @@ def test_spans_are_told_where_they_are_not_everywhere(driver, spans, told):
         verb = "differs from run to run" if driver == "run" else f"varies with {driver}"
         assert f"{verb}{told}: " in text
         assert ("per_run=True" in text) == (driver == "run" and verdict != "named")
+
+
+def test_a_term_in_a_window_is_told_by_its_name_and_steps_by_where_they_are():
+    term = where_in_words(finding(where=[Location("parameter", "k", "t", PART, 0.5, 20.0, terms=("drag",))]))
+    assert "varies with t (largest at 2 to 5): adding drag there removes 50 % of" in term
+    step = Location("output", "y", "t", PART, 0.5, 20.0, edges=(2.0,))
+    assert "jumps with t (at 2): one constant change on one side removes" in where_in_words(finding(where=[step]))
+    steps = Location("output", "y", "t", PART, 0.5, 20.0, extent=10.0, edges=(2.0, 5.0))
+    assert "jumps with t (at 2 and 5): one constant change in between removes" in where_in_words(finding(where=[steps]))
 
 
 def test_spans_over_decades_are_measured_in_decades():

@@ -206,6 +206,7 @@ class Location:
         period: Of an oscillation, in units of the driver; None of any other change.
         extent: How far the driver extends in the recording; None where nobody knows.
         edges: Of a change in steps, the values of the driver where it begins or ends; none of any other change.
+        terms: Where it is that some terms act, their names: the share is what they remove, and the evidence theirs.
     """
 
     kind: str
@@ -217,6 +218,7 @@ class Location:
     period: float | None = None
     extent: float | None = None
     edges: tuple[float, ...] = ()
+    terms: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -107,8 +108,11 @@ def locate(
         high = w.high if math.isfinite(w.high) else float(drivers.max())
         kind, target = _acts_on(local)
         share, evidence, extent = removed(search, local), _evidence(search, local), _extent(drivers)
-        edges = tuple(end for end in (w.low, w.high) if math.isfinite(end)) if local is search.unnamed else ()
-        rows.append(Location(kind, target, w.driver, ((low, high),), share, evidence, extent=extent, edges=edges))
+        if local is search.unnamed:
+            told: dict[str, Any] = {"edges": tuple(end for end in (w.low, w.high) if math.isfinite(end))}
+        else:
+            told = {"terms": local.names}
+        rows.append(Location(kind, target, w.driver, ((low, high),), share, evidence, extent=extent, **told))
     sensor = best is not None and _acts_on(best)[0] == "output"  # then it has been shown to be the output
     places = [
         place
@@ -121,10 +125,10 @@ def locate(
         if not places or (places[0].channel.kind, places[0].channel.target) not in own:
             rows.append(_contributed(search, best, [place.driver for place in places]))
     seen: set[tuple[str, str]] = set()
-    told = {(row.kind, row.target, row.driver) for row in rows}
+    known = {(row.kind, row.target, row.driver) for row in rows}
     for place in places:
         key = _key(place)
-        if key[:2] in seen or key in told:
+        if key[:2] in seen or key in known:
             continue
         seen.add(key[:2])
         extent = _extent(place.channel.drivers[place.driver])
@@ -206,7 +210,8 @@ def _contributed(search: Search, model: Model, drivers: Sequence[str]) -> Locati
     largest = torch.zeros_like(values).scatter_reduce(0, which, size.to(values), "amax")
     kind, target = _acts_on(model)
     spans, share, evidence = _ranges(values, largest), removed(search, model), _evidence(search, model)
-    return Location(kind, target, driver, spans, share, evidence, extent=_extent(values))
+    extent = _extent(values)
+    return Location(kind, target, driver, spans, share, evidence, extent=extent, terms=model.names)
 
 
 def _evidence(search: Search, model: Model) -> float:

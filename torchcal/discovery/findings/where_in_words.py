@@ -49,6 +49,12 @@ def where_in_words(d: Any) -> str:
             f"The mismatch sits in the {place.kind} {place.target} and oscillates with {place.driver} (period "
             f"{place.period:.3g}): a wave there {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
         )
+    if place.terms:
+        what = f"{' and '.join(place.terms)}{' together' if len(place.terms) > 1 else ''}"
+        return (
+            f"The mismatch sits in the {place.kind} {place.target} and varies with {place.driver}{largest}: "
+            f"adding {what} there {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
+        )
     if place.edges:
         between_them = "in between" if len(place.edges) > 1 else "on one side"
         at = " and ".join(between([(edge, edge) for edge in place.edges], "to", place.extent))

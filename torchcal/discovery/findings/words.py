@@ -341,9 +341,15 @@ def _ambiguous(d: Any) -> list[str]:
     if len(known) == 1:
         if d.settings.get("withdrawn"):
             return [where_in_words(d), d.settings["withdrawn"]]
-        if d.settings.get("doubt"):
-            return [where_in_words(d), f"{_hypothesis(d, known[0])} explains it best. {d.settings['doubt']}"]
         sure = sum(row.probability for row in d.ranking if set(known[0]) <= set(row.terms))
+        if d.settings.get("doubt"):
+            beside = [f"Something that is not in the library has a probability of {unknown:.2f}."]
+            return [
+                where_in_words(d),
+                f"The best explanation in the library is {_hypothesis(d, known[0])} (probability {sure:.2f}).",
+                d.settings["doubt"],
+                *(beside if unknown >= LISTED else []),
+            ]
         told = math.floor(100 * sure) / 100  # and never what would be enough
         return [
             where_in_words(d),
@@ -381,7 +387,9 @@ def _ambiguous(d: Any) -> list[str]:
     if d.settings.get("doubt"):
         best_of = {"It ": "The best of them ", "it ": "the best of them "}
         parts.append(re.sub(r"^It |\bit ", lambda found: best_of[found[0]], d.settings["doubt"], count=1))
-    if len(known) < len(d.tied):
+    if unknown > sum(shares):
+        parts.append(f"Something that is not in the library is likelier (probability {unknown:.2f}).")
+    elif len(known) < len(d.tied):
         share = f"probability {unknown:.2f}"
         if unknown < LISTED:
             share = f"though its probability is {_probability(unknown)}"

@@ -225,7 +225,7 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
     for number, name in enumerate(problem.recording.outputs):
         mine = (problem.output_of == number).double()
         own_drivers = {**at_data, f"{name} itself": found.y}
-        if not problem.in_time or name in at_data:
+        if name in at_data or (not problem.in_time and problem.order is not None):  # it is seen along another
             own_drivers.pop(f"{name} itself")
         list_.append(Channel("output", name, problem.recording.units.get(name), own_drivers, time, mine))
     return [c for c in list_ if math.isfinite(float(c.matrix.abs().sum()))]

@@ -57,11 +57,16 @@ def spread(column: Tensor) -> Tensor:
 
 
 def beyond(problem: Problem, places: Tensor, design: Tensor, unit: Tensor, *, ends: bool = False) -> Tensor:
-    """Orthonormal directions of one sequence that noise is looked for beyond, ``(len(places), m)``: smooth curves, and
-    tangents in units of the noise."""
-    own = design[places] / unit[problem.index[places]][:, None]
+    """Orthonormal directions of one sequence that noise is looked for beyond, ``(len(places), m)``: smooth curves and
+    tangents, both in units of the noise.
+
+    What is smooth is not so in these units: where they are a share of what was read, a constant and a tangent of the
+    output would take up all noise.
+    """
+    each = unit[problem.index[places]][:, None]
+    own, smooth = design[places] / each, smooth_columns(problem, places, ends=ends) / each
     share = max(int(len(places) * SMOOTH_SHARE), min(design.shape[1], len(places) // 2))
-    wide = torch.cat([smooth_columns(problem, places, ends=ends), orthonormal(own, most=share)], dim=1)
+    wide = torch.cat([smooth, orthonormal(own, most=share)], dim=1)
     return orthonormal(wide, most=int(0.6 * len(places)))
 
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.fits.candidates import spread_values
+from torchcal.discovery.fits.fitting import fit
 from torchcal.discovery.fits.local import is_window
 from torchcal.discovery.fits.readings import Reading, are_instruments
 from torchcal.discovery.hypotheses.model import Model
@@ -39,12 +40,24 @@ def unnatural(model: Model) -> str:
     for term in model.candidate.terms:
         for name, (expected, spread) in term.expected.items():
             full = term.full(name)
-            if abs(values[full] - expected) > APART * math.hypot(spread, sd[full]):
-                return (
-                    f"In nature {full} is {expected:g} within {spread:g}, and not {values[full]:.2g} ± "
-                    f"{sd[full]:.1g}: something else may have left as much."
-                )
+            off, nature = abs(values[full] - expected), f"In nature {full} is {expected:g} within {spread:g}, and"
+            if off > APART * math.hypot(spread, sd[full]):
+                return f"{nature} not {values[full]:.2g} ± {sd[full]:.1g}: something else may have left as much."
+            if off > APART * spread and _worse_at(model, full, expected) > APART**2:  # its sd says nothing at a fold
+                return f"{nature} with that the fit is worse: something else may have left as much."
     return ""
+
+
+def _worse_at(model: Model, name: str, value: float) -> float:
+    """How much larger χ² is with one parameter of a model's terms held at a value."""
+    found, candidate = model.found, model.candidate
+    place = [q.name for q in found.problem.parameters].index(name)
+    begin = found.values.expand(1 + len(candidate.shapes), -1).clone()
+    shapes = [k for k, i in enumerate(candidate.own) if i not in candidate.amplitudes]
+    begin[1:, [candidate.own[k] for k in shapes]] = candidate.shapes[:, shapes]
+    begin[:, place] = value
+    held = fit(found.problem, found.whitening, begin, [i for i in found.free if i != place])
+    return math.inf if held is None else held.chi2 - found.chi2
 
 
 def only_instruments(model: Model) -> bool:
