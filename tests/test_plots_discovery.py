@@ -430,6 +430,76 @@ def test_a_dense_map_draws_local_means():
 
 
 def test_a_driver_is_found_where_it_is():
+def grey(color):
+    return float(np.dot([0.2126, 0.7152, 0.0722], matplotlib.colors.to_rgb(color)))
+
+
+@pytest.mark.parametrize("size", [50, 3000])
+def test_points_of_a_dense_map_stand_out_from_what_is_shaded(size):
+    x = torch.linspace(0, 1, size, dtype=F64)
+    recording = Recording(x=x, y=noise(size), noise=1.0)
+    ax = plots.residual_map(recording, torch.zeros(size), torch.zeros(size), spans=[(0.2, 0.8)])
+    points = [line for line in ax.lines if line.get_label() == "_points"]
+    assert len(points) == 2
+    for line in points:
+        contrast = grey(discovery.pieces.NOISE) - grey(line.get_markerfacecolor())
+        assert line.get_alpha() * contrast > (0.25 if size == 50 else 0.08)
+        assert line.get_markersize() >= 3
+
+
+def test_residuals_of_each_level_of_another_condition_are_told_apart():
+    a = torch.linspace(-12, 12, 32, dtype=F64).repeat(3)
+    load = torch.tensor([2.0, 4.0, 6.0], dtype=F64).repeat_interleave(32)
+    recording = Recording(x={"a": a, "load": load}, y=load - 4.0, noise=0.1, units={"load": "kN"})
+    ax = plots.residual_map(recording, torch.zeros(96), torch.ones(96), driver="a")
+    shades = []
+    for level, height in ((2, -2.0), (4, 0.0), (6, 2.0)):
+        line = curve(ax, f"base model, load = {level} kN")
+        assert (set(line.get_ydata()), len(line.get_xdata())) == ({height}, 32)
+        shades.append(grey(line.get_markerfacecolor()))
+    assert shades == sorted(set(shades))
+    np.testing.assert_allclose(curve(ax, "base model, local mean").get_ydata()[1:-1], 0.0, atol=1.0)
+    assert len(curve(ax, "_points").get_xdata()) == 96  # of the accepted model, which should leave no levels
+    five = Recording(x={"a": a, "load": torch.arange(96) % 5}, y=a)
+    named = [name for name in labels(plots.residual_map(five, torch.zeros(96), driver="a")) if "load" in name]
+    assert named == ["base model, load = 0", "base model, load = 4"]
+    d = oscillator()
+    runs = plots.residual_map(d.recording, d.base, driver="t", values=d.recording.x["time"], output="v")
+    np.testing.assert_array_equal(
+        curve(runs, "base model, run 1").get_ydata(), (d.recording.y - d.base.prediction)[180:]
+    )
+
+
+@pytest.mark.parametrize(("periods", "drawn"), [(5, True), (25, True), (300, False)])
+def test_local_means_of_an_oscillation_are_finer_than_its_period(periods, drawn):
+    x = torch.linspace(0, 1, 600, dtype=F64)
+    wave = torch.sin(2 * math.pi * periods * x)
+    d = cooling()
+    d.recording = Recording(x=x, y=wave, noise=0.5)
+    d.base = d.final = fit(d.recording, torch.zeros(600, dtype=F64))
+    d.where = [Location("output", "y", "x", ((0.0, 1.0),), 1.0, 20.0, period=1 / periods)]
+    (part,) = [part for part in discovery.figure_parts(d) if part.key == "residuals"]
+    figure = plt.figure()
+    part.draw(figure)
+    assert ("base model, local mean" in labels(figure.axes[0])) == drawn
+    assert ("base model" in labels(figure.axes[0])) == (not drawn)  # then the points are named
+    if drawn:
+        mean = curve(figure.axes[0], "base model, local mean").get_ydata()
+        assert (np.diff(np.sign(mean)) != 0).sum() in range(2 * periods - 2, 2 * periods + 1)
+        assert np.sqrt((mean**2).mean()) == pytest.approx(math.sqrt(0.5), rel=0.1)
+
+
+def test_where_a_constant_change_begins_and_ends_is_marked():
+    d = cooling()
+    d.where = [Location("output", "y", "x", ((40.0, 60.0),), 1.0, 20.0, edges=(40.0, 60.0, 500.0))]
+    (part,) = [part for part in discovery.figure_parts(d) if part.key == "residuals"]
+    figure = plt.figure()
+    part.draw(figure)
+    lines = [line for line in figure.axes[0].lines if line.get_label() in ("change begins or ends", "_edge")]
+    assert [list(line.get_xdata()) for line in lines] == [[40.0, 40.0], [60.0, 60.0]]  # 500 is beyond the data
+    assert "change begins or ends" not in labels(plots.residual_map(d.recording, d.base))
+
+
     d = oscillator()
     np.testing.assert_array_equal(plots.driver_values(d.recording, "t"), d.recording.x["time"])
     np.testing.assert_array_equal(plots.driver_values(d.recording, "f"), d.recording.x["time"].sin())
@@ -752,7 +822,4 @@ def test_a_dollar_in_a_name_is_no_mathematics():
 
 @pytest.mark.parametrize("pair", [(discovery.BASE, discovery.ACCEPTED), (discovery.HELD_OUT, discovery.ACCEPTED)])
 def test_colours_differ_in_grey(pair):
-    def grey(color):
-        return float(np.dot([0.2126, 0.7152, 0.0722], matplotlib.colors.to_rgb(color)))
-
     assert abs(grey(pair[0]) - grey(pair[1])) > 0.2

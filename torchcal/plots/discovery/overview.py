@@ -150,20 +150,20 @@ def figure_parts(diagnosis: Any) -> list[FigurePart]:
     if values is None:
         driver = None
     spans = best.spans if best is not None and driver is not None else ()
+    told = {} if best is None or driver is None else {"edges": best.edges, "period": best.period}
     output = best.target if best is not None and best.target in recording.outputs else None
 
     def mismatch(fig: Any) -> None:
         residual_map(
             recording, base, after, driver=driver, values=values, spans=spans, output=output, units=units,
             share=best.share if best is not None and spans else None, noise=diagnosis.noise,
-            set_aside=getattr(diagnosis, "set_aside", None),
-            ax=fig.subplots(),
+            set_aside=getattr(diagnosis, "set_aside", None), ax=fig.subplots(), **told,
         )  # fmt: skip
 
     said = "What the models leave of the data"
     said += f", against {called(driver)}." if driver is not None else "."
     said += " Shaded: where the mismatch sits." if spans else ""
-    parts.append(FigurePart("residuals", "Where the mismatch sits" if spans else "Residuals", said, mismatch, 6.0, 3.5))
+    parts.append(FigurePart("residuals", "Where the mismatch sits" if spans else "Residuals", said, mismatch, 6.0, 3.8))
 
     hypotheses = list(diagnosis.ranking)
     if hypotheses:

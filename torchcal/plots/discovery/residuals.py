@@ -33,6 +33,12 @@ if TYPE_CHECKING:
 
 #: Largest noise sd over the smallest, above which residuals are drawn in units of it.
 UNEVEN = 5.0
+#: Levels of another condition up to which the residuals of each have their own shade, and up to which all are named.
+MOST_LEVELS, NAMED_LEVELS = 6, 3
+#: Data up to which their dots hide each other so little that these need not be transparent.
+OPAQUE = 200
+#: Local means in one period of an oscillation: fewer would not show it.
+PER_PERIOD = 6
 
 
 def driver_values(recording: Recording, driver: str, fitted: Any = None) -> Tensor | None:
@@ -66,6 +72,8 @@ def residual_map(
     driver: str | None = None,
     values: Any = None,
     spans: Iterable[tuple[float, float]] = (),
+    edges: Iterable[float] = (),
+    period: float | None = None,
     share: float | None = None,
     noise: Any = None,
     set_aside: Any = None,
@@ -78,8 +86,10 @@ def residual_map(
 ) -> "Axes":
     """Residuals, data minus model, of both models against what the mismatch varies with.
 
-    With more than 40 data their means over neighbouring data are drawn as lines. Where the noise sd varies more than
-    fivefold, residuals are divided by it: in the output's unit the smallest would all look like zero.
+    With more than 40 data their means over neighbouring data are drawn as lines. Where another condition has few
+    levels, or there are few runs, the base's residuals of each have their own shade, from dark to light: a mean over
+    them hides signs that differ. Where the noise sd varies more than fivefold, residuals are divided by it: in the
+    output's unit the smallest would all look like zero.
 
     Args:
         recording: The data.
@@ -88,6 +98,9 @@ def residual_map(
         driver: What is on the abscissa: see `driver_values`; the first condition (time) by default.
         values: The driver's values ``(n,)``, where the recording does not hold them.
         spans: Ranges of the driver in which the mismatch sits, shaded.
+        edges: Values of the driver at which a constant change begins or ends, drawn as vertical lines.
+        period: Of an oscillation, in the driver's unit: the means are then finer than it, or left out where the data
+            are too few for that.
         share: Share of the misfit that sits there.
         noise: Noise sd of the output, in its unit, a number or one for each condition ``(n,)``; or anything with a
             dict ``sd`` of them by output; where it is known, and by default, the recording's. Drawn as a band of ±2 sd.
@@ -106,6 +119,9 @@ def residual_map(
         DomainError: If the output does not exist, or the recording does not hold the driver.
         ShapeError: If fits or driver and recording do not fit.
     """
+    from matplotlib.colors import to_rgb
+    from matplotlib.patheffects import withStroke
+
     fits = curves_of(recording, before, after, names)
     look = Look(units={**recording.units, **(units or {})}, labels=labels or {})
     y = recording.y.cpu().numpy()
@@ -142,6 +158,8 @@ def residual_map(
             label=located if i == 0 else "_located",
         )  # fmt: skip
     sd = _noise_of(noise, recording, output)
+    for i, edge in enumerate(edge for edge in edges if low <= edge <= high):
+        ax.axvline(edge, color=EDGE, lw=1.0, zorder=2, label="change begins or ends" if i == 0 else "_edge")
     unit_of = np.ones(recording.n)
     label = f"data − model, {look.axis(output)}"
     if sd is not None and shown.any() and 0 < UNEVEN * sd[shown].min() < sd[shown].max():
@@ -159,25 +177,26 @@ def residual_map(
     keep = np.flatnonzero(shown)
     keep = keep[np.argsort(x[keep], kind="stable")]
     many = len(keep) > 40
+    bins = _bins(x, keep, period) if many else []
     dots = keep[thinned(len(keep))]
-    for fit in fits:
+    along = "time" if driver == "t" else driver
+    groups = _levels({name: column[dots] for name, column in columns.items() if name != along}, dots, look)
+    for i, fit in enumerate(fits):
         residual = (y[part] - fit.values[part]) / unit_of
-        ax.plot(
-            x[dots], residual[dots], fit.marker, ms=2.2 if many else 4.5, mfc=fit.face if not many else fit.color,
-            mec="none" if many else fit.color, mew=0.9, alpha=0.3 if many else 1.0, zorder=fit.zorder - 3,
-            label="_points" if many else fit.name,
-        )  # fmt: skip
-        if many:
-            levels = np.unique(x[keep])
-            if len(levels) <= 30:
-                bins = [keep[x[keep] == level] for level in levels]
-            else:
-                bins = np.array_split(keep, min(30, len(keep) // 8))
+        for rows, level, shade in groups if i == 0 else [(dots, "", 1.0)]:
+            color = tuple(shade * part for part in to_rgb(fit.color))
+            name = f"{fit.name}, {level}" if level else "_points" if bins else fit.name
+            ax.plot(
+                x[rows], residual[rows], fit.marker, ms=3.0 if many else 4.5, mfc=color if many else fit.face,
+                mec="none" if many else color, mew=0.9, alpha=(OPAQUE / max(len(dots), OPAQUE)) ** 0.5,
+                zorder=fit.zorder - 3, label=name,
+            )  # fmt: skip
+        if bins:
             centers = [np.median(x[rows]) for rows in bins]
             means = [np.nanmean(residual[rows]) for rows in bins]
             ax.plot(
                 centers, means, color=fit.color, ls=fit.line, lw=1.7, label=fit.name + ", local mean",
-                zorder=fit.zorder,
+                zorder=fit.zorder, path_effects=[withStroke(linewidth=3.5, foreground="white")],
             )  # fmt: skip
     if aside.any():
         residual = (y - fits[-1].values)[part] / unit_of
@@ -186,6 +205,36 @@ def residual_map(
     if legend:
         draw_key(ax)
     return ax
+
+
+def _bins(x: np.ndarray, keep: np.ndarray, period: float | None) -> list[np.ndarray]:
+    """Rows over which residuals are averaged, of those to keep in ascending order; none where that would hide a period.
+
+    Each holds one level of the driver where it has few, else at least eight data, or two in a part of a period.
+    """
+    levels = np.unique(x[keep])
+    if len(levels) <= 30:
+        return [keep[x[keep] == level] for level in levels]
+    if period is None:
+        return np.array_split(keep, min(30, len(keep) // 8))
+    part = np.floor((x[keep] - levels[0]) * PER_PERIOD / period)
+    bins = [keep[part == number] for number in np.unique(part)]
+    return bins if np.median([len(rows) for rows in bins]) >= 2 else []
+
+
+def _levels(others: Mapping[str, np.ndarray], rows: np.ndarray, look: Look) -> list[tuple[np.ndarray, str, float]]:
+    """Rows of each level of the condition with the fewest, its name (empty for none) and its shade, dark to light."""
+    rounded = {name: np.array([float(f"{value:.9g}") for value in others[name]]) for name in others}
+    few = {name: len(levels) for name in rounded if 1 < len(levels := np.unique(rounded[name])) <= MOST_LEVELS}
+    if not few:
+        return [(rows, "", 0.75)]
+    name = min(few, key=lambda name: few[name])
+    groups = []
+    for i, level in enumerate(np.unique(rounded[name])):
+        called = f"run {level:.0f}" if name == "run" else look.value(name, level)
+        named = few[name] <= NAMED_LEVELS or i in (0, few[name] - 1)
+        groups.append((rows[rounded[name] == level], called if named else "", 0.3 + 0.7 * i / (few[name] - 1)))
+    return groups
 
 
 def _noise_of(noise: Any, recording: Recording, output: str) -> np.ndarray | None:
