@@ -231,12 +231,12 @@ def figure_parts(diagnosis: Any) -> list[FigurePart]:
                 3.5,
             )
         )
-    if scores[0] is not None:
+    if None not in pair:  # without an accepted term there is nothing to compare
         unit = units.get(recording.outputs[0], "") if len(recording.outputs) == 1 else None
         parts.append(
             FigurePart(
                 "scores",
-                "Scores before and after" if pair[1] is not None else "Scores",
+                "Scores before and after",
                 "RMSE, mean log predictive density a datum, and share of the data in the 95 % interval, whose wanted "
                 "value is dotted.",
                 lambda fig: _ignore(held_out_scores(*pair, ax=fig.subplots(1, 3), unit=unit)),
