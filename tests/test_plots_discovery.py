@@ -1,5 +1,6 @@
 """Figures of a diagnosis: what is drawn equals what was given, and nothing hides anything else."""
 
+import itertools
 import math
 import re
 from types import SimpleNamespace
@@ -429,7 +430,6 @@ def test_a_dense_map_draws_local_means():
     np.testing.assert_allclose(line.get_ydata(), 1.3 * phi.log() - 0.1, atol=1e-9)
 
 
-def test_a_driver_is_found_where_it_is():
 def grey(color):
     return float(np.dot([0.2126, 0.7152, 0.0722], matplotlib.colors.to_rgb(color)))
 
@@ -500,6 +500,7 @@ def test_where_a_constant_change_begins_and_ends_is_marked():
     assert "change begins or ends" not in labels(plots.residual_map(d.recording, d.base))
 
 
+def test_a_driver_is_found_where_it_is():
     d = oscillator()
     np.testing.assert_array_equal(plots.driver_values(d.recording, "t"), d.recording.x["time"])
     np.testing.assert_array_equal(plots.driver_values(d.recording, "f"), d.recording.x["time"].sin())
@@ -593,7 +594,26 @@ def test_long_sets_of_terms_are_broken_between_terms():
     first, second, base = ax.get_yticklabels()
     assert first.get_text() == "fuel reaction order +\ntemperature exponent + pressure error"
     assert second.get_text() == "fuel reaction order + lag"
-    assert first.get_fontsize() < second.get_fontsize() == base.get_fontsize()
+    assert first.get_fontsize() == second.get_fontsize() == base.get_fontsize()
+
+
+@pytest.mark.parametrize("rows", [3, 16])
+def test_names_and_notes_of_two_lines_leave_their_neighbours_alone(rows):
+    terms = [(f"fuel reaction order {i}", "temperature exponent", "pressure error") for i in range(rows)]
+    note = "its tangent tells nothing new: only large effects can"
+    d = ignition()
+    d.ranking = [Hypothesis(each, 9.0 - i, 0.1, (), i != 1) for i, each in enumerate(terms)]
+    d.ranking[-1] = Hypothesis(("none of these",), 2.0, 0.5)
+    d.tied = [terms[0]]  # all kinds, so that the legend is as high as it gets
+    d.detection_limit = [Limit(each[0], "a", math.inf, None, 0.9, None, note) for each in terms]
+    figure = plots.discovery_overview(d)
+    alone = [plots.ranking(d.ranking, tied=d.tied), plots.detection_limits(d.detection_limit)]
+    parts = {part._suptitle.get_text(): part.axes[0] for part in figure.subfigs}
+    for ax in (parts["Ranking of the hypotheses"], parts["Detection limits"], *alone):
+        ax.figure.canvas.draw()
+        for texts in (ax.get_yticklabels(), [text for text in ax.texts if "\n" in text.get_text()]):
+            boxes = sorted((text.get_window_extent() for text in texts), key=lambda box: box.y0)
+            assert all(low.y1 < high.y0 for low, high in itertools.pairwise(boxes))
 
 
 LONG = "heat that is lost through the wall of the "
@@ -693,10 +713,25 @@ def test_detection_limits_are_ratios():
         plots.detection_limits([])
 
 
+@pytest.mark.parametrize("estimate", [2.3, 30.0, 1e4])
+def test_ticks_of_detection_limits_do_not_overlap(estimate):
+    rows = [Limit("non-linearity of Fy", "c", 1.0, None, 0.9, estimate, "calibration hides negative effects")]
+    ax = plots.detection_limits(rows, ax=plt.subplots(figsize=(5.4, 3.2), layout="constrained")[1])
+    ax.figure.canvas.draw()
+    low, high = ax.get_xlim()
+    every = [text for text in ax.get_xticklabels(which="both") if text.get_text()]
+    shown = [text for text in every if low <= text.get_position()[0] <= high]
+    assert len(shown) >= 2
+    assert "1" in {text.get_text() for text in shown}
+    boxes = sorted((text.get_window_extent() for text in shown), key=lambda box: box.x0)
+    assert all(left.x1 < right.x0 for left, right in itertools.pairwise(boxes))
+
+
 def test_detection_limits_show_the_number_beside_what_there_is_to_say():
     rows = [
         Limit("yield stress", "tau0", 0.283, "Pa", 0.9, 1.5, "also: offset of tau"),
         Limit("hidden", "a", math.inf, "Pa", 0.9, None, "calibration hides effects of 310, the largest that was tried"),
+        Limit("blind", "a", math.inf, None, 0.9, None, "its tangent tells nothing new: only large effects can"),
         Limit("lag", "a", math.inf, "s", 0.9),
         Limit("loss", "h", 2.83e-5, "W/(m^2 K)", 0.9, None, "also: some other loss of heat"),
         Limit("price", "c", 2.0, "$", 0.9),
@@ -705,9 +740,10 @@ def test_detection_limits_show_the_number_beside_what_there_is_to_say():
     told = dict(zip([name.get_text() for name in ax.get_yticklabels()], ax.texts, strict=False))
     assert {name: text.get_text() for name, text in told.items()} == {
         "yield stress": "0.28 Pa, also: offset of tau",
-        "hidden": "calibration hides effects of…",
+        "hidden": "calibration hides effects of\n310, the largest that was…",
+        "blind": "its tangent tells nothing new:\nonly large effects can",
         "lag": "∞",
-        "loss": "2.8e−05 W/(m^2 K), also: some…",
+        "loss": "2.8e−05 W/(m^2 K), also: some\nother loss of heat",
         "price": r"2 \$",
     }
 

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Any
 from torchcal.display import NONE, percent
 from torchcal.errors import DomainError
 from torchcal.plots import style
-from torchcal.plots.discovery.pieces import ACCEPTED, beside, draw_key, finite, likeliest_with, signed, told_apart
+from torchcal.plots.discovery.pieces import (
+    ACCEPTED,
+    LINESPACING,
+    beside,
+    draw_key,
+    finite,
+    likeliest_with,
+    signed,
+    told_apart,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -63,7 +72,7 @@ def ranking(
     left_out = len(rows) - len(kept)
     rows = [h for h in rows if any(h is other for other in kept)]
     if ax is None:
-        ax = style.new_axes(None, (6.4, 1.2 + 0.3 * len(rows)))
+        ax = style.new_axes(None, (6.4, 1.2 + 0.32 * len(rows)))
     else:
         ax = style.new_axes(ax)
 
@@ -96,7 +105,7 @@ def ranking(
             ax.barh(places, widths, height=0.66, lw=0.7, label=name, zorder=3, **options)
     ax.axvline(0.0, color="0.25", lw=0.7, zorder=4)
     names = told_apart([_name(item) for item in rows], 2 * LINE - 6)
-    ax.set_yticks(range(len(rows)), [_in_lines(name) for name in names], linespacing=1.0)
+    ax.set_yticks(range(len(rows)), [_in_lines(name) for name in names], linespacing=LINESPACING)
     ax.set_ylim(len(rows) - 0.4, -0.6)
     low = min([number for number in numbers if math.isfinite(number)], default=0.0)
     ax.set_xlim(max(min(low, 0.0) * 1.05, floor), max(top, 0.01) * 1.05 if value == "log_evidence" else 1.0)
@@ -109,9 +118,6 @@ def ranking(
     ax.set_xlabel(shown + (f"\n({left_out} weaker ones not shown)" if left_out else ""))
     style.dress(ax)
     ax.tick_params(axis="y", length=0)
-    for tick in ax.get_yticklabels():
-        if "\n" in tick.get_text():
-            tick.set_fontsize("x-small")
     if legend and len(set(kinds)) > 1:
         draw_key(ax, right=True)
     return ax

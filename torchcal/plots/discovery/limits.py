@@ -1,6 +1,7 @@
 """The smallest effects that a recording could have shown."""
 
 import math
+import textwrap
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,9 @@ from torchcal.plots.discovery.pieces import ACCEPTED, NOISE, beside, draw_key, f
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+#: Letters on a line beside a row: more would leave no room for the axes.
+LINE = 30
 
 
 def detection_limits(limits: Iterable[Any], *, most: int = 16, ax: "Axes | None" = None, legend: bool = True) -> "Axes":
@@ -29,6 +33,8 @@ def detection_limits(limits: Iterable[Any], *, most: int = 16, ax: "Axes | None"
     Raises:
         DomainError: If there is no candidate.
     """
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     rows = list(limits)
     if not rows:
         raise DomainError("Expected at least one candidate. Got none.")
@@ -40,12 +46,15 @@ def detection_limits(limits: Iterable[Any], *, most: int = 16, ax: "Axes | None"
 
     rows.sort(key=lambda item: (-finite(ratio(item), -1.0), not math.isfinite(item.smallest)))
     left_out, rows = len(rows) - most, rows[:most]
-    ax = style.new_axes(None, (6.4, 1.2 + 0.28 * len(rows))) if ax is None else style.new_axes(ax)
+    ax = style.new_axes(None, (6.4, 1.2 + 0.3 * len(rows))) if ax is None else style.new_axes(ax)
     ratios = np.array([ratio(item) for item in rows])
     shown = ratios[np.isfinite(ratios) & (ratios > 0)]
     low = max(min(0.3, 0.7 * shown.min(initial=1.0)), 0.01)
     high = max(3.0, 1.6 * shown.max(initial=1.0))
     ax.set_xscale("log")
+    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if high < 100 * low else (1.0,)))
+    ax.xaxis.set_major_formatter(lambda value, _: style.number(value))
+    ax.xaxis.set_minor_formatter(NullFormatter())  # their labels would overlap
     ax.set_xlim(low, high)
     ax.axvspan(low, 1.0, facecolor=NOISE, lw=0, zorder=0, label="too small to be seen in these data")
     ax.axvline(1.0, color="0.25", lw=1.0, zorder=2)
@@ -66,7 +75,8 @@ def detection_limits(limits: Iterable[Any], *, most: int = 16, ax: "Axes | None"
         smallest = f"{style.number(float(f'{item.smallest:.2g}'))}{unit}" if math.isfinite(item.smallest) else ""
         note = str(getattr(item, "note", "") or "")
         text = ", ".join(part for part in (smallest, note) if part)
-        beside(ax, i, 6, plain(text or "∞", 30), "left")  # more would leave no room for the axes
+        lines = textwrap.wrap(text or "∞", LINE, max_lines=2, placeholder="…")
+        beside(ax, i, 6, "\n".join(map(plain, lines)), "left")
     beside(ax, None, 6, "smallest", "left")
     ax.plot([], [], "o", ms=5.5, mfc=ACCEPTED, mec=ACCEPTED, label="estimate, where fitted")
     ax.set_yticks(range(len(rows)), names)

@@ -183,7 +183,7 @@ def figure_parts(diagnosis: Any) -> list[FigurePart]:
                     )
                 ),
                 7.0,
-                max(3.2, 1.4 + 0.26 * bars),
+                max(3.2, 1.4 + 0.3 * bars),
             )
         )
     if shifts:
@@ -254,7 +254,7 @@ def figure_parts(diagnosis: Any) -> list[FigurePart]:
                 "multiple of it.",
                 lambda fig: _ignore(detection_limits(limits, ax=fig.subplots())),
                 7.0,
-                max(3.2, 1.4 + 0.26 * min(len(limits), 16)),
+                max(3.2, 1.4 + 0.3 * min(len(limits), 16)),
             )
         )
     return parts

@@ -22,6 +22,7 @@ HELD_OUT = "#e4e4e4"  # grey (91)
 NOISE = "#d9d9d9"  # grey (87)
 LOCATED, EDGE = style.ADDITIVE_BAND, style.ADDITIVE
 DENSE = 80  # data in one panel above which each is a dot instead of a circle
+LINESPACING = 1.1  # of two lines in one row
 MOST_LETTERS = 44  # of a user's text on a figure
 MOST_POINTS = 2000  # drawn in one panel; more cannot be told apart
 
@@ -104,6 +105,7 @@ def beside(ax: "Axes", row: int | None, points: float, text: str, side: str = "r
         text, (1.0, 1.0 if row is None else row), (points, 2 if row is None else 0), textcoords="offset points",
         xycoords="axes fraction" if row is None else ax.get_yaxis_transform(), ha=side, fontsize="small",
         va="bottom" if row is None else "center", color="0.35" if row is None else "black", annotation_clip=False,
+        linespacing=LINESPACING,
     )  # fmt: skip
 
 
