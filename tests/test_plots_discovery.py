@@ -445,6 +445,8 @@ def test_points_of_a_dense_map_stand_out_from_what_is_shaded(size):
         contrast = grey(discovery.pieces.NOISE) - grey(line.get_markerfacecolor())
         assert line.get_alpha() * contrast > (0.25 if size == 50 else 0.08)
         assert line.get_markersize() >= 3
+    means = [curve(ax, f"{name}, local mean") for name in ("base model", "accepted model")]
+    assert [bool(line.get_path_effects()) for line in means] == [size > 50] * 2  # a white rim among many, hiding few
 
 
 def test_residuals_of_each_level_of_another_condition_are_told_apart():

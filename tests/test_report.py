@@ -83,7 +83,7 @@ def test_the_page_is_well_formed_and_needs_nothing_else(make, pages):
     assert "@import" not in visible
 
 
-@pytest.mark.parametrize(("make", "count"), [(oscillator, 8), (ignition, 7), (cooling, 4), (unexplained, 7)])
+@pytest.mark.parametrize(("make", "count"), [(oscillator, 8), (ignition, 7), (cooling, 3), (unexplained, 6)])
 def test_every_figure_is_in_it_and_can_be_read(make, count, pages):
     sources = [attributes["src"] for tag, attributes in Reader(pages[make.__name__]).tags if tag == "img"]
     assert len(sources) == count

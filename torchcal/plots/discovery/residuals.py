@@ -180,6 +180,7 @@ def residual_map(
     bins = _bins(x, keep, period) if many else []
     dots = keep[thinned(len(keep))]
     along = "time" if driver == "t" else driver
+    outline = [withStroke(linewidth=3.5, foreground="white")] if len(dots) > OPAQUE else []  # or it would hide dots
     groups = _levels({name: column[dots] for name, column in columns.items() if name != along}, dots, look)
     for i, fit in enumerate(fits):
         residual = (y[part] - fit.values[part]) / unit_of
@@ -196,7 +197,7 @@ def residual_map(
             means = [np.nanmean(residual[rows]) for rows in bins]
             ax.plot(
                 centers, means, color=fit.color, ls=fit.line, lw=1.7, label=fit.name + ", local mean",
-                zorder=fit.zorder, path_effects=[withStroke(linewidth=3.5, foreground="white")],
+                zorder=fit.zorder, path_effects=outline,
             )  # fmt: skip
     if aside.any():
         residual = (y - fits[-1].values)[part] / unit_of
