@@ -242,7 +242,7 @@ def test_rates_are_guessed_from_the_length_of_long_runs():
 def test_a_mistake_in_a_term_is_told_as_this_terms():
     base, recording = decays()
     wrong = tc.Term("wall loss", equation="A", rate=lambda t, s, p, u: -p["w"] * s["B"], parameters=[tc.Parameter("w")])
-    with pytest.raises(tc.errors.SimulatorError, match=r"'wall loss'.*KeyError: 'B'.*given 4 arguments, with A; k"):
+    with pytest.raises(tc.errors.SimulatorError, match=r"'wall loss'.*KeyError: 'B'.*given \(t, s, p, u\), with A; k"):
         diagnose(base, recording, [wrong])
     sensor = tc.Term(
         "bad sensor", outputs={"A": lambda t, s, p, u, y: y + p["b"] * u["q"]}, parameters=[tc.Parameter("b")]

@@ -1,5 +1,6 @@
 """Steps and bumps, which slow noise may take as well as physics."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -12,10 +13,11 @@ from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.base import calibrate_base
 from torchcal.discovery.misfit.channels import channels
 from torchcal.discovery.misfit.likeliest import Tangents, settled, with_unknown
+from torchcal.discovery.misfit.lines import Lines
 from torchcal.discovery.misfit.places import SIZES
 from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.misfit.steps import LEAST, MOST, SURER, Sudden, stepwise, sudden_changes
-from torchcal.discovery.misfit.structure import analyse
+from torchcal.discovery.misfit.structure import analyse, evidences
 
 X = np.linspace(0, 10, 60)
 
@@ -47,7 +49,7 @@ def only(found):
 def test_the_evidence_of_a_sudden_change_is_the_ratio_of_two_normal_densities():
     found, noise = calibrated(stepped(0, size=0.3), noise=0.1)
     sudden, residual = only(found), Residual(found, noise, draws=0)
-    evidence, step = sudden.evidence(residual)
+    evidence, _, step = sudden.evidence(residual)
     # Within what the line does not make up for, of white noise: the residual with and without one of a normal size.
     rho = float(noise.correlation[0])
     white = np.linalg.inv(np.linalg.cholesky(0.01 * toeplitz(rho ** np.arange(60))))
@@ -62,6 +64,26 @@ def test_the_evidence_of_a_sudden_change_is_the_ratio_of_two_normal_densities():
     assert evidence == pytest.approx(np.logaddexp.reduce(each) - math.log(len(each)), abs=1e-6)
     assert int((step != 0).sum()) == 24
     assert float(step.max()) == pytest.approx(0.3, abs=0.1)
+
+
+def test_what_was_taken_out_counts_for_itself_and_for_no_other():
+    """The best of all others may be what comes next, and would count twice."""
+    found, noise = calibrated(stepped(0, size=0.3), noise=0.1)
+    sudden, residual = only(found), Residual(found, noise, draws=0)
+    evidence, number, _ = sudden.evidence(residual)
+    each = [sudden.evidence_of(residual, k) for k in range(sudden.functions.shape[1])]
+    assert np.logaddexp.reduce(each) == pytest.approx(evidence, abs=1e-9)
+    assert int(np.argmax(each)) == number
+    lines = Lines.of(found.problem, next(c for c in channels(found.problem, found) if c.kind == "output"), "x", 12)
+    every, number = lines.evidence(residual.e[:, None], SIZES)
+    each = [lines.evidence_of(residual.e, torch.tensor(k), SIZES) for k in range(len(lines.frequencies))]
+    assert np.logaddexp.reduce(each) == pytest.approx(float(every[0]), abs=1e-9)
+    # Two that are alike cannot both have been there.
+    wave = calibrated(1 + 0.3 * X + 0.3 * np.sin(9 * X) + 0.1 * np.random.default_rng(0).standard_normal(60), noise=0.1)
+    _, rough = evidences(Residual(*wave, draws=0), (), channels(wave[0].problem, wave[0]), ())
+    assert rough.evidence(Residual(*wave, draws=0)) > 10
+    left = dataclasses.replace(wave[0], y=wave[0].y + rough.curve)
+    assert rough.evidence(Residual(left, wave[1], draws=0)) < 0
 
 
 def test_noise_alone_has_no_more_evidence_than_it_should():

@@ -19,7 +19,7 @@ from torchcal.discovery.misfit.curves import orthonormal
 from torchcal.discovery.misfit.noise import GRID, LEAST, Noise, estimate, least, log_prior, mine
 from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.misfit.steps import sudden_changes
-from torchcal.discovery.misfit.structure import evidences, responses_of
+from torchcal.discovery.misfit.structure import Rough, evidences, responses_of
 
 __all__ = ["Tangents", "alone", "log_likelihood", "log_normal", "settled", "with_unknown"]
 
@@ -172,10 +172,10 @@ def with_unknown(
     available = [c for c in channels(problem, model) if c.kind in problem.kinds]
     looks, sudden = responses_of(problem, available), sudden_changes(problem, available)
 
-    def likeliest(peeled: list[Fitted]) -> tuple[Noise, float, Tensor | None]:
+    def likeliest(peeled: list[Fitted], taken: list[Rough]) -> tuple[Noise, float, Rough | None]:
         """Beside what is unknown, and the waves and sudden changes taken out so far, near what is estimated without."""
         noise = estimate(problem, peeled[-1].residual, model.jacobian, given, unit)
-        found: dict[_Places, tuple[Noise, float, Tensor | None]] = {}
+        found: dict[_Places, tuple[Noise, float, Rough | None]] = {}
 
         def evidence(at: _Places) -> float:
             if at not in found:
@@ -184,7 +184,7 @@ def with_unknown(
                 residuals = [Residual(weighed(one, w), tried, draws=0) for one in peeled]
                 seen, rough = evidences(residuals[-1], looks, available, sudden)
                 gain = max(seen) - math.log(len(seen)) if seen else -math.inf
-                gain += sum(max(evidences(one, (), available, sudden)[0], default=0.0) for one in residuals[:-1])
+                gain += sum(one.evidence(residual) for one, residual in zip(taken, residuals, strict=False))
                 like = _log_density(w, residuals[0].e, tried, tangents, problem)
                 found[at] = tried, like + gain, rough
             return found[at][1]
@@ -203,11 +203,12 @@ def with_unknown(
                 break
         return found[best]
 
-    peeled = [model]
-    noise, evidence, rough = likeliest(peeled)
-    while rough is not None and len(peeled) <= ROUGH:  # no noise is estimated from these
-        peeled.append(dataclasses.replace(peeled[-1], y=peeled[-1].y + rough))
-        fresh, more, rough = likeliest(peeled)
+    peeled, taken = [model], list[Rough]()
+    noise, evidence, rough = likeliest(peeled, taken)
+    while rough is not None and len(taken) < ROUGH:  # no noise is estimated from these
+        peeled.append(dataclasses.replace(peeled[-1], y=peeled[-1].y + rough.curve))
+        taken.append(rough)
+        fresh, more, rough = likeliest(peeled, taken)
         if more <= evidence:
             break
         noise, evidence = fresh, more

@@ -117,6 +117,12 @@ class Lines:
             found.append(logs.logsumexp(0))
         return torch.cat(found) - math.log(len(sizes) * (self.last - self.first)), best
 
+    def evidence_of(self, whitened: Tensor, number: Tensor, sizes: Tensor) -> float:
+        """Log evidence of a wave of one frequency, out of all that are as likely, in a whitened residual ``(n,)``."""
+        seen = [(norms[:, number], squares[:, number]) for norms, squares in self._seen(whitened[:, None])]
+        logs = torch.stack([self._log(size, seen) for size in sizes.tolist()])
+        return float(logs.logsumexp(0)) - math.log(len(sizes) * (self.last - self.first))
+
     def wave(self, values: Tensor, whitened: Tensor, number: Tensor, sizes: Tensor) -> tuple[Tensor, float]:
         """The likeliest wave of one frequency in the residual ``(n,)``, and the χ² that it removes.
 

@@ -69,20 +69,32 @@ class Sudden:
         functions = torch.cat(found, dim=1)
         return cls(functions) if functions.shape[1] else None
 
-    def evidence(self, residual: Residual) -> tuple[float, Tensor]:
-        """Log evidence of one of them against none, with all and all `SIZES` as likely, and the likeliest ``(n,)``.
+    def evidence(self, residual: Residual) -> tuple[float, int, Tensor]:
+        """Log evidence of one of them against none, with all and all `SIZES` as likely.
 
-        The size is that of its whitened effect beyond what the base's parameters make up for.
+        The size is that of its whitened effect beyond what the base's parameters make up for. Also returns the number
+        of the likeliest, and that one ``(n,)``.
         """
-        whitened = residual.found.whitening(self.functions)
+        along, norm = self._along(residual, self.functions)
+        logs = _logs(along)
+        size, number = divmod(int(logs.argmax()), logs.shape[1])
+        height = float(_shrink()[size] * along[number] / norm[number])
+        return float(logs.logsumexp((0, 1))) - math.log(logs.numel()), number, height * self.functions[:, number]
+
+    def evidence_of(self, residual: Residual, number: int) -> float:
+        """Log evidence of one of them, out of all that are as likely."""
+        logs = _logs(self._along(residual, self.functions[:, number : number + 1])[0])
+        return float(logs.logsumexp((0, 1))) - math.log(len(SIZES) * self.functions.shape[1])
+
+    @staticmethod
+    def _along(residual: Residual, functions: Tensor) -> tuple[Tensor, Tensor]:
+        """The residual along effects of functions ``(n, K)``, of unit norm, 0 where none is seen; and their norms."""
+        whitened = residual.found.whitening(functions)
         columns = residual.project(whitened)
         norm = columns.norm(dim=0)
         seen = norm > SEEN * whitened.norm(dim=0)
-        along = (columns.T @ residual.e / norm).where(seen, 0.0)
-        logs = _logs(along)
-        size, place = divmod(int(logs.argmax()), logs.shape[1])
-        height = float(_shrink()[size] * along[place] / norm[place]) if bool(seen[place]) else 0.0
-        return float(logs.logsumexp((0, 1))) - math.log(logs.numel()), height * self.functions[:, place]
+        norm = norm.where(seen, torch.inf)
+        return columns.T @ residual.e / norm, norm
 
 
 def sudden_changes(problem: Problem, available: Sequence[Channel]) -> list[Sudden]:

@@ -6,7 +6,7 @@ Probabilities come from simulated noise that went through the same projection.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -22,7 +22,7 @@ from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.misfit.steps import Sudden
 from torchcal.discovery.misfit.waves import wave_places
 
-__all__ = ["Structure", "analyse", "evidences", "responses_of"]
+__all__ = ["Rough", "Structure", "analyse", "evidences", "responses_of"]
 
 #: Radial functions along time, and along any other driver: the evidence chooses how many.
 IN_TIME, ALONG = (12, 24, 48), (12, 24)
@@ -53,6 +53,19 @@ def _features(driver: Tensor, count: int) -> Tensor:
     centres = torch.linspace(low, high, count, dtype=torch.float64)
     width = 1.2 * (high - low) / (count - 1)
     return torch.exp(-0.5 * ((driver[:, None] - centres) / width).square())
+
+
+@dataclass(frozen=True, eq=False)
+class Rough:
+    """A wave or a sudden change of an output.
+
+    Attributes:
+        curve: Its values at the data, ``(n,)``.
+        evidence: Its log evidence in another residual.
+    """
+
+    curve: Tensor
+    evidence: Callable[[Residual], float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,11 +125,11 @@ def _line_place(lines: Lines, residual: Residual) -> Place:
 
 def evidences(
     residual: Residual, looks: Sequence[_Look], available: Sequence[Channel], sudden: Sequence[Sudden]
-) -> tuple[list[float], Tensor | None]:
+) -> tuple[list[float], Rough | None]:
     """Log evidence for a smooth change of each channel against each driver, and oscillations and sudden changes of
     each output.
 
-    Also returns the oscillation or sudden change ``(n,)`` that the residual has where one is likelier than all else.
+    Also returns the oscillation or sudden change that the residual has where one is likelier than all else.
     """
     smooth: dict[int, float] = {}
     for key, _, change in _changes(residual, looks, residual.e[:, None]):
@@ -125,12 +138,13 @@ def evidences(
     for lines in _lines(residual, available):
         evidence, number = lines.evidence(residual.e[:, None], SIZES)
         if float(evidence[0]) > max([0.0, *found]):
-            rough = lines.wave(residual.found.residual, residual.e, number, SIZES)[0]
+            wave = lines.wave(residual.found.residual, residual.e, number, SIZES)[0]
+            rough = Rough(wave, lambda other, lines=lines, at=number: lines.evidence_of(other.e, at, SIZES))  # type: ignore[misc]
         found.append(float(evidence[0]))
     for each in sudden:
-        likely, curve = each.evidence(residual)
+        likely, place, curve = each.evidence(residual)
         if likely > max([0.0, *found]):
-            rough = curve
+            rough = Rough(curve, lambda other, each=each, at=place: each.evidence_of(other, at))  # type: ignore[misc]
         found.append(likely)
     return found, rough
 
