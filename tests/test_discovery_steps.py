@@ -204,6 +204,41 @@ def test_a_change_between_two_steps_is_found_with_its_edges_and_its_size():
     assert found.share > 0.9
 
 
+def test_one_edge_is_told_where_there_is_one():
+    """All pairs of ends alike would let a second one in where nothing is seen: there are ten times as many."""
+    single = []
+    for seed in range(8):
+        noise = 0.1 * np.random.default_rng(seed).standard_normal(60)
+        residual, smooth = place_of(1 + 0.3 * X + 0.6 * (X > 5.1) + noise)
+        found = stepwise(residual, smooth, surer=0.0)
+        if found is smooth:
+            continue
+        single.append(len(found.edges) == 1)
+        # Half of the points are on either side: whatever ends are averaged over, it is 0 on one of them.
+        assert min(float(found.profile[:25].abs().max()), float(found.profile[36:].abs().max())) < 0.05
+        assert float(found.sd[5:25].max()) < 0.12
+    assert len(single) >= 5
+    assert np.mean(single) > 0.8
+
+
+def test_points_that_do_nothing_to_an_output_are_none_of_its_own():
+    t = torch.linspace(0, 10, 40, dtype=torch.float64)
+    three = tc.Simulator(
+        lambda x, p: {name: p[name] + 0.3 * x["x"] for name in "abc"},
+        [tc.Parameter(name, initial=0.5) for name in "abc"],
+    )
+    y = {name: 1 + 0.3 * t + 0.1 * torch.as_tensor(np.random.default_rng(k).standard_normal(40))
+         for k, name in enumerate("abc")}  # fmt: skip
+    y["a"][20:22] += 0.45  # two data alone may be outliers
+    found, noise = calibrate_base(Problem.of(three, tc.Recording(x={"x": t}, y=y, noise=0.1)), {}, 2, 0)
+    residual = Residual(found, noise)
+    place = next(p for p in analyse(residual, every=True).places if p.channel.kind == "output"
+                 and (p.channel.target, p.driver, p.period) == ("a", "x", None))  # fmt: skip
+    edges = stepwise(residual, place, surer=-math.inf).edges
+    low, high = edges if len(edges) > 1 else (edges[0], math.inf)
+    assert int(((t > low) & (t < high)).sum()) >= LEAST
+
+
 def test_what_is_smooth_stays_smooth_and_so_does_what_few_points_show():
     noise = 0.1 * np.random.default_rng(1).standard_normal(60)
     for change in (np.sin(2 * X), 0.05 * (X - 5) ** 2):

@@ -226,6 +226,8 @@ def test_a_term_in_a_window_is_told_by_its_name_and_steps_by_where_they_are():
     assert "jumps with t (at 2): one constant change on one side removes" in where_in_words(finding(where=[step]))
     steps = Location("output", "y", "t", PART, 0.5, 20.0, extent=10.0, edges=(2.0, 5.0))
     assert "jumps with t (at 2 and 5): one constant change in between removes" in where_in_words(finding(where=[steps]))
+    ends = dataclasses.replace(steps, spans=((0.0, 1.9), (5.1, 10.0)))
+    assert "(at 2 and 5): one constant change outside of these removes" in where_in_words(finding(where=[ends]))
 
 
 def test_spans_over_decades_are_measured_in_decades():

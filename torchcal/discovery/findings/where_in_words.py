@@ -56,11 +56,14 @@ def where_in_words(d: Any) -> str:
             f"adding {what} there {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
         )
     if place.edges:
-        between_them = "in between" if len(place.edges) > 1 else "on one side"
+        side = "on one side"
+        if len(place.edges) > 1:
+            low, high = place.edges
+            side = "in between" if any(low < 0.5 * sum(span) < high for span in place.spans) else "outside of these"
         at = " and ".join(between([(edge, edge) for edge in place.edges], "to", place.extent))
         return (
             f"The mismatch sits in the {place.kind} {place.target} and jumps with {place.driver} (at {at}): one "
-            f"constant change {between_them} {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
+            f"constant change {side} {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
         )
     return (
         f"The mismatch sits in the {place.kind} {place.target} and varies with {place.driver}{largest}: a smooth "

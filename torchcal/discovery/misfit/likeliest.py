@@ -185,6 +185,7 @@ def with_unknown(
                 seen, rough = evidences(residuals[-1], looks, available, sudden)
                 gain = max(seen) - math.log(len(seen)) if seen else -math.inf
                 gain += sum(one.evidence(residual) for one, residual in zip(taken, residuals, strict=False))
+                gain -= len(taken) * math.log(2 * len(places))  # a wave or a sudden change of any output
                 like = _log_density(w, residuals[0].e, tried, tangents, problem)
                 found[at] = tried, like + gain, rough
             return found[at][1]

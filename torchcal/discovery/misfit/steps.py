@@ -21,7 +21,7 @@ __all__ = ["SURER", "Sudden", "stepwise", "sudden_changes"]
 
 #: Data, or points of a channel, that there are at least on either side of a step: fewer may be outliers.
 LEAST = 5
-#: Steps that are tried in an output, evenly among its data, and about how many bumps.
+#: Steps that are tried in all outputs together, evenly among their data, and about how many bumps.
 MOST = 200
 #: Sd of the narrowest bump, in usual gaps between data, and of the widest, as a share of a run.
 NARROW, WIDE = 1.5, 0.125
@@ -62,8 +62,8 @@ class Sudden:
         number, along = problem.recording.outputs.index(channel.target), problem.order[problem.condition_of]
         own = [p for p in problem.sequences if int(problem.output_of[p[0]]) == number and len(p) >= 2 * LEAST]
         found = [torch.zeros(problem.n, 0, dtype=torch.float64)]
+        most = max(MOST // max(len(own) * len(problem.recording.outputs), 1), 1)
         for places in own:
-            most = max(MOST // len(own), 1)
             each = torch.cat([_steps(along[places], most), _bumps(along[places], most)], dim=1)
             found.append(torch.zeros(problem.n, each.shape[1], dtype=torch.float64).index_copy_(0, places, each))
         functions = torch.cat(found, dim=1)
@@ -118,7 +118,9 @@ def _bumps(along: Tensor, most: int) -> Tensor:
         centres = torch.linspace(float(along[0]), float(along[-1]), round(span / width) + 1, dtype=torch.float64)
         found.append(torch.exp(-0.5 * ((along[:, None] - centres) / width).square()))
         width *= 2.0
-    return torch.cat(found, dim=1) if found else torch.zeros(len(along), 0, dtype=torch.float64)
+    bumps = torch.cat(found, dim=1) if found else torch.zeros(len(along), 0, dtype=torch.float64)
+    size = bumps.sum(0).square() / bumps.square().sum(0).clamp_min(1e-300)  # of how many data that are alike
+    return bumps[:, size >= 0.5 * LEAST]
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +129,7 @@ class _Between:
 
     Attributes:
         inside: Which points are in between, bool ``(L, U, K)``.
-        there: Which pairs of ends have enough points in between and outside, and are seen, bool ``(L, U)``.
+        there: Which pairs of ends have enough points that act in between and outside, and are seen, bool ``(L, U)``.
         norm: Of their effects, ``(L, U)``.
         along: The residual along their effects, scaled to unit norm, ``(L, U)``.
     """
@@ -142,12 +144,13 @@ class _Between:
         """Between ends ``(L,)`` and ``(U,)`` of the values ``(K,)`` of a driver."""
         from_low, from_high = ((values >= ends[:, None]) for ends in (low, high))
         inside = from_low[:, None] & ~from_high
-        count = inside.sum(-1)
+        acts = _acts(channel)
+        count = (inside & acts).sum(-1)
         lower, upper = (residual.tangent(channel.response(one.double().T)) for one in (from_low, from_high))
         square = lower.square().sum(0)[:, None] + upper.square().sum(0) - 2 * lower.T @ upper
         whole = residual.found.whitening(channel.response(torch.ones(len(values), 1, dtype=torch.float64)))
         seen = square > max(SEEN * float(whole.norm()), 1e-150) ** 2
-        there = (low[:, None] < high) & (count >= LEAST) & (len(values) - count >= LEAST) & seen
+        there = (low[:, None] < high) & (count >= LEAST) & (int(acts.sum()) - count >= LEAST) & seen
         norm = square.where(there, 1.0).sqrt()
         along = ((lower.T @ residual.e)[:, None] - upper.T @ residual.e) / norm
         return cls(inside, there, norm, along.where(there, 0.0))
@@ -155,6 +158,11 @@ class _Between:
     def logs(self) -> Tensor:
         """Log evidence of each, ``(sizes, L, U)``; −∞ of such as there are none."""
         return _logs(self.along).where(self.there, -math.inf)
+
+
+def _acts(channel: Channel) -> Tensor:
+    """Which of a channel's points do anything to the data, bool ``(K,)``: of an output its own."""
+    return channel.matrix != 0 if channel.matrix.ndim == 1 else (channel.matrix != 0).any(0)
 
 
 def stepwise(residual: Residual, place: Place, *, surer: float = SURER) -> Place:
@@ -169,7 +177,7 @@ def stepwise(residual: Residual, place: Place, *, surer: float = SURER) -> Place
         surer: Log evidence by which the other must be likelier.
     """
     channel, values = place.channel, place.channel.drivers[place.driver]
-    levels = values.unique()
+    levels = values[_acts(channel)].unique()
     cuts = 0.5 * (levels[1:] + levels[:-1])
     if place.period is not None or place.driver == RUN or len(cuts) < 2 * LEAST:
         return place
@@ -178,30 +186,50 @@ def stepwise(residual: Residual, place: Place, *, surer: float = SURER) -> Place
     every = _Between.of(residual, channel, values, low, high)
     if not bool(every.there.any()) or not bool(torch.isfinite(every.along).all()):
         return place
-    logs = every.logs()
-    i, j = divmod(int(logs.amax(0).argmax()), len(high))
-    low, high = _around(cuts, low, i), _around(cuts, high, j)
+    prior = _prior(every.there)
+    logs = every.logs() + prior
+    one = _one_end(every.there)
+    likelier = one if float(logs[:, one].logsumexp((0, 1))) >= float(logs[:, ~one].logsumexp((0, 1))) else ~one
+    i, j = divmod(int(logs.where(likelier, -math.inf).amax(0).argmax()), len(high))
+    low, high, share = _around(cuts, low, i), _around(cuts, high, j), float(prior[i, j])
     near = _Between.of(residual, channel, values, low, high)
     closer = near.logs()
-    tried = len(SIZES) * int(every.there.sum())
-    evidence = max(float(logs.logsumexp((0, 1, 2))), float(closer.logsumexp((0, 1, 2))) - math.log(near.there.sum()))
-    evidence -= math.log(tried)
+    nearly = float(closer.logsumexp((0, 1, 2))) + share - math.log(int(near.there.sum()))
+    evidence = max(float(logs.logsumexp((0, 1, 2))), nearly) - math.log(len(SIZES))
     if evidence < place.evidence + surer:
         return place
     weight, shrink = (closer - closer.logsumexp((0, 1, 2))).exp(), _shrink()[:, None, None]
     mean, inside = shrink * near.along / near.norm, near.inside
+    size, i, j = (int(at) for at in torch.unravel_index(closer.argmax(), closer.shape))
     if is_unseen(channel, residual):
-        most = inside.double().mean(-1) > 0.5
+        best = inside[i, j]
+        more = best if float(best[_acts(channel)].double().mean()) > 0.5 else ~best
+        agree = torch.einsum("lu,luk->k", weight.sum(0), (inside == best).double())
+        most = inside[..., int((agree + more).argmax())]  # it is 0 there, whichever ends it has
         mean, inside = torch.where(most, -mean, mean), inside ^ most[..., None]
     inside = inside.double()
     profile = torch.einsum("slu,luk->k", weight * mean, inside)
     square = torch.einsum("slu,luk->k", weight * (mean.square() + shrink / near.norm.square()), inside)
     sd = (square - profile.square()).clamp_min(0.0).sqrt()
-    size, i, j = (int(at) for at in torch.unravel_index(closer.argmax(), closer.shape))
     removed = float((1 - (1 - _shrink()[size]).square()) * near.along[i, j].square())
     edges = tuple(end for end in (float(low[i]), float(high[j])) if math.isfinite(end))
-    share = residual.share(removed, 1.0 + len(edges))
-    return dataclasses.replace(place, evidence=evidence, share=share, profile=profile, sd=sd, edges=edges)
+    taken = residual.share(removed, 1.0 + len(edges))
+    return dataclasses.replace(place, evidence=evidence, share=taken, profile=profile, sd=sd, edges=edges)
+
+
+def _one_end(there: Tensor) -> Tensor:
+    """Which pairs have an open end, bool ``(L, U)``: the first lower or the last upper one."""
+    one = torch.zeros_like(there)
+    one[0], one[:, -1] = True, True
+    return one
+
+
+def _prior(there: Tensor) -> Tensor:
+    """Log prior ``(L, U)`` of pairs that are there: with one end and with two as likely, not by how many these are."""
+    one = _one_end(there)
+    count = torch.where(one, (there & one).sum(), (there & ~one).sum()).double()
+    kinds = int(bool((there & one).any())) + int(bool((there & ~one).any()))
+    return -(count * kinds).clamp_min(1.0).log()
 
 
 def _evenly(cuts: Tensor, count: int) -> Tensor:

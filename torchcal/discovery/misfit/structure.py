@@ -61,7 +61,7 @@ class Rough:
 
     Attributes:
         curve: Its values at the data, ``(n,)``.
-        evidence: Its log evidence in another residual.
+        evidence: Its log evidence in another residual, out of all that are as likely there.
     """
 
     curve: Tensor
