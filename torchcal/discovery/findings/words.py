@@ -343,12 +343,11 @@ def _ambiguous(d: Any) -> list[str]:
             return [where_in_words(d), d.settings["withdrawn"]]
         sure = sum(row.probability for row in d.ranking if set(known[0]) <= set(row.terms))
         if d.settings.get("doubt"):
-            beside = [f"Something that is not in the library has a probability of {unknown:.2f}."]
             return [
                 where_in_words(d),
                 f"The best explanation in the library is {_hypothesis(d, known[0])} (probability {sure:.2f}).",
                 d.settings["doubt"],
-                *(beside if unknown >= LISTED else []),
+                *_unknown_too(unknown),
             ]
         told = math.floor(100 * sure) / 100  # and never what would be enough
         return [
@@ -394,13 +393,18 @@ def _ambiguous(d: Any) -> list[str]:
         if unknown < LISTED:
             share = f"though its probability is {_probability(unknown)}"
         parts.append(f"Nor can these data exclude something that is not in the library ({share}).")
-    elif unknown >= LISTED:
-        parts.append(f"Something that is not in the library has a probability of {unknown:.2f}.")
+    else:
+        parts += _unknown_too(unknown)
     if d.experiment is not None:
         parts += _experiment(d)
     elif sum(any(row.refitted and set(row.terms) == set(tied) for row in d.ranking) for tied in known) > 1:
         parts.append("None of the experiments that were tried in thought would tell them apart.")
     return parts
+
+
+def _unknown_too(unknown: float) -> list[str]:
+    """That something unknown is likely enough to be told."""
+    return [f"Something that is not in the library has a probability of {unknown:.2f}."] if unknown >= LISTED else []
 
 
 def _would_tell(d: Any, terms: Sequence[str]) -> str:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.misfit.channels import Channel
+from torchcal.discovery.misfit.residual import Residual
 
 __all__ = ["Lines", "lines_of"]
 
@@ -117,9 +118,9 @@ class Lines:
             found.append(logs.logsumexp(0))
         return torch.cat(found) - math.log(len(sizes) * (self.last - self.first)), best
 
-    def evidence_of(self, whitened: Tensor, number: Tensor, sizes: Tensor) -> float:
-        """Log evidence of a wave of one frequency, out of all that are as likely, in a whitened residual ``(n,)``."""
-        seen = [(norms[:, number], squares[:, number]) for norms, squares in self._seen(whitened[:, None])]
+    def evidence_of(self, residual: Residual, number: Tensor, sizes: Tensor) -> float:
+        """Log evidence of a wave of one frequency, out of all that are as likely."""
+        seen = [(norms[:, number], squares[:, number]) for norms, squares in self._seen(residual.e[:, None])]
         logs = torch.stack([self._log(size, seen) for size in sizes.tolist()])
         return float(logs.logsumexp(0)) - math.log(len(sizes) * (self.last - self.first))
 

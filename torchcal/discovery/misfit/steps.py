@@ -128,13 +128,15 @@ class _Between:
     """Constant changes of a channel between any of some lower and any of some upper ends, the lower one included.
 
     Attributes:
-        inside: Which points are in between, bool ``(L, U, K)``.
+        from_low: Which points are not below each lower end, bool ``(L, K)``.
+        from_high: The same of the upper ends, ``(U, K)``.
         there: Which pairs of ends have enough points that act in between and outside, and are seen, bool ``(L, U)``.
         norm: Of their effects, ``(L, U)``.
         along: The residual along their effects, scaled to unit norm, ``(L, U)``.
     """
 
-    inside: Tensor
+    from_low: Tensor
+    from_high: Tensor
     there: Tensor
     norm: Tensor
     along: Tensor
@@ -143,9 +145,8 @@ class _Between:
     def of(cls, residual: Residual, channel: Channel, values: Tensor, low: Tensor, high: Tensor) -> "_Between":
         """Between ends ``(L,)`` and ``(U,)`` of the values ``(K,)`` of a driver."""
         from_low, from_high = ((values >= ends[:, None]) for ends in (low, high))
-        inside = from_low[:, None] & ~from_high
         acts = _acts(channel)
-        count = (inside & acts).sum(-1)
+        count = (from_low & acts).sum(-1)[:, None] - (from_high & acts).sum(-1)  # where the lower end is the lower
         lower, upper = (residual.tangent(channel.response(one.double().T)) for one in (from_low, from_high))
         square = lower.square().sum(0)[:, None] + upper.square().sum(0) - 2 * lower.T @ upper
         whole = residual.found.whitening(channel.response(torch.ones(len(values), 1, dtype=torch.float64)))
@@ -153,7 +154,12 @@ class _Between:
         there = (low[:, None] < high) & (count >= LEAST) & (int(acts.sum()) - count >= LEAST) & seen
         norm = square.where(there, 1.0).sqrt()
         along = ((lower.T @ residual.e)[:, None] - upper.T @ residual.e) / norm
-        return cls(inside, there, norm, along.where(there, 0.0))
+        return cls(from_low, from_high, there, norm, along.where(there, 0.0))
+
+    @property
+    def inside(self) -> Tensor:
+        """Which points are in between, bool ``(L, U, K)``."""
+        return self.from_low[:, None] & ~self.from_high
 
     def logs(self) -> Tensor:
         """Log evidence of each, ``(sizes, L, U)``; −∞ of such as there are none."""

@@ -8,6 +8,7 @@ Probabilities come from simulated noise that went through the same projection.
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -139,12 +140,12 @@ def evidences(
         evidence, number = lines.evidence(residual.e[:, None], SIZES)
         if float(evidence[0]) > max([0.0, *found]):
             wave = lines.wave(residual.found.residual, residual.e, number, SIZES)[0]
-            rough = Rough(wave, lambda other, lines=lines, at=number: lines.evidence_of(other.e, at, SIZES))  # type: ignore[misc]
+            rough = Rough(wave, partial(lines.evidence_of, number=number, sizes=SIZES))
         found.append(float(evidence[0]))
     for each in sudden:
         likely, place, curve = each.evidence(residual)
         if likely > max([0.0, *found]):
-            rough = Rough(curve, lambda other, each=each, at=place: each.evidence_of(other, at))  # type: ignore[misc]
+            rough = Rough(curve, partial(each.evidence_of, number=place))
         found.append(likely)
     return found, rough
 

@@ -43,8 +43,8 @@ def unnatural(model: Model) -> str:
             off, nature = abs(values[full] - expected), f"In nature {full} is {expected:g} within {spread:g}, and"
             if off > APART * math.hypot(spread, sd[full]):
                 return f"{nature} not {values[full]:.2g} ± {sd[full]:.1g}: something else may have left as much."
-            open_ = not sd[full] < off  # at a fold its sd says nothing
-            if open_ and off > APART * spread and _worse_at(model, full, expected) > APART**2:
+            undetermined = not sd[full] < off  # at a fold its sd says nothing
+            if undetermined and off > APART * spread and _worse_at(model, full, expected) > APART**2:
                 return f"{nature} with that the fit is worse: something else may have left as much."
     return ""
 

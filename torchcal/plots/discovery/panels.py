@@ -98,7 +98,7 @@ def panels_of(
     others = [name for name in columns if name != along]
     if along is not None and others:
         if run is None:
-            groups = _groups(columns, others, look)
+            groups = groups_of(columns, others, look)
         else:
             groups = [(np.flatnonzero(columns["run"] == run), f"run {run}")]
         if len(groups) == 1 and in_time and run is None:
@@ -123,7 +123,7 @@ def panels_of(
     return panels
 
 
-def _groups(columns: Mapping[str, np.ndarray], others: Sequence[str], look: Look) -> list[tuple[np.ndarray, str]]:
+def groups_of(columns: Mapping[str, np.ndarray], others: Sequence[str], look: Look) -> list[tuple[np.ndarray, str]]:
     """Rows that agree in the other conditions, up to rounding."""
     key = np.array([[float(f"{value:.9g}") for value in columns[name]] for name in others]).T
     values, which = np.unique(key, axis=0, return_inverse=True)

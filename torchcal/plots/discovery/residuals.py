@@ -10,7 +10,7 @@ from torch import Tensor
 from torchcal.data import Recording
 from torchcal.errors import DomainError
 from torchcal.plots import style
-from torchcal.plots.discovery.panels import curves_of
+from torchcal.plots.discovery.panels import curves_of, groups_of
 from torchcal.plots.discovery.pieces import (
     EDGE,
     LOCATED,
@@ -225,17 +225,15 @@ def _bins(x: np.ndarray, keep: np.ndarray, period: float | None) -> list[np.ndar
 
 def _levels(others: Mapping[str, np.ndarray], rows: np.ndarray, look: Look) -> list[tuple[np.ndarray, str, float]]:
     """Rows of each level of the condition with the fewest, its name (empty for none) and its shade, dark to light."""
-    rounded = {name: np.array([float(f"{value:.9g}") for value in others[name]]) for name in others}
-    few = {name: len(levels) for name in rounded if 1 < len(levels := np.unique(rounded[name])) <= MOST_LEVELS}
-    if not few:
+    each = [groups for name in others if 1 < len(groups := groups_of(others, [name], look)) <= MOST_LEVELS]
+    if not each:
         return [(rows, "", 0.75)]
-    name = min(few, key=lambda name: few[name])
-    groups = []
-    for i, level in enumerate(np.unique(rounded[name])):
-        called = f"run {level:.0f}" if name == "run" else look.value(name, level)
-        named = few[name] <= NAMED_LEVELS or i in (0, few[name] - 1)
-        groups.append((rows[rounded[name] == level], called if named else "", 0.3 + 0.7 * i / (few[name] - 1)))
-    return groups
+    few = min(each, key=len)
+    last = len(few) - 1
+    return [
+        (rows[places], called if last < NAMED_LEVELS or i in (0, last) else "", 0.3 + 0.7 * i / last)
+        for i, (places, called) in enumerate(few)
+    ]
 
 
 def _noise_of(noise: Any, recording: Recording, output: str) -> np.ndarray | None:
