@@ -68,7 +68,7 @@ def test_two_drivers_and_their_product():
     assert volume == pytest.approx(expected, abs=7 * math.sqrt(4 / 900))
 
 
-@pytest.mark.parametrize("size", [1, 2, 5, pytest.param(14, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("size", [1, 2, *(pytest.param(size, marks=pytest.mark.slow) for size in (5, 14))])
 def test_what_is_not_bent_is_left_alone(size):
     """Normal draws, skew ones and ones with heavy tails, as few as are looked at, 20 times each."""
     for seed in range(20):

@@ -83,6 +83,7 @@ def test_no_tie_of_names_alone_for_a_wrong_guess():
     assert d.verdict == "unexplained" or ["none of these"] in d.tied
 
 
+@pytest.mark.slow
 def test_a_wrong_guess_adds_no_name_to_a_right_one():
     d = tc.diagnose(motor(), recording(0, "linear", friction=0.3), candidates(), seed=0, progress=False)
     assert "dead time" not in d.terms

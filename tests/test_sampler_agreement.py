@@ -244,7 +244,7 @@ def check_same_posterior(found, expected):
     check_same_distribution(one, other, names)
 
 
-@pytest.fixture(scope="module", params=[0.1, 0.01])
+@pytest.fixture(scope="module", params=[pytest.param(0.1, marks=pytest.mark.slow), 0.01])
 def cubic_reference(request):
     """The tolerance, and Pyro's draws."""
     options = {"num_samples": 240, "num_chains": 2, "num_warmup": 100, "sampler": "pyro"}

@@ -7,7 +7,21 @@ import torch
 
 from torchcal.errors import DomainError
 
-__all__ = ["outside_inference_mode", "whole"]
+__all__ = ["by_default_on_cpu", "outside_inference_mode", "whole"]
+
+
+def by_default_on_cpu() -> None:
+    """Raise where new tensors are made on another device than the CPU, where recordings and rules are made.
+
+    Raises:
+        DomainError: If ``torch.set_default_device`` or ``with torch.device(...)`` says so.
+    """
+    device = torch.get_default_device()
+    if device.type != "cpu":
+        raise DomainError(
+            f"Expected the CPU as torch's default device. Got {device} (set it back, torch.set_default_device('cpu'), "
+            "and say where to compute: calibrate(..., device='cuda'), or NISP(...).to('cuda') in a model of your own)."
+        )
 
 
 def outside_inference_mode() -> None:

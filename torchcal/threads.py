@@ -8,6 +8,8 @@ from typing import ParamSpec, TypeVar
 
 import torch
 
+from torchcal.checks import by_default_on_cpu
+
 __all__ = ["SHARED", "few_threads", "with_torch_settings"]
 
 #: Numbers of which each thread has so many or more: with fewer it waits longer for the others than it computes.
@@ -44,11 +46,12 @@ def few_threads(numbers: int = 0) -> Iterator[None]:
 def with_torch_settings(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """A function that has one thread, but where it asks for more, and derivatives, also within ``torch.no_grad()``.
 
-    Warnings are told of the user's line, through it.
+    Another default device than the CPU is refused. Warnings are told of the user's line, through it.
     """
 
     @functools.wraps(function)
     def inner(*args: _P.args, **options: _P.kwargs) -> _R:
+        by_default_on_cpu()
         with few_threads(), torch.enable_grad():
             return function(*args, **options)
 

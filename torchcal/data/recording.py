@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchcal.checks import by_default_on_cpu
 from torchcal.data.arrays import sample_spread, value_range
 from torchcal.data.frames import check_columns, column_names, read_csv
 from torchcal.data.noise import noise_sd
@@ -95,6 +96,7 @@ class Recording:
         units: Mapping[str, str] | None = None,
         runs: Any = None,
     ) -> None:
+        by_default_on_cpu()
         if runs is not None and (x is not None or y is not None):
             raise RecordingError(
                 f"Expected x= and y=, or runs=. Got runs= and {'x=' if x is not None else 'y='} (runs hold their own "

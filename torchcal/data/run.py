@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchcal.checks import by_default_on_cpu
 from torchcal.data.arrays import check_finite, is_quantity, to_tensor, value_range
 from torchcal.data.frames import check_columns, column_names
 from torchcal.data.interpolation import HOLDS, evaluate_pieces, pieces
@@ -76,6 +77,7 @@ class Run:
         initial: Mapping[str, Any] | None = None,
         hold: str = "linear",
     ) -> None:
+        by_default_on_cpu()
         given_outputs, given_inputs = _series(outputs, "outputs"), _series(inputs, "inputs")
         if not given_outputs:
             raise RecordingError("Expected outputs: a dict with an array. Got none (give outputs={name: array}).")

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from torchcal import polychaos
-from torchcal.checks import whole
+from torchcal.checks import by_default_on_cpu, whole
 from torchcal.embeddings import Embedding, Pattern
 from torchcal.errors import DomainError, EmbeddingError, ShapeError
 from torchcal.propagation import choice, convergence, parameters, polynomials
@@ -95,6 +95,7 @@ class NISP(nn.Module):
         max_elements: int | None = None,
     ) -> None:
         super().__init__()
+        by_default_on_cpu()
         if not isinstance(simulator, Simulator):
             raise DomainError(f"Expected a torchcal.Simulator. Got {type(simulator).__name__}. Wrap the function.")
         if not isinstance(embedding, Embedding):

@@ -365,6 +365,8 @@ def _advice(error: Exception, x: Conditions, parameters: Sequence[str]) -> str:
             " Use torch functions on p and x: values of many parameters come at once, with gradients. A function that "
             "cannot be written so goes into torchcal.ExternalSimulator."
         )
+    if "same device" in str(error) or "expected device" in str(error):
+        return " Tensors that the function holds or makes must be on the device of x and p: tensor.to(x.device)."
     if named and "dict" in str(error):
         return f" Here x is a dict, as in the recording: use {', '.join(f'x[{name!r}]' for name in x)}."
     if not named and isinstance(error, TypeError | IndexError) and re.search(r"\bstr\b", str(error)):
