@@ -411,6 +411,25 @@ def test_an_instrument_that_adds_more_than_it_measures_is_no_name(size, verdict)
     assert told == (verdict != "named")
 
 
+@pytest.mark.filterwarnings("ignore:The calibrated base explains no more than a constant")
+@pytest.mark.parametrize(
+    ("offset", "gain", "told"),
+    [
+        (2.0, -0.3, None),
+        (0.0, -0.8, "shows less than 40% of what the true value varies by"),
+        (-30.0, 0.0, "is off by more than it ever was"),
+    ],
+)
+def test_an_instrument_that_hardly_shows_what_it_measures_is_no_name(offset, gain, told):
+    x = np.linspace(0, 3, 80)
+    y = (1 + gain) * np.exp(x) + offset + 0.05 * np.random.default_rng(0).standard_normal(80)
+    base = tc.Simulator(lambda x, p: torch.exp(p["m"] * x), [tc.Parameter("m", initial=1.0)])
+    terms = [t for t in tc.terms.sensor(("y",), static=True) if t.name in ("offset of y", "gain error of y")]
+    d = tc.diagnose(base, tc.Recording(x=x, y=y), terms, seed=0, progress=False)
+    assert d.verdict == ("named" if told is None else "ambiguous")
+    assert told is None or told in " ".join(str(d).split())
+
+
 LOSS = tc.ODESimulator(
     rates=lambda t, s, p, u: {"n": -p["k"] * s["n"]},
     states={"n": "1"},

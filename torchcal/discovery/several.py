@@ -75,13 +75,8 @@ def refit_several(search: Search) -> None:
         fitted = _either_way(search, fitted)
     best = search.physical_leader
     if best is not None and len(best.numbers) == 2:
-        search.models += (twins := _refit_sets(
-            search, [(pair, None) for pair in _swapped(search, best) if pair not in pairs], prior
-        ))
-        fitted += _either_way(search, twins)
-        best = search.physical_leader or best
-        close = [m for m in search.models if m.physical and len(m.numbers) == 2 and m.weight > best.weight - CLOSE]
-        for pair in sorted(close, key=lambda m: -m.weight)[:AGAIN]:
+        fitted += _with_look_alikes(search, set(pairs), prior)
+        for pair in _close(search):
             _alone_again(search, pair)
     if isinstance(search.problem.recording.noise, Tensor):  # else a smaller noise makes physics of any small misfit
         search.reweigh()
@@ -95,6 +90,29 @@ def refit_several(search: Search) -> None:
         leader = search.physical_leader
         if leader is not None and len(leader.numbers) == 3:
             _one_fewer(search, leader, prior)
+
+
+def _close(search: Search) -> list[Model]:
+    """The leading pairs, the likeliest first."""
+    pairs = [m for m in search.models if m.physical and len(m.numbers) == 2]
+    best = max(m.weight for m in pairs)
+    return sorted((m for m in pairs if m.weight > best - CLOSE), key=lambda m: -m.weight)[:AGAIN]
+
+
+def _with_look_alikes(search: Search, tried: set[tuple[int, ...]], prior: float) -> list[Model]:
+    """Pairs with another candidate in place of a leading one's that does nearly the same: first of the best, then of
+    those that lead with it, until there are no more."""
+    fitted: list[Model] = []
+    done: set[tuple[int, ...]] = set()
+    leading = _close(search)[:1]
+    while leading and len(fitted) < MOST:
+        done |= {m.numbers for m in leading}
+        wanted = dict.fromkeys(pair for lead in leading for pair in _swapped(search, lead) if pair not in tried)
+        tried |= wanted.keys()
+        search.models += (twins := _refit_sets(search, [(pair, None) for pair in wanted], prior))
+        fitted += _either_way(search, twins)
+        leading = [m for m in _close(search) if m.numbers not in done]
+    return fitted
 
 
 def _either_way(search: Search, pairs: list[Model]) -> list[Model]:
