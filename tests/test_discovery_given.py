@@ -95,7 +95,7 @@ def test_a_wrong_guess_in_one_of_two_runs_is_told_of_that_run():
     both = tc.Recording(runs=[right.runs[0], wrong.runs[0]], noise=0.02)
     d = tc.diagnose(motor(), both, candidates(), seed=0, progress=False)
     assert d.verdict in ("ambiguous", "unexplained")
-    assert any("with hold='zero' in run 2 the base leaves no more than noise" in row for row in d.symptoms)
+    assert any("with hold='zero' in run 1 the base leaves no more than noise" in row for row in d.symptoms)
 
 
 def test_what_is_held_and_stays_is_no_ramp():

@@ -328,7 +328,25 @@ def test_data_that_stick_out_at_one_level_of_a_grid_are_no_outliers(rows, togeth
     problem = Problem.of(hall, tc.Recording(x={"B": field, "I": current}, y=y))
     high = torch.zeros(25, dtype=torch.bool)
     high[rows] = True
-    assert outliers._clustered(problem, torch.arange(25), high) is together
+    assert outliers._clustered(problem, torch.arange(25), high, y) is together
+
+
+@pytest.mark.parametrize(
+    ("on_end", "sides", "together"),
+    [([50, 51, 53], (1, 1, 1), True), ([50, 51, 53], (1, -1, 1), False), ([20, 51, 93], (1, 1, 1), False)],
+)
+def test_data_that_stick_out_on_end_along_one_of_several_conditions_are_no_outliers(on_end, sides, together):
+    t = torch.linspace(0, 1, 140, dtype=F64)
+    seeing = torch.tensor(np.random.default_rng(5).uniform(0.8, 2.0, 140))
+    flat = tc.Simulator(lambda x, p: p["F"] + 0 * x["t"], [tc.Parameter("F")])
+    y = 1 + 0.01 * normal(140, 3)
+    y[on_end] += 0.06 * torch.tensor(sides, dtype=F64)
+    shuffled = torch.tensor(np.random.default_rng(1).permutation(140))
+    problem = Problem.of(flat, tc.Recording(x={"t": t[shuffled], "seeing": seeing[shuffled]}, y=y[shuffled]))
+    high = torch.zeros(140, dtype=torch.bool)
+    high[on_end] = True
+    found = outliers._clustered(problem, torch.arange(140), high[shuffled], (y - 1)[shuffled])
+    assert found is together
 
 
 @pytest.mark.parametrize(

@@ -383,6 +383,25 @@ def test_a_lone_outlier_is_one_beside_a_residual_of_the_other_sign_and_a_bump_or
     assert lone(problem, residual, None).nonzero()[:, 0].tolist() == [20, 51]
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_blank_at_the_start_is_no_surer_than_what_is_known(seed):
+    """An assay: 5 % of the reading and a floor. Of the first sample, an exact 0 by the model, no neighbours tell."""
+    t = np.array([0, 0.1, 0.25, 0.5, 0.75, 1, 1.5, 2, 3, 4, 6, 8, 10, 12, 16, 20, 24, 30.0])
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"A": -p["ka"] * s["A"], "C": p["ka"] * s["A"] - p["ke"] * s["C"]}, ["A", "C"],
+        [tc.Parameter("ka", low=0.0, initial=1.0), tc.Parameter("ke", low=0.0, initial=0.1)], observe=("C",),
+    )  # fmt: skip
+    runs, sd = [], []
+    for number, dose in enumerate((5.0, 15.0)):
+        clean = dose * 1.2 / (1.2 - 0.18) * (np.exp(-0.18 * t) - np.exp(-1.2 * t))
+        sd.append(0.05 * clean + 0.01)
+        noisy = clean + sd[-1] * np.random.default_rng(2 * seed + number).standard_normal(len(t))
+        runs.append(tc.Run(time=t, outputs={"C": noisy}, initial={"A": dose, "C": 0.0}))
+    _, noise = calibrate_base(Problem.of(base, tc.Recording(runs=runs)), {}, 4, 0)
+    ratio = (noise.sd / torch.tensor(np.concatenate(sd))).numpy()
+    assert 0.3 < ratio.min() < ratio.max() < 4.0
+
+
 def test_replicates_tell_noise_that_grows():
     """As many false alarms at 1 % as a binomial of 20 allows, where small values looked too well fitted before."""
     x = np.tile(np.geomspace(0.2, 20, 20), 2)

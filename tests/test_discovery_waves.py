@@ -72,7 +72,7 @@ def test_a_rate_constant_that_cycles_in_several_runs_is_a_wave_of_that_parameter
     assert relative(d.missing.along, 0.08 * torch.sin(2.4 * d.missing.time)) < 0.2
     ax = plots.missing_rate(d.missing)
     assert ax.get_ylabel() == "missing shift of k2 [1/h]"
-    assert [line.get_label() for line in ax.lines if line.get_label().startswith("run")] == ["run 1", "run 2"]
+    assert [line.get_label() for line in ax.lines if line.get_label().startswith("run")] == ["run 0", "run 1"]
     ends = [float(line.get_xdata()[-1]) for line in ax.lines[1:]]
     assert ends == pytest.approx([12, 10], abs=0.3)  # each as long as its run
 

@@ -501,7 +501,7 @@ def test_draws_from_the_posterior_of_a_model_in_time() -> None:
     model = tc.ODESimulator(lambda t, s, p, u: {"c": -p["k"] * s["c"]}, ["c"], [tc.Parameter("k", initial=0.5)])
     noise = 0.02 * np.random.default_rng(1).standard_normal(12)
     data = tc.Recording(runs=[tc.Run(t, {"c": np.exp(-0.8 * t) + noise}, initial={"c": 1.0})], noise=0.02)
-    found = tc.calibrate_additive(model, data, num_samples=100, num_chains=2, num_warmup=50, seed=0)
+    found = tc.calibrate_additive(model, data, num_samples=160, num_chains=2, num_warmup=50, seed=0)
     draws: Tensor = found.parameters[:, 0]
     jacobian = t * np.exp(-0.8 * t)
     sd = 0.02 / np.sqrt((jacobian**2).sum())

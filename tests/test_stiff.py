@@ -16,7 +16,7 @@ from torchcal.discovery.fits.sharpen import sharpen
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.inference.summary import settings_of
 from torchcal.results.reading import _with_steps
-from torchcal.simulators import Trajectories, outgrown, settled, settled_implicitly, workable
+from torchcal.simulators import Trajectories, magnified, outgrown, settled, settled_implicitly, workable
 from torchcal.terms import extend
 
 F64 = torch.float64
@@ -408,3 +408,20 @@ def test_a_stiff_mechanism_is_calibrated_and_kept(tmp_path):
     again = tc.results.Calibration.load(tmp_path / "stiff.nc", simulator=base)
     assert again.propagate.simulator.implicit
     torch.testing.assert_close(again.predict().mean, found.predict().mean)
+
+
+def test_steps_that_would_magnify_what_fades_are_not_kept():
+    """What has faded long ago is solved well by any steps; what feeds it later was magnified without limit."""
+    t = np.concatenate([np.linspace(0, 5, 41), np.linspace(6, 60, 50)])
+    fading = {"rates": lambda t, s, p, u: {"N": p["f"] - p["k"] * s["N"]}, "states": ["N"]}
+    parameters = [tc.Parameter("k", low=0.0), tc.Parameter("f", low=0.0, initial=0.0)]
+    values, allowed = tensor(5.6, 0.0)[None], torch.full((len(t),), 1e-3, dtype=F64)
+    for stiff in (None, False):
+        model = tc.ODESimulator(parameters=parameters, stiff=stiff, **fading)
+        bound = model.bind(tc.Recording(runs=[run_of(t, {"N": 1.0}, ("N",))]))
+        assert magnified(bound, values, bound.solve(values))
+        found = settled(bound, values, allowed)
+        assert found.implicit == (stiff is None)
+        slope = found.linearise(values[0], ["f"]).jacobian[-1, 0] if stiff is False else None
+        assert not magnified(found, values, found.solve(values))
+        assert slope is None or float(slope) == pytest.approx(1 / 5.6, rel=1e-3)

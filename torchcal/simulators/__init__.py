@@ -13,6 +13,7 @@ from torchcal.simulators.solution import Solution
 from torchcal.simulators.static import Conditions, Linearisation, Simulator, asks_for_numbers, check_parameters
 from torchcal.simulators.stepping import (
     focused,
+    magnified,
     may_change,
     outgrown,
     settled,
@@ -46,6 +47,7 @@ __all__ = [
     "free_parameters",
     "is_value_of",
     "limits",
+    "magnified",
     "may_change",
     "outgrown",
     "settled",

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators.trajectories import Trajectories
 
-__all__ = ["focused", "may_change", "outgrown", "settled", "settled_implicitly", "step_errors", "workable"]
+__all__ = ["focused", "magnified", "may_change", "outgrown", "settled", "settled_implicitly", "step_errors", "workable"]
 
 #: How often steps are halved at most; how often implicit ones are chosen that are tried in place of others, and how
 #: many they may become.
@@ -24,6 +24,9 @@ DENSER, DENSEST, JUMPS = 4, 4096, 48
 #: Factor in log by which something may grow within an implicit step: these damp what grows faster, and stay on a branch
 #: of the solution that is none.
 GROWTH = 2.0
+#: Size of h λ from which on explicit steps may magnify what fades; steps on end that do, by which factor in log all
+#: together, until it matters; and how often they are halved for that alone.
+UNSTABLE, ON_END, MAGNIFIED, CALMING = 2.5, 3, 7.0, 4
 #: Implicit steps that are solved at most while their lengths are chosen: a model that jumps needs ever more of them.
 WORK = 200_000
 #: Choices of their lengths in which the error must fall by `CONVERGING`.
@@ -47,8 +50,8 @@ def settled(
 ) -> Trajectories:
     """The same with steps so short that halving them changes no output by more than is allowed.
 
-    Where halving them hardly lessens that, as of a stiff model, implicit steps are tried; where they are implicit,
-    these are shortened in places first. A solution that is infinite with both steps counts as settled. Where the
+    Where halving them hardly lessens that, as of a stiff model, or where they would magnify what fades, implicit steps
+    are tried; where they are implicit, these are shortened in places first. A solution that is infinite with both steps counts as settled. Where the
     simulator has a ``max_step``, the steps stay as they are.
 
     Args:
@@ -72,10 +75,13 @@ def settled(
         finer = _Solved(halved, halved.solve(values))
         z = finer.outputs(values)
         change = torch.where(torch.isfinite(y) | torch.isfinite(z), (z - y).abs(), torch.zeros_like(y))
+        loud = False
         if bool((change <= allowed).all()) and not outgrown(here.simulator, values, here.states):
-            return here.simulator
+            loud = number < CALMING and magnified(here.simulator, values, here.states)
+            if not loud:
+                return here.simulator
         before, share = share, float((change / allowed).nan_to_num(nan=math.inf).max())
-        if switch and number == 1 and not share < before / CONVERGING and not simulator.implicit:
+        if switch and number == 1 and (loud or not share < before / CONVERGING) and not simulator.implicit:
             other = settled_implicitly(simulator, values, allowed)
             if other is not None:
                 return other
@@ -214,6 +220,36 @@ def _shorter(simulator: Trajectories) -> Iterator[Trajectories]:
 
 def _finite(simulator: Trajectories, values: Tensor) -> bool:
     return bool(torch.isfinite(_Solved(simulator, simulator.solve(values)).outputs(values)).all())
+
+
+def magnified(simulator: Trajectories, values: Tensor, states: Tensor) -> bool:
+    """Whether explicit steps, at some values and their solved states, magnify what fades.
+
+    A fast state at rest may be solved well with such steps, and what a small change makes of it be wrong without limit:
+    several steps on end lie outside the region in which the method is stable.
+    """
+    if simulator.implicit:
+        return False
+    t, h, u = simulator.grid.flat
+    slopes = simulator.steps.slopes_at(values, states[:, :, :-1], t, {name: table[0] for name, table in u.items()})
+    growth = torch.zeros(slopes.shape[:2], dtype=slopes.dtype)
+    possible = (slopes.abs().sum(-1).amax(-1) * h > UNSTABLE) & slopes.isfinite().flatten(2).all(-1)
+    if not bool(possible.any()):
+        return False
+    z = torch.linalg.eigvals(slopes[possible]) * h.expand(possible.shape)[possible][:, None]
+    gain = (1 + z * (1 + z / 2 * (1 + z / 3 * (1 + z / 4)))).abs().log()
+    growth[possible] = torch.where(z.real < 0, gain, torch.zeros_like(gain)).amax(-1).clamp_min(0)
+    factor, steps = _on_end(growth.reshape(*states.shape[:2], -1))
+    return bool(((factor > MAGNIFIED) & (steps >= ON_END)).any())
+
+
+def _on_end(growth: Tensor) -> tuple[Tensor, Tensor]:
+    """Sum of what is above 0, and how many, up to each one since the last 0, ``(..., K)``."""
+    total, count = growth.cumsum(-1), (growth > 0).long().cumsum(-1)
+    calm = growth <= 0
+    since = torch.where(calm, total, torch.zeros_like(total)).cummax(-1).values
+    before = torch.where(calm, count, torch.zeros_like(count)).cummax(-1).values
+    return total - since, count - before
 
 
 def step_errors(simulator: Trajectories, values: Tensor, states: Tensor) -> Tensor:

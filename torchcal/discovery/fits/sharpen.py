@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchcal.discovery.fits.fitting import Fitted, fit
 from torchcal.errors import DomainError
-from torchcal.simulators import Trajectories, focused, may_change, outgrown, settled_implicitly, step_errors
+from torchcal.simulators import Trajectories, focused, magnified, may_change, outgrown, settled_implicitly, step_errors
 
 __all__ = ["SOLVER_SHARE", "accurate", "sharpen"]
 
@@ -16,8 +16,9 @@ __all__ = ["SOLVER_SHARE", "accurate", "sharpen"]
 SOLVER_SHARE = 0.05
 #: How often implicit steps are chosen at most.
 ROUNDS = 8
-#: Factor by which the error must become smaller when steps are chosen anew.
-CONVERGING = 4.0
+#: Factor by which the error must become smaller when steps are chosen anew; and how often they are halved at most where
+#: they would magnify what fades.
+CONVERGING, CALMING = 4.0, 3
 
 
 def accurate(found: Fitted, sd: Tensor) -> bool:
@@ -30,7 +31,7 @@ def accurate(found: Fitted, sd: Tensor) -> bool:
         return True
     states = simulator.solve(found.values[None], found.warm)
     errors = step_errors(simulator, found.values, states)
-    if outgrown(simulator, found.values[None], states):
+    if outgrown(simulator, found.values[None], states) or magnified(simulator, found.values[None], states):
         return False
     least = float((sd / found.problem.recording.spread[found.problem.index]).min())
     return float(errors.sum()) <= SOLVER_SHARE * least
@@ -41,7 +42,8 @@ def sharpen(
 ) -> tuple[Fitted, float]:
     """Shorten a fit's time steps, where they err, until halving them moves no output by more than is allowed.
 
-    Where that is of little avail, as in a stiff model, they become implicit if that is.
+    Where that is of little avail, as in a stiff model, or steps would magnify what fades, they become implicit if that
+    is.
 
     Args:
         found: The fit.
@@ -65,16 +67,20 @@ def sharpen(
         error, most = (y - found.y).abs(), allowed(found)
         states = simulator.solve(found.values[None], found.warm)
         branch = outgrown(simulator, found.values[None], states)  # of the solution may be another one
-        if bool((error <= most).all()) and not branch:
+        settled = bool((error <= most).all()) and not branch
+        loud = settled and magnified(simulator, found.values[None], states)  # what a term would do is wrong
+        if settled and (number == CALMING or not loud):
             return found, 0.0
         before, share = share, float((error / most).nan_to_num(nan=math.inf).max())
-        slow = branch or (number > 0 and not share < before / CONVERGING)
+        slow = branch or loud or (number > 0 and not share < before / CONVERGING)
         if slow and (again := _implicit(found, most, ROUNDS if patient else 1)) is not None:
             return sharpen(again, allowed, rounds=rounds, patient=patient)
+        if settled and (number == rounds or not patient):
+            return found, 0.0
         if number == rounds or (slow and not patient):
             break
         try:
-            if math.isfinite(share):
+            if math.isfinite(share) and not loud:
                 finer = focused(simulator, found.values, states, 2.0 * share)
         except DomainError:  # more steps than anyone can take
             break

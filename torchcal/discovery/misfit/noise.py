@@ -37,6 +37,8 @@ FLOOR = 1e-7
 #: and as how many independent data differences of neighbours count.
 FEWEST, GROWS, LITTLE, INDEPENDENT = 20, 3.0, 4.0, 0.6
 OFFSETS = (1e-5, 3e-5, 1e-4, 3e-4, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3)
+#: So many data with outputs that small say how noise is there; below them it is no smaller.
+SAY = 3
 #: Least share of a datum's own noise that smooth curves leave of it.
 LEVERAGE = 0.1
 #: Ratio of the largest to the smallest sd of an output from which on both are told.
@@ -201,8 +203,9 @@ def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor, before
     """Noise sd in units of its median, ``(n_total,)``: 1, or growing with the model's output where the scatter does.
 
     An sd of a + |f| / max |f| is taken for the best of a few a where it makes the fastest part of the residual much
-    likelier (by `GROWS`; Laplace's distribution, whose scale a few outliers move little). Where there are replicates,
-    how far they are off their means takes the place of the residual. It is for noise of unknown size. Outputs ``f`` are
+    likelier (by `GROWS`; Laplace's distribution, whose scale a few outliers move little), and no smaller than where
+    `SAY` data were looked at: of a blank nothing is known but by them. Where there are replicates, how far they are off
+    their means takes the place of the residual. It is for noise of unknown size. Outputs ``f`` are
     those of all data, used or not, ``(n_total,)``; ``before`` is what was found before, by which data are weighed.
     """
     unit = torch.ones_like(problem.recording.y)
@@ -227,7 +230,7 @@ def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor, before
         e, size_of, told = e[seen], size_of[seen], told * float(seen.double().mean())
         if len(e) < FEWEST or not float(used.max()) > 0 or not float(e.sum()) > 0:
             continue
-        best = GROWS - told * math.log(float(e.sum()))
+        best, smallest = GROWS - told * math.log(float(e.sum())), float(size_of.sort().values[SAY - 1])
         for offset in OFFSETS:
             shape = offset + size_of
             if float(shape.max()) < LITTLE * float(shape.min()):
@@ -235,7 +238,8 @@ def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor, before
             like = -told * (math.log(float((e / shape).sum())) + float(shape.log().mean()))
             if like > best:
                 best, here = like, mine(problem, output)
-                unit[here] = (offset + f[here] / used.max()) / (offset + float(used.median() / used.max()))
+                grown = offset + (f[here] / used.max()).clamp_min(smallest)
+                unit[here] = grown / (offset + float(used.median() / used.max()))
     return torch.where(torch.isfinite(unit), unit, 1.0)
 
 

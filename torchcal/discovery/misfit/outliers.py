@@ -26,8 +26,9 @@ UNEVEN = 2.0
 ROUNDED = 1e-12
 #: Share of supposed outliers with another one as nearest neighbour above which they are no outliers.
 TOGETHER = 0.4
-#: Probability of as many of them at one value of a condition by chance, below which they are no outliers.
-CHANCE = 0.1
+#: Probability of as many of them at one value of a condition by chance, below which they are no outliers; and of as many
+#: on end along one, `BESIDE` places apart at most and on the same side.
+CHANCE, ON_END, BESIDE = 0.1, 0.01, 2
 
 
 def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
@@ -46,7 +47,7 @@ def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
         if problem.order is None:
             left, scale = _robust_left(smooth_columns(problem, places, ranks=True), r)
             high, far = (_high(values, sd is not None) for values in (left, left / scale))
-            found[places] = _first(high & far, left / scale) if not _clustered(problem, places, high) else False
+            found[places] = _first(high & far, left / scale) if not _clustered(problem, places, high, left) else False
             continue
         at = problem.order[problem.condition_of[places]].double()
         # A curve leaves its neighbours' range nowhere, but bends everywhere.
@@ -73,7 +74,7 @@ def lone(problem: Problem, residual: Tensor, sd: Tensor | None, ends: bool = Fal
         far = (r.abs() > LONE * size) & (size > 0)
         if problem.order is None:
             far = _first(far, r)
-            found[places] = far & (not _clustered(problem, places, far))
+            found[places] = far & (not _clustered(problem, places, far, r))
             continue
         beside = torch.full_like(r, -math.inf)
         beside[1:] = r[:-1] * r[1:].sign()
@@ -207,13 +208,15 @@ def _off_curve(at: Tensor, r: Tensor, high: Sequence[bool], k: int, end: int, le
     return False
 
 
-def _clustered(problem: Problem, places: Tensor, high: Tensor) -> bool:
-    """Whether data that stick out lie together among the conditions, as outliers do not."""
+def _clustered(problem: Problem, places: Tensor, high: Tensor, r: Tensor) -> bool:
+    """Whether data that stick out lie together among the conditions, as outliers do not; ``r`` is by how much."""
     count = int(high.sum())
     if count < 2:
         return False
     columns = problem.recording.columns[problem.condition_of[places]].unbind(-1)
     if any(_one_level(column, high, CHANCE / len(columns)) for column in columns):
+        return True
+    if any(_on_end(column, high, r, ON_END / len(columns)) for column in columns):
         return True
     if count < 3:
         return False
@@ -224,6 +227,19 @@ def _clustered(problem: Problem, places: Tensor, high: Tensor) -> bool:
     nearest = (distance <= distance.amin(1, keepdim=True) * (1 + 1e-9)).double()
     together = float((nearest @ high.double() / nearest.sum(1)).mean())
     return together > TOGETHER
+
+
+def _on_end(column: Tensor, high: Tensor, r: Tensor, chance: float) -> bool:
+    """Whether more data that stick out to one side follow each other along a condition than by chance of less than
+    this: of c among m, as many as a Poisson variable with a mean of c² `BESIDE` / 2 m."""
+    count, m = int(high.sum()), len(column)
+    if 2 * len(column.unique()) < m:
+        return False
+    order = column.argsort(stable=True)
+    at, side = high[order].nonzero()[:, 0], r[order][high[order]].sign()
+    pairs = int(((at.diff() <= BESIDE) & (side.diff() == 0)).sum())
+    mean = 0.5 * BESIDE * count**2 / m
+    return 1 - math.exp(-mean) * sum(mean**k / math.factorial(k) for k in range(pairs)) < chance
 
 
 def _one_level(column: Tensor, high: Tensor, chance: float) -> bool:

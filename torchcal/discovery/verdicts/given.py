@@ -154,7 +154,7 @@ def held_otherwise(search: Search) -> list[str]:
     holds = {hold for _, hold in changed}
     how = f"hold='{holds.pop()}'" if len(holds) == 1 else "the other hold="
     if len(changed) < len(pairs):
-        how += f" in run{'s' if len(changed) > 1 else ''} {', '.join(str(r + 1) for r, _ in changed)}"
+        how += f" in run{'s' if len(changed) > 1 else ''} {', '.join(str(r) for r, _ in changed)}"
     left = f"the base's RMSE is {_rmse(found):.4g} in place of {_rmse(search.base):.4g}"
     if not search.exact and _noise_alone(search, found):
         left = "the base leaves no more than noise"

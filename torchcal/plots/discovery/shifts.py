@@ -101,7 +101,7 @@ def missing_rate(
     for number, (at, height, wide) in enumerate(curves):
         alone = len(curves) == 1
         color, dashes = (ACCEPTED, "-") if alone else style.CYCLE[number % len(style.CYCLE)]
-        name = "estimate" if alone else f"run {number + 1}" if number < NAMED_RUNS else None
+        name = "estimate" if alone else f"run {number}" if number < NAMED_RUNS else None
         ax.fill_between(
             at, height - 2 * wide, height + 2 * wide, lw=0, zorder=2, color=style.MODEL_ERROR_BAND if alone else color,
             alpha=None if alone else 0.15, label="±2 sd" if number == 0 else None,
