@@ -51,8 +51,8 @@ def settled(
     """The same with steps so short that halving them changes no output by more than is allowed.
 
     Where halving them hardly lessens that, as of a stiff model, or where they would magnify what fades, implicit steps
-    are tried; where they are implicit, these are shortened in places first. A solution that is infinite with both steps counts as settled. Where the
-    simulator has a ``max_step``, the steps stay as they are.
+    are tried; where they are implicit, these are shortened in places first. A solution that is infinite with both steps
+    counts as settled. Where the simulator has a ``max_step``, the steps stay as they are.
 
     Args:
         simulator: In time.

@@ -26,8 +26,8 @@ UNEVEN = 2.0
 ROUNDED = 1e-12
 #: Share of supposed outliers with another one as nearest neighbour above which they are no outliers.
 TOGETHER = 0.4
-#: Probability of as many of them at one value of a condition by chance, below which they are no outliers; and of as many
-#: on end along one, `BESIDE` places apart at most and on the same side.
+#: Probability of as many of them at one value of a condition by chance, below which they are no outliers; and of as
+#: many on end along one, `BESIDE` places apart at most and on the same side.
 CHANCE, ON_END, BESIDE = 0.1, 0.01, 2
 
 
