@@ -60,8 +60,9 @@ def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
 def lone(problem: Problem, residual: Tensor, sd: Tensor | None, ends: bool = False) -> Tensor:
     """Used data that a model that explains the others misses by far, bool ``(n,)``.
 
-    In an order their neighbours must not be half as far off that way, and the ends are not judged unless that is
-    wanted: a quick beginning is physics as likely as not. Among several conditions they must not be together.
+    In an order their neighbours, or those of two side by side, must not be half as far off that way, and the ends are
+    not judged unless that is wanted: a quick beginning is physics as likely as not. Among several conditions they must
+    not be together.
     """
     found = torch.zeros(problem.n, dtype=torch.bool)
     for places in problem.sequences:
@@ -81,7 +82,18 @@ def lone(problem: Problem, residual: Tensor, sd: Tensor | None, ends: bool = Fal
         beside[:-1] = torch.maximum(beside[:-1], r[1:] * r[:-1].sign())
         if not ends:
             far[[0, -1]] = False
-        found[places] = far & (beside < 0.5 * r.abs())
+        found[places] = (far & (beside < 0.5 * r.abs())) | _twins(r, far)
+    return found
+
+
+def _twins(r: Tensor, far: Tensor) -> Tensor:
+    """Which of some data ``(m,)`` are two side by side, far off on one side, and those around not half as far."""
+    found = torch.zeros_like(far)
+    both = far[1:-2] & far[2:-1] & (r[1:-2] * r[2:-1] > 0)
+    around = torch.maximum(r[:-3] * r[1:-2].sign(), r[3:] * r[1:-2].sign())
+    both &= around < 0.5 * torch.minimum(r[1:-2].abs(), r[2:-1].abs())
+    found[1:-2] |= both
+    found[2:-1] |= both
     return found
 
 
