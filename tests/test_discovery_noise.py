@@ -381,7 +381,7 @@ def test_a_lone_outlier_is_one_beside_a_residual_of_the_other_sign_and_a_bump_or
     residual[40:43] = torch.tensor([0.5, 0.6, 0.5], dtype=F64)  # something that lasts
     assert lone(problem, residual, recording.noise).nonzero()[:, 0].tolist() == [20, 51]
     assert lone(problem, residual, None).nonzero()[:, 0].tolist() == [20, 51]
-    residual[29:33] = torch.tensor([0.1, -0.82, -0.6, -0.1], dtype=F64)  # two side by side, of different size
+    residual[29:33] = torch.tensor([0.1, -0.82, -0.7, -0.1], dtype=F64)  # two side by side, of different size
     assert lone(problem, residual, recording.noise).nonzero()[:, 0].tolist() == [20, 30, 31, 51]
     residual[32] = -0.4  # what fades is no pair of them
     assert lone(problem, residual, recording.noise).nonzero()[:, 0].tolist() == [20, 51]
