@@ -1,6 +1,7 @@
 """Least squares, whitening and simulated noise of a diagnosis, against scipy, Cholesky and what follows by hand."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.base import calibrate_base
 from torchcal.discovery.misfit.noise import GRID, Noise
 from torchcal.discovery.misfit.residual import Residual, _noise_draws
+from torchcal.discovery.verdicts.explain import deeper
 from torchcal.simulators.dual import transformed
 
 F64 = torch.float64
@@ -491,3 +493,27 @@ def test_a_look_ahead_goes_no_farther_than_steps_do_along_a_flat_logarithm():
         assert math.isfinite(found.chi2)
         reached.append(math.log(farthest[0] / 1e4))
     assert max(reached) <= 2.0 * 26
+
+
+def test_what_is_named_is_told_at_its_lowest_minimum():
+    """A sine whose frequency was found in another minimum than the lowest."""
+    x = torch.linspace(0, 6, 80, dtype=F64)
+    parameters = [tc.Parameter("w", low=0.5, high=6.0, initial=2.0), tc.Parameter("b")]
+    wave = tc.Simulator(lambda x, p: torch.sin(p["w"] * x) + p["b"] * x, parameters)
+    recording = tc.Recording(x=x, y=torch.sin(2.0 * x) + 0.3 * x + 0.1 * draws(1, 80, seed=3)[0], noise=0.1)
+    problem = Problem.of(wave, recording)
+    whitening = problem.whitening(recording.noise, torch.zeros(1, dtype=F64))
+
+    def search():
+        return SimpleNamespace(exact=False, seed=0, from_guesses=lambda found, begin, steps: fit(
+            problem, whitening, begin, found.free, max_steps=steps, finish=0))  # fmt: skip
+
+    def named(w):
+        found = fit(problem, whitening, torch.tensor([[w, 0.3]], dtype=F64), [0, 1])
+        candidate = SimpleNamespace(own=[1], amplitudes=[1], neutral=torch.zeros(1, dtype=F64))
+        return SimpleNamespace(found=found, candidate=candidate, window=None)
+
+    astray, right = named(4.6), named(2.1)
+    assert astray.found.chi2 > right.found.chi2 + 100
+    assert deeper(search(), right) is None
+    assert deeper(search(), astray).chi2 == pytest.approx(right.found.chi2, abs=1e-3)

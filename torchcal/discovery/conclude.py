@@ -80,6 +80,8 @@ def conclude(
         interrupted: In words, or empty.
     """
     best = decision.best
+    if best is not None and (found := explain.deeper(search, best)) is not None:
+        best.found, best.structure, best.residual = found, None, None
     contained = [term for term in asked.terms if all(term is not one for one in search.terms)]
     told = [best] if best is not None else decision.tied_models if decision.none + decision.base < HALF else []
     if told and (noise := beside(search, told[0])) is not search.noise:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.fits.candidates import Candidate, drivers_scale, prepare
-from torchcal.discovery.fits.fitting import Fitted, refit, weighed
+from torchcal.discovery.fits.fitting import Fitted, fit, refit, weighed
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.refits import Refit, refit_all
 from torchcal.discovery.fits.sharpen import SOLVER_SHARE, accurate, sharpen
@@ -91,6 +91,7 @@ class Search:
     otherwise: dict[int, tuple[Fitted, Fitted | None]] = field(init=False, default_factory=dict)
     _unknown: dict[int, tuple[Fitted, tuple[Noise, float]]] = field(init=False, default_factory=dict)
     _held_out: dict[tuple[int, bytes], tuple[Fitted, HeldOut | None]] = field(init=False, default_factory=dict)
+    _from_guesses: dict[int, tuple[Fitted, Fitted | None]] = field(init=False, default_factory=dict)
 
     @property
     def exact(self) -> bool:
@@ -220,6 +221,13 @@ class Search:
         if key not in self._held_out:  # the fit is kept beside it, so that its id stays its own
             self._held_out[key] = (found, held_out_fit(found, self.noise, mask))
         return self._held_out[key][1]
+
+    def from_guesses(self, found: Fitted, begin: Tensor, max_steps: int) -> Fitted | None:
+        """A model of this search fitted from first guesses ``(H, P)``; computed once."""
+        if id(found) not in self._from_guesses:  # as above
+            again = fit(found.problem, found.whitening, begin, found.free, max_steps=max_steps, finish=0)
+            self._from_guesses[id(found)] = (found, again)
+        return self._from_guesses[id(found)][1]
 
     def amplitude(self, column: int) -> int:
         """Place of a screened column's amplitude among its candidate's parameters."""

@@ -16,6 +16,7 @@ from torchcal.discovery.misfit.structure import Structure
 from torchcal.discovery.records import Estimate, Fit
 
 __all__ = [
+    "deeper",
     "depends",
     "estimates",
     "fit_record",
@@ -43,6 +44,8 @@ APART = 5.0
 #: Starts from which what is named is fitted again, and steps; a minimum that is higher by less than `RIVAL` in χ² and
 #: more than `ELSEWHERE` sd away is another one.
 STARTS, AGAIN, RIVAL, ELSEWHERE = 4, 60, 4.0, 4.0
+#: By how much lower in χ² a fit from there is the one that is told.
+DEEPER = 0.1
 #: Correlation of what two accepted terms do to the data from which on one law between them may look like their sum.
 ONE_LAW = 0.9
 #: A parameter depends on what acts beside it when that moves it by more than this many of its sd.
@@ -252,20 +255,44 @@ def _merged(groups: Sequence[list[str]]) -> list[list[str]]:
     return merged
 
 
+def deeper(search: Search, model: Model) -> Fitted | None:
+    """A better fit of a named model, from the base's first guesses; None where there is none."""
+    found = model.found
+    again = _from_guesses(search, model) if model.window is None and _sized(search, model) else None
+    if again is None or not again.chi2 < found.chi2 - DEEPER:
+        return None
+    better = fit(found.problem, found.whitening, again.values[None], found.free)
+    same = better is not None and torch.equal(better.at_bound, found.at_bound) and better.chi2 < found.chi2 - DEEPER
+    return better if same else None
+
+
+def _sized(search: Search, model: Model) -> list[int]:
+    """Places of a model's amplitudes that the data determine.
+
+    Where the size is open, as the scale of an unseen state leaves it, there is a valley and no other minimum.
+    """
+    found, candidate, sd = model.found, model.candidate, model.found.sd()
+    neutral = dict(zip(candidate.own, candidate.neutral.tolist(), strict=True))
+    if search.exact:
+        return []
+    return [i for i in candidate.amplitudes if 0 < float(sd[i]) < abs(float(found.values[i]) - neutral[i])]
+
+
+def _from_guesses(search: Search, model: Model) -> Fitted | None:
+    """A model fitted again from the base's first guesses, with what its terms bring as it was found."""
+    found = model.found
+    held = [i for i in range(len(found.values)) if i not in found.free]
+    kept = {i: float(found.values[i]) for i in (*held, *model.candidate.own)}
+    return search.from_guesses(found, starts(found.problem, STARTS, search.seed, kept), AGAIN)
+
+
 def other_minima(search: Search, model: Model) -> list[str]:
     """Other estimates of a named term's size that fit about as well, from the base's first guesses.
 
     The sd that are given are those within one minimum.
     """
-    found, candidate = model.found, model.candidate
-    sd, neutral = found.sd(), dict(zip(candidate.own, candidate.neutral.tolist(), strict=True))
-    # Where the size is open, as the scale of an unseen state leaves it, there is a valley and no other minimum.
-    places = [i for i in candidate.amplitudes if 0 < float(sd[i]) < abs(float(found.values[i]) - neutral[i])]
-    if search.exact or not places:
-        return []
-    held = [i for i in range(len(found.values)) if i not in found.free]
-    begin = starts(found.problem, STARTS, search.seed, {i: float(found.values[i]) for i in (*held, *candidate.own)})
-    again = fit(found.problem, found.whitening, begin, found.free, max_steps=AGAIN, finish=0)
+    found, sd, places = model.found, model.found.sd(), _sized(search, model)
+    again = _from_guesses(search, model) if places else None
     if again is None or again.ends is None or again.ends_chi2 is None:
         return []
     for k in again.ends_chi2.argsort().tolist():
