@@ -349,6 +349,20 @@ def test_data_that_stick_out_on_end_along_one_of_several_conditions_are_no_outli
     assert found is together
 
 
+@pytest.mark.parametrize("m", [300, 1500])
+def test_many_outliers_on_one_side_are_no_row_of_them(m):
+    """Of 60 draws each with a chance of 2 % at most 6 are taken for one; 200 of them one after the other are."""
+    column, rng = torch.linspace(0, 1, m, dtype=F64), np.random.default_rng(0)
+    taken = 0
+    for _ in range(60):
+        high = torch.zeros(m, dtype=torch.bool)
+        high[rng.choice(m, m // 10, replace=False)] = True
+        taken += outliers._in_a_row(column, high, high.double(), 0.02)
+    assert taken <= 6
+    row = torch.arange(m) < min(200, m // 3)
+    assert outliers._in_a_row(column, row, row.double(), 0.01)
+
+
 @pytest.mark.parametrize(
     ("p", "bend", "verdict"),
     [(0.005, 1.0, "named"), (0.03, 0.2, "named"), (0.2, 0.2, "consistent"), (0.2, 1.0, "named")],

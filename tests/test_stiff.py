@@ -424,3 +424,16 @@ def test_steps_that_would_magnify_what_fades_are_not_kept():
         assert not magnified(found, values, found.solve(values))
         more = found.at(found.x)(values + tensor(0.0, 1e-3)) - found.at(found.x)(values)
         assert float(more[0, -1]) == pytest.approx(1e-3 / 5.6, rel=1e-3)
+
+
+def test_steps_that_magnify_whatever_is_done_stay_as_they_are():
+    """Halving them a few times is of no avail: then not at all, and never again and again."""
+    t = np.concatenate([np.linspace(0, 0.1, 40), np.linspace(1, 40, 40)])
+    model = tc.ODESimulator(
+        lambda t, s, p, u: {"N": -p["k"] * s["N"]}, ["N"], [tc.Parameter("k", low=0.0)], stiff=False
+    )
+    bound = model.bind(tc.Recording(runs=[run_of(t, {"N": 0.0}, ("N",))]))
+    values, allowed = tensor(1e4)[None], torch.full((len(t),), 1e-3, dtype=F64)
+    assert magnified(bound, values, bound.solve(values))
+    assert settled(bound, values, allowed).num_steps == bound.num_steps
+    assert settled(bound, values, allowed, halvings=1, switch=False).num_steps == bound.num_steps

@@ -108,8 +108,9 @@ def _with_look_alikes(search: Search, tried: set[tuple[int, ...]], prior: float)
     while leading and len(fitted) < MOST:
         done |= {m.numbers for m in leading}
         wanted = dict.fromkeys(pair for lead in leading for pair in _swapped(search, lead) if pair not in tried)
-        tried |= wanted.keys()
-        search.models += (twins := _refit_sets(search, [(pair, None) for pair in wanted], prior))
+        pairs = list(wanted)[: MOST - len(fitted)]
+        tried.update(pairs)
+        search.models += (twins := _refit_sets(search, [(pair, None) for pair in pairs], prior))
         fitted += _either_way(search, twins)
         leading = [m for m in _close(search) if m.numbers not in done]
     return fitted

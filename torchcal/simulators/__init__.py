@@ -12,6 +12,7 @@ from torchcal.simulators.slopes import check_slopes
 from torchcal.simulators.solution import Solution
 from torchcal.simulators.static import Conditions, Linearisation, Simulator, asks_for_numbers, check_parameters
 from torchcal.simulators.stepping import (
+    calmed,
     focused,
     magnified,
     may_change,
@@ -40,6 +41,7 @@ __all__ = [
     "Values",
     "asks_for_numbers",
     "build_surrogate",
+    "calmed",
     "careful",
     "check_parameters",
     "check_slopes",

@@ -10,7 +10,17 @@ from torch import Tensor
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators.trajectories import Trajectories
 
-__all__ = ["focused", "magnified", "may_change", "outgrown", "settled", "settled_implicitly", "step_errors", "workable"]
+__all__ = [
+    "calmed",
+    "focused",
+    "magnified",
+    "may_change",
+    "outgrown",
+    "settled",
+    "settled_implicitly",
+    "step_errors",
+    "workable",
+]
 
 #: How often steps are halved at most; how often implicit ones are chosen that are tried in place of others, and how
 #: many they may become.
@@ -25,8 +35,8 @@ DENSER, DENSEST, JUMPS = 4, 4096, 48
 #: of the solution that is none.
 GROWTH = 2.0
 #: Size of h λ from which on explicit steps may magnify what fades; steps on end that do, by which factor in log all
-#: together, until it matters; and how often they are halved for that alone.
-UNSTABLE, ON_END, MAGNIFIED, CALMING = 2.5, 3, 7.0, 4
+#: together, until it matters; how many parameter values are looked at; and how often they are halved for that alone.
+UNSTABLE, ON_END, MAGNIFIED, LOOKED_AT, CALMING = 2.5, 3, 7.0, 4, 4
 #: Implicit steps that are solved at most while their lengths are chosen: a model that jumps needs ever more of them.
 WORK = 200_000
 #: Choices of their lengths in which the error must fall by `CONVERGING`.
@@ -75,13 +85,10 @@ def settled(
         finer = _Solved(halved, halved.solve(values))
         z = finer.outputs(values)
         change = torch.where(torch.isfinite(y) | torch.isfinite(z), (z - y).abs(), torch.zeros_like(y))
-        loud = False
         if bool((change <= allowed).all()) and not outgrown(here.simulator, values, here.states):
-            loud = number < CALMING and magnified(here.simulator, values, here.states)
-            if not loud:
-                return here.simulator
+            return calmed(here.simulator, values, allowed, here.states, switch=switch)
         before, share = share, float((change / allowed).nan_to_num(nan=math.inf).max())
-        if switch and number == 1 and (loud or not share < before / CONVERGING) and not simulator.implicit:
+        if switch and number == 1 and not share < before / CONVERGING and not simulator.implicit:
             other = settled_implicitly(simulator, values, allowed)
             if other is not None:
                 return other
@@ -222,25 +229,58 @@ def _finite(simulator: Trajectories, values: Tensor) -> bool:
     return bool(torch.isfinite(_Solved(simulator, simulator.solve(values)).outputs(values)).all())
 
 
+def calmed(
+    simulator: Trajectories, values: Tensor, allowed: Tensor, states: Tensor, *, switch: bool = True
+) -> Trajectories:
+    """The same, or where its explicit steps magnify what fades, with implicit ones or shorter ones that do not; itself
+    where there are none. Arguments are those of `settled`, and its solved states."""
+    excess = _magnifying(simulator, values, states)
+    if not excess:
+        return simulator
+    if switch and (other := settled_implicitly(simulator, values, allowed)) is not None:
+        return other
+    finer = simulator
+    for _ in range(CALMING if excess < 2**CALMING else 0):
+        try:
+            finer = finer.refined(2)
+        except DomainError:  # more steps than anyone can take
+            break
+        if finer.num_steps > MANY:
+            break
+        if not _magnifying(finer, values, finer.solve(values)):
+            return finer
+    return simulator
+
+
 def magnified(simulator: Trajectories, values: Tensor, states: Tensor) -> bool:
     """Whether explicit steps, at some values and their solved states, magnify what fades.
 
     A fast state at rest may be solved well with such steps, and what a small change makes of it be wrong without limit:
     several steps on end lie outside the region in which the method is stable.
     """
+    return _magnifying(simulator, values, states) > 0
+
+
+def _magnifying(simulator: Trajectories, values: Tensor, states: Tensor) -> float:
+    """The largest size of h λ in `UNSTABLE` where steps magnify what fades; 0 where they do not. It is looked at for a
+    few of the values."""
     if simulator.implicit:
-        return False
+        return 0.0
+    few = torch.linspace(0, len(values) - 1, min(LOOKED_AT, len(values))).long()
+    values, states = values[few], states[few]
     t, h, u = simulator.grid.flat
     slopes = simulator.steps.slopes_at(values, states[:, :, :-1], t, {name: table[0] for name, table in u.items()})
-    growth = torch.zeros(slopes.shape[:2], dtype=slopes.dtype)
+    growth, size = (torch.zeros(slopes.shape[:2], dtype=slopes.dtype) for _ in range(2))
     possible = (slopes.abs().sum(-1).amax(-1) * h > UNSTABLE) & slopes.isfinite().flatten(2).all(-1)
     if not bool(possible.any()):
-        return False
+        return 0.0
     z = torch.linalg.eigvals(slopes[possible]) * h.expand(possible.shape)[possible][:, None]
+    z = torch.where(z.real < 0, z, torch.zeros_like(z))
     gain = (1 + z * (1 + z / 2 * (1 + z / 3 * (1 + z / 4)))).abs().log()
-    growth[possible] = torch.where(z.real < 0, gain, torch.zeros_like(gain)).amax(-1).clamp_min(0)
+    growth[possible], size[possible] = gain.amax(-1).clamp_min(0), z.abs().amax(-1)
     factor, steps = _on_end(growth.reshape(*states.shape[:2], -1))
-    return bool(((factor > MAGNIFIED) & (steps >= ON_END)).any())
+    loud = bool(((factor > MAGNIFIED) & (steps >= ON_END)).any())
+    return float(size[growth > 0].max()) / UNSTABLE if loud else 0.0
 
 
 def _on_end(growth: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,7 +8,16 @@ from torch import Tensor
 
 from torchcal.discovery.fits.fitting import Fitted, fit
 from torchcal.errors import DomainError
-from torchcal.simulators import Trajectories, focused, magnified, may_change, outgrown, settled_implicitly, step_errors
+from torchcal.simulators import (
+    Trajectories,
+    calmed,
+    focused,
+    magnified,
+    may_change,
+    outgrown,
+    settled_implicitly,
+    step_errors,
+)
 
 __all__ = ["SOLVER_SHARE", "accurate", "sharpen"]
 
@@ -16,9 +25,8 @@ __all__ = ["SOLVER_SHARE", "accurate", "sharpen"]
 SOLVER_SHARE = 0.05
 #: How often implicit steps are chosen at most.
 ROUNDS = 8
-#: Factor by which the error must become smaller when steps are chosen anew; and how often they are halved at most where
-#: they would magnify what fades.
-CONVERGING, CALMING = 4.0, 3
+#: Factor by which the error must become smaller when steps are chosen anew.
+CONVERGING = 4.0
 
 
 def accurate(found: Fitted, sd: Tensor) -> bool:
@@ -67,20 +75,16 @@ def sharpen(
         error, most = (y - found.y).abs(), allowed(found)
         states = simulator.solve(found.values[None], found.warm)
         branch = outgrown(simulator, found.values[None], states)  # of the solution may be another one
-        settled = bool((error <= most).all()) and not branch
-        loud = settled and magnified(simulator, found.values[None], states)  # what a term would do is wrong
-        if settled and (number == CALMING or not loud):
-            return found, 0.0
+        if bool((error <= most).all()) and not branch:
+            return _calm(found, most, states, ROUNDS if patient else 1), 0.0
         before, share = share, float((error / most).nan_to_num(nan=math.inf).max())
-        slow = branch or loud or (number > 0 and not share < before / CONVERGING)
+        slow = branch or (number > 0 and not share < before / CONVERGING)
         if slow and (again := _implicit(found, most, ROUNDS if patient else 1)) is not None:
             return sharpen(again, allowed, rounds=rounds, patient=patient)
-        if settled and (number == rounds or not patient):
-            return found, 0.0
         if number == rounds or (slow and not patient):
             break
         try:
-            if math.isfinite(share) and not loud:
+            if math.isfinite(share):
                 finer = focused(simulator, found.values, states, 2.0 * share)
         except DomainError:  # more steps than anyone can take
             break
@@ -88,6 +92,20 @@ def sharpen(
         again = fit(problem, found.whitening, found.values[None], found.free)
         found = found if again is None else again
     return found, float(error.max())
+
+
+def _calm(found: Fitted, allowed: Tensor, states: Tensor, rounds: int) -> Fitted:
+    """The fit with steps that do not magnify what fades, where there are any: what a term would do there is wrong."""
+    problem, simulator = found.problem, found.problem.simulator
+    if not isinstance(simulator, Trajectories) or not magnified(simulator, found.values[None], states):
+        return found
+    if (again := _implicit(found, allowed, rounds)) is not None:
+        return again
+    calm = calmed(simulator, found.values[None], allowed, states, switch=False)
+    if calm is simulator:
+        return found
+    again = fit(problem.with_simulator(calm), found.whitening, found.values[None], found.free)
+    return found if again is None else again
 
 
 def _implicit(found: Fitted, allowed: Tensor, rounds: int) -> Fitted | None:

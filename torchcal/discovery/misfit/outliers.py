@@ -28,7 +28,7 @@ ROUNDED = 1e-12
 TOGETHER = 0.4
 #: Probability of as many of them at one value of a condition by chance, below which they are no outliers; and of as
 #: many on end along one, `BESIDE` places apart at most and on the same side.
-CHANCE, ON_END, BESIDE = 0.1, 0.01, 2
+CHANCE, IN_ROW, BESIDE = 0.1, 0.02, 2
 
 
 def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
@@ -228,7 +228,7 @@ def _clustered(problem: Problem, places: Tensor, high: Tensor, r: Tensor) -> boo
     columns = problem.recording.columns[problem.condition_of[places]].unbind(-1)
     if any(_one_level(column, high, CHANCE / len(columns)) for column in columns):
         return True
-    if any(_on_end(column, high, r, ON_END / len(columns)) for column in columns):
+    if any(_in_a_row(column, high, r, IN_ROW / len(columns)) for column in columns):
         return True
     if count < 3:
         return False
@@ -241,17 +241,19 @@ def _clustered(problem: Problem, places: Tensor, high: Tensor, r: Tensor) -> boo
     return together > TOGETHER
 
 
-def _on_end(column: Tensor, high: Tensor, r: Tensor, chance: float) -> bool:
+def _in_a_row(column: Tensor, high: Tensor, r: Tensor, chance: float) -> bool:
     """Whether more data that stick out to one side follow each other along a condition than by chance of less than
-    this: of c among m, as many as a Poisson variable with a mean of c² `BESIDE` / 2 m."""
-    count, m = int(high.sum()), len(column)
+    this: of a above and b below among m, as many as a Poisson variable with a mean of
+    (a (a - 1) + b (b - 1)) `BESIDE` / m."""
+    m = len(column)
     if 2 * len(column.unique()) < m:
         return False
     order = column.argsort(stable=True)
     at, side = high[order].nonzero()[:, 0], r[order][high[order]].sign()
     pairs = int(((at.diff() <= BESIDE) & (side.diff() == 0)).sum())
-    mean = 0.5 * BESIDE * count**2 / m
-    return 1 - math.exp(-mean) * sum(mean**k / math.factorial(k) for k in range(pairs)) < chance
+    mean = BESIDE * sum(c * (c - 1) for c in (int((side > 0).sum()), int((side < 0).sum()))) / m
+    as_many = torch.special.gammainc(*torch.tensor([[max(pairs, 1)], [mean]], dtype=torch.float64))
+    return pairs > 0 and float(as_many) < chance
 
 
 def _one_level(column: Tensor, high: Tensor, chance: float) -> bool:

@@ -23,7 +23,8 @@ __all__ = ["no_instrument", "only_instruments", "unnatural", "which_instruments"
 FALL, ROUNDING = 2.0, 1e-3
 #: Variation that an instrument may add, in that of what it measures: with more it is another model of the thing.
 ADDED = 1.0
-#: Share of what the true value varies by of which an instrument that bends nowhere shows at least so much.
+#: Share of what the true value varies by that an instrument which bends nowhere shows at least, beside other terms:
+#: alone it may be set to another range.
 SHOWN = 0.4
 #: Share of the range of the true values by which it is looked at beyond them.
 BEYOND = 0.2
@@ -77,7 +78,7 @@ def which_instruments(model: Model) -> list[bool]:
 
 def no_instrument(search: Search, model: Model) -> str:
     """Why a model's instruments are none: the reading of one falls where the true value rises, shows more of the
-    instrument than of what it measures or little of that, or has its zero farther off than it ever read."""
+    instrument than of what it measures, or little of that."""
     problem = model.found.problem
     instruments = [term for term in model.candidate.terms if term.is_sensor and not term.states]
     if not instruments:
@@ -110,13 +111,12 @@ def no_instrument(search: Search, model: Model) -> str:
             drifts = curve or (problem.in_time and reading.is_of_value(and_time=True))
             if drifts and float((shown - true[here]).std()) > ADDED * float(true[here].std()):
                 return f"By it the reading of {name} varies more by the instrument's error than by the true value."
-            if curve and not _bends(reading, true[here]) and float(shown.std()) < SHOWN * float(true[here].std()):
+            little = float(shown.std()) < SHOWN * float(true[here].std())
+            if little and curve and len(model.names) > 1 and not _bends(reading, true[here]):
                 return (
                     f"By it the reading of {name} shows less than {SHOWN:.0%} of what the true value varies by, as "
                     "that of hardly any instrument does."
                 )
-            if curve and float((shown - true[here]).mean().abs()) > float(problem.y[here].abs().max()):
-                return f"By it the reading of {name} is off by more than it ever was, as that of hardly any instrument."
             shaped = curve and any(term.brings(names[i]) and not is_window(names[i]) for i in shapes)
             if shaped and _bends(reading, true[here]) and _straight(reading, true[here], sd[here]):
                 return (
