@@ -19,6 +19,7 @@ from torchcal.errors import (
     TorchcalWarning,
 )
 from torchcal.inference.setup import check_inputs
+from torchcal.simulators.static import _copied
 
 X = np.linspace(0, 6, 25)
 
@@ -304,6 +305,11 @@ def test_another_default_device_is_refused():
         ):
             with pytest.raises(DomainError, match=r"default device. Got meta .*device='cuda'"):
                 call()
+
+
+def test_conditions_stay_on_their_device_where_the_default_is_given():
+    with torch.device("cpu"):
+        assert _copied(torch.ones(3, device="meta")).device.type == "meta"
 
 
 def test_a_tensor_of_another_device_is_told():

@@ -135,10 +135,7 @@ class Simulator:
         """
         n = _length(x)
         # A copy: whatever the function does, the recording stays as it is.
-        if isinstance(x, Mapping):
-            x = {name: torch.as_tensor(value).clone() for name, value in x.items()}
-        else:
-            x = torch.as_tensor(x).clone()
+        x = {name: _copied(value) for name, value in x.items()} if isinstance(x, Mapping) else _copied(x)
 
         def evaluate(values: Tensor) -> Tensor:
             check_values(values, self.names)
@@ -332,6 +329,11 @@ def _length(x: Conditions) -> int:
     if first.ndim != 1:
         raise ShapeError(f"Expected conditions of shape (n,). Got {tuple(first.shape)}.")
     return first.shape[0]
+
+
+def _copied(x: Any) -> Tensor:
+    """Of a tensor, where it is: within ``torch.device("cpu")`` ``as_tensor`` would fetch it."""
+    return x.clone() if isinstance(x, Tensor) else torch.as_tensor(x).clone()
 
 
 def _describe(x: Conditions) -> str:
