@@ -19,7 +19,7 @@ def by_default_on_cpu() -> None:
     device = torch.get_default_device()
     if device.type != "cpu":
         raise DomainError(
-            f"Expected the CPU as torch's default device. Got {device} (set it back, torch.set_default_device('cpu'), "
+            f"Expected the CPU as torch's default device. Got {device} (set it back, torch.set_default_device(None), "
             "and say where to compute: calibrate(..., device='cuda'), or NISP(...).to('cuda') in a model of your own)."
         )
 
