@@ -112,7 +112,7 @@ def no_instrument(search: Search, model: Model) -> str:
             if drifts and float((shown - true[here]).std()) > ADDED * float(true[here].std()):
                 return f"By it the reading of {name} varies more by the instrument's error than by the true value."
             little = float(shown.std()) < SHOWN * float(true[here].std())
-            if little and curve and len(model.names) > 1 and not _bends(reading, true[here]):
+            if little and curve and len(model.candidate.terms) > 1 and not _bends(reading, true[here]):
                 return (
                     f"By it the reading of {name} shows less than {SHOWN:.0%} of what the true value varies by, as "
                     "that of hardly any instrument does."
