@@ -414,7 +414,8 @@ def test_a_bound_beside_a_nearly_parallel_tangent(low, high, start):
     assert found.at_bound.tolist() == [False, True]
 
 
-@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), 1])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_unknown_velocities_under_much_noise(star, seed):
     """One and a half orbits: the slope of the first few positions is noise, and a wrong one leads to another orbit."""
     t = torch.linspace(0, 6.6, 154, dtype=F64)

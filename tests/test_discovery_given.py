@@ -63,7 +63,7 @@ def recording(seed: int, hold: str, friction: float = 0.0) -> tc.Recording:
     return tc.Recording(runs=[tc.Run(time=time, outputs={"w": y}, inputs={"c": c}, hold=hold)], noise=sd)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_a_wrong_guess_between_samples_is_no_dead_time(seed):
     d = tc.diagnose(motor(), recording(seed, "linear"), candidates(), seed=0, progress=False)
     assert d.verdict == "ambiguous"
