@@ -101,7 +101,7 @@ def _close(search: Search) -> list[Model]:
 
 def _with_look_alikes(search: Search, tried: set[tuple[int, ...]], prior: float) -> list[Model]:
     """Pairs with another candidate in place of a leading one's that does nearly the same: first of the best, then of
-    those that lead with it, until there are no more."""
+    those that lead with it, until there are no more or `MOST` of them."""
     fitted: list[Model] = []
     done: set[tuple[int, ...]] = set()
     leading = _close(search)[:1]

@@ -35,6 +35,10 @@ class Arrays(ABC):
         """A tensor as an array."""
 
     @abstractmethod
+    def give(self, array: Array) -> Tensor:
+        """An array as a tensor, where it is."""
+
+    @abstractmethod
     def host(self, *arrays: Array) -> tuple[np.ndarray, ...]:
         """Arrays of as many rows each in NumPy."""
 
@@ -62,6 +66,10 @@ class Host(Arrays):
     def take(self, tensor: Tensor) -> np.ndarray:
         """The same memory."""
         return tensor.detach().numpy()
+
+    def give(self, array: np.ndarray) -> Tensor:
+        """The same memory."""
+        return torch.as_tensor(array)
 
     def host(self, *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
         """Themselves."""
@@ -93,6 +101,10 @@ class Device(Arrays):
     def take(self, tensor: Tensor) -> Tensor:
         """On the device."""
         return tensor.detach().to(self._device)
+
+    def give(self, array: Tensor) -> Tensor:
+        """Itself: ``as_tensor`` would fetch it within ``torch.device("cpu")``."""
+        return array
 
     def host(self, *arrays: Tensor) -> tuple[np.ndarray, ...]:
         """Brought from the device in one copy, since each one waits for all that is under way."""

@@ -2,7 +2,6 @@
 
 from typing import Any, Protocol
 
-import torch
 from torch import Tensor
 
 from torchcal.inference import hmc_step, nuts_step
@@ -54,7 +53,7 @@ class NUTS:
 
     def positions(self, state: nuts_step.State) -> Tensor:
         """Proposals of the trees so far."""
-        return _tensor(state.proposal[:, : state.momentum_sum.shape[1]])
+        return self.arrays.give(state.proposal[:, : state.momentum_sum.shape[1]])
 
     def tune(self, z: Tensor, groups: Tensor, space: Whitened, step_size: float) -> Tensor:
         """Trees may be as deep as was asked for from now on."""
@@ -83,7 +82,7 @@ class HMC:
 
     def positions(self, state: hmc_step.State) -> Tensor:
         """Ends of the last trajectories."""
-        return _tensor(state.position)
+        return self.arrays.give(state.position)
 
     def tune(self, z: Tensor, groups: Tensor, space: Whitened, step_size: float) -> Tensor:
         """The length of trajectories is found."""
@@ -92,8 +91,3 @@ class HMC:
             state, space.potential, groups, step_size=step_size, arrays=self.arrays
         )
         return self.positions(state)
-
-
-def _tensor(array: Any) -> Tensor:
-    """Of one of NumPy's; one of torch's stays where it is, which ``as_tensor`` need not leave it at."""
-    return array if isinstance(array, Tensor) else torch.as_tensor(array)

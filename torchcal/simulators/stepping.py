@@ -278,18 +278,16 @@ def _magnifying(simulator: Trajectories, values: Tensor, states: Tensor) -> floa
     z = torch.where(z.real < 0, z, torch.zeros_like(z))
     gain = (1 + z * (1 + z / 2 * (1 + z / 3 * (1 + z / 4)))).abs().log()
     growth[possible], size[possible] = gain.amax(-1).clamp_min(0), z.abs().amax(-1)
-    factor, steps = _on_end(growth.reshape(*states.shape[:2], -1))
-    loud = bool(((factor > MAGNIFIED) & (steps >= ON_END)).any())
-    return float(size[growth > 0].max()) / UNSTABLE if loud else 0.0
-
-
-def _on_end(growth: Tensor) -> tuple[Tensor, Tensor]:
-    """Sum of what is above 0, and how many, up to each one since the last 0, ``(..., K)``."""
-    total, count = growth.cumsum(-1), (growth > 0).long().cumsum(-1)
+    growth = growth.reshape(*states.shape[:2], -1)
     calm = growth <= 0
-    since = torch.where(calm, total, torch.zeros_like(total)).cummax(-1).values
-    before = torch.where(calm, count, torch.zeros_like(count)).cummax(-1).values
-    return total - since, count - before
+    loud = (_on_end(growth, calm) > MAGNIFIED) & (_on_end((~calm).double(), calm) >= ON_END)
+    return float(size.max()) / UNSTABLE if bool(loud.any()) else 0.0
+
+
+def _on_end(values: Tensor, calm: Tensor) -> Tensor:
+    """Sums of values ``(..., K)``, 0 where it is calm, up to each one since it was calm last."""
+    total = values.cumsum(-1)
+    return total - torch.where(calm, total, torch.zeros_like(total)).cummax(-1).values
 
 
 def step_errors(simulator: Trajectories, values: Tensor, states: Tensor) -> Tensor:

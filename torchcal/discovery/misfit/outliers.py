@@ -250,10 +250,9 @@ def _in_a_row(column: Tensor, high: Tensor, r: Tensor, chance: float) -> bool:
         return False
     order = column.argsort(stable=True)
     at, side = high[order].nonzero()[:, 0], r[order][high[order]].sign()
-    pairs = int(((at.diff() <= BESIDE) & (side.diff() == 0)).sum())
-    mean = BESIDE * sum(c * (c - 1) for c in (int((side > 0).sum()), int((side < 0).sum()))) / m
-    as_many = torch.special.gammainc(*torch.tensor([[max(pairs, 1)], [mean]], dtype=torch.float64))
-    return pairs > 0 and float(as_many) < chance
+    pairs = ((at.diff() <= BESIDE) & (side.diff() == 0)).sum().double()
+    mean = BESIDE * sum(c * (c - 1) for c in ((side > 0).sum(), (side < 0).sum())) / torch.tensor(m).double()
+    return bool(pairs > 0) and float(torch.special.gammainc(pairs, mean)) < chance
 
 
 def _one_level(column: Tensor, high: Tensor, chance: float) -> bool:
