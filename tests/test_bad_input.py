@@ -364,3 +364,15 @@ def test_known_noise_that_suffices_is_no_direction_that_the_data_do_not_see(tmp_
     assert "sigma is at zero" in str(tc.results.AdditiveCalibration.load(tmp_path / "enough.nc"))
     unknown = tc.calibrate_additive(simulator, tc.Recording(x=x, y=1 + x + wiggle), num_samples=0)
     assert not unknown.noise_suffices
+
+
+def test_additive_with_known_noise_takes_as_many_data_as_bounded_parameters():
+    """The likelihood is bounded then, and falls with σ to the power of −N."""
+    x, y = [0.0, 1.0], [1.0, 2.0]
+    parameters = [tc.Parameter("a", low=0.0, high=3.0), tc.Parameter("b", low=-3.0, high=3.0)]
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, parameters)
+    found = tc.calibrate_additive(line, tc.Recording(x=x, y=y, noise=0.1), num_samples=0, seed=0, progress=False)
+    assert found.map.mean.tolist() == pytest.approx([1.0, 1.0], abs=1e-3)
+    free = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    with pytest.raises(ImproperPosteriorError, match="without two bounds"):
+        tc.calibrate_additive(free, tc.Recording(x=x, y=y, noise=0.1), num_samples=0, seed=0, progress=False)

@@ -330,3 +330,21 @@ def test_the_default_dtype_changes_nothing():
     finally:
         torch.set_default_dtype(torch.float32)
     assert torch.equal(single, double)
+
+
+def test_seeds_that_follow_each_other_share_no_chain():
+    x = torch.linspace(0, 1, 12, dtype=torch.float64)
+    y = 1 + x + 0.1 * torch.randn(12, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+
+    def chains(seed):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # so few draws converge nowhere
+            return tc.calibrate_additive(
+                line, tc.Recording(x=x, y=y), sampler="pyro", num_samples=8, num_chains=2, num_warmup=20, seed=seed,
+                progress=False,
+            ).samples  # fmt: skip
+
+    first, second = chains(0), chains(1)
+    assert not any(torch.allclose(a, b, atol=1e-3) for a in first for b in second)
+    torch.testing.assert_close(chains(0), first)

@@ -460,3 +460,48 @@ def test_look_alikes_of_both_terms_of_a_pair_are_tried():
     d = tc.diagnose(probe, tc.Recording(x=v, y=y), terms, seed=0, progress=False)
     found = [d.terms] if d.verdict == "named" else d.tied
     assert ["leakage", "resistance"] in [sorted(one) for one in found], d.tied
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_a_positive_scale_stays_positive(own):
+    """What would need a negative value of a parameter on a logarithmic scale is no effect of it."""
+    x = torch.linspace(0, 10, 40, dtype=F64)
+    noise = 0.3 * torch.randn(40, generator=torch.Generator().manual_seed(0), dtype=F64)
+    q = tc.Parameter("q", neutral=1.0, transform="log")
+    bases = [tc.Parameter("a"), tc.Parameter("b")]
+    if own:
+        base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, bases)
+        term = tc.Term("bend", shifts={"a": lambda x, p: (p["q"] - 1) * x**2}, parameters=[q])
+    else:
+        base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x + (p["q"] - 1) * x**2, [*bases, q])
+        term = tc.Term("bend", frees=("q",))
+    for c, verdict in ((-3.0, "unexplained"), (2.0, "named")):
+        d = tc.diagnose(base, tc.Recording(x=x, y=1 + 2 * x + c * x**2 + noise), [term], seed=0, progress=False)
+        assert d.verdict == verdict
+        row = next(row for row in d.ranking if row.terms == ("bend",) or list(row.terms) == ["bend"])
+        assert all(one.value > 0 for one in row.estimates)
+    told = {one.name: one.value for one in row.estimates}
+    assert told["bend.q" if own else "q"] == pytest.approx(3.0, abs=0.05)
+    improved = next(p for p in d.improved.parameters if p.name in ("q", "bend.q"))
+    assert improved.initial == pytest.approx(3.0, abs=0.05)
+    d = tc.diagnose(base, tc.Recording(x=x, y=1 + 2 * x + 100 * noise, noise=30.0), [term], seed=0, progress=False)
+    (limit,) = d.detection_limit
+    assert "hides negative effects of 1, the largest within its bounds" in limit.note
+
+
+def test_what_the_base_calibrates_is_no_effect_of_a_term_that_frees_it_too():
+    x = torch.linspace(0, 10, 40, dtype=F64)
+    base = tc.Simulator(
+        lambda x, p: p["a"] + p["b"] * x + p["q"] * x**2,
+        [tc.Parameter("a"), tc.Parameter("b", low=2.5, high=9.0), tc.Parameter("q", neutral=0.0)],
+    )
+    noise = 0.3 * torch.randn(40, generator=torch.Generator().manual_seed(0), dtype=F64)
+    rows = []
+    for frees in (("b", "q"), ("q",)):  # b = 2 lies beyond its bound
+        d = tc.diagnose(base, tc.Recording(x=x, y=1 + 2 * x + noise), [tc.Term("curve", frees=frees)], seed=0,
+                        progress=False)  # fmt: skip
+        rows.append(next(row for row in d.ranking if list(row.terms) == ["curve"]))
+        assert [one.name for one in rows[-1].estimates] == ["q"]
+        assert "neutral" not in rows[-1].note
+    assert rows[0].note == rows[1].note
+    assert rows[0].log_evidence == pytest.approx(rows[1].log_evidence, abs=1e-3)

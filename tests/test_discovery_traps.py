@@ -415,3 +415,23 @@ def test_steps_are_short_enough_for_the_least_noise():
     d = diagnose(model, tc.Recording(runs=[tc.Run(time=t, outputs={"W": y})]), [loss, *tc.terms.sensor(("W",))[:1]])
     assert d.verdict == "consistent"
     assert d.base.estimates[0].value == pytest.approx(0.2, rel=0.01)
+
+
+def test_two_outputs_share_what_was_fitted_to_their_replicates():
+    """Were every parameter counted against the means of every output, white noise would be a shared preparation."""
+    x = torch.linspace(0, 10, 9, dtype=F64).repeat_interleave(4)
+
+    def wave(x, k):
+        return torch.cos(k * torch.pi * x / 10)
+
+    def model(x, p):
+        return {o: sum(p[f"{o}{k}"] * wave(x, k) for k in range(4)) for o in "uw"}
+
+    base = tc.Simulator(model, [tc.Parameter(f"{o}{k}") for o in "uw" for k in range(4)])
+    term = tc.Term("fourth", outputs={"u": lambda x, p, y: y + p["m"] * wave(x, 4)}, parameters=[tc.Parameter("m")])
+    for seed in (0, 2, 3):
+        noise = 0.3 * torch.randn(2, 36, generator=torch.Generator().manual_seed(seed), dtype=F64)
+        y = {o: 1 + wave(x, 1) + e for o, e in zip("uw", noise, strict=True)}
+        d = diagnose(base, tc.Recording(x=x, y={**y, "u": y["u"] + 2 * wave(x, 4)}), [term])
+        assert d.terms == ["fourth"]
+        assert not any("preparation" in row for row in d.symptoms)

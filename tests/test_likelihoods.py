@@ -399,3 +399,11 @@ def test_float32_is_taken(likelihood):
 def test_likelihoods_are_frozen():
     with pytest.raises(AttributeError):
         ABC(epsilon=0.1).epsilon = 0.2
+
+
+def test_data_that_are_no_tensor_or_not_finite_are_told():
+    one = torch.ones(2, dtype=torch.float64)
+    with pytest.raises(ShapeError, match="y as a tensor of shape"):
+        ABC(epsilon=0.1).log_prob([1.0, 2.0], one, one)
+    with pytest.raises(DomainError, match="Got NaN or infinity in y"):
+        ABC().log_prob(torch.tensor([1.0, math.nan], dtype=torch.float64), one, one)

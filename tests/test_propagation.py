@@ -844,3 +844,32 @@ def test_moments_of_the_second_order_end_in_those_of_the_first():
             found.append((mean.detach(), covariance.detach()))
         for one, other in zip(*found, strict=True):
             torch.testing.assert_close(one, other, rtol=1e-9, atol=0.0)
+
+
+def test_no_buffer_is_state_that_another_module_could_load():
+    """What it computes is set by its constructor: loading conditions alone would leave the rest as it was."""
+    line = Simulator(lambda x, p: p["a"] + p["b"] * x, AB)
+    propagate = NISP(line, Gaussian(), X, fixed={"b": 5.0})
+    assert not propagate.state_dict()
+    assert {"nodes", "_x0"} <= {name for name, _ in propagate.named_buffers()}
+    old = {"_x0": 2 * X}
+    with pytest.raises(RuntimeError, match="Unexpected key"):
+        propagate.load_state_dict(old)
+
+
+@pytest.mark.parametrize(
+    ("x", "message"),
+    [
+        (None, "Expected x as real numbers"),
+        ("x", "Expected x as real numbers"),
+        ({}, "at least one condition"),
+        ([0.0, math.nan], "finite numbers"),
+        ([[0.0, 1.0]], r"shape \(n,\)"),
+        ({"u": [0.0, 1.0], "v": [0.0]}, "of one length"),
+    ],
+)
+def test_conditions_that_are_none_are_refused(x, message):
+    line = Simulator(lambda x, p: p["a"] + p["b"] * x, AB)
+    with pytest.raises(DomainError, match=message):
+        NISP(line, Gaussian(), x)
+    assert NISP(line, Gaussian(), 2.0).x.tolist() == [2.0]

@@ -437,3 +437,51 @@ def test_steps_that_magnify_whatever_is_done_stay_as_they_are():
     assert magnified(bound, values, bound.solve(values))
     assert settled(bound, values, allowed).num_steps == bound.num_steps
     assert settled(bound, values, allowed, halvings=1, switch=False).num_steps == bound.num_steps
+
+
+@pytest.mark.parametrize("k", [3.6, 4.5, 5.5])
+def test_steps_leave_room_for_what_a_fit_may_find(k):
+    """Near the edge of what explicit steps bear χ² rises as at a bound, at which a fit would stop."""
+    t = np.linspace(0, 60, 121)
+    model = tc.ODESimulator(lambda t, s, p, u: {"N": p["k"] * (1.0 - s["N"])}, ["N"], [tc.Parameter("k", low=0.0)])
+    bound = model.bind(tc.Recording(runs=[run_of(t, {"N": 1.0}, ("N",))]))
+    values, allowed = tensor(k)[None], torch.full((len(t),), 1e-3, dtype=F64)
+    assert magnified(bound, values, bound.solve(values)) == (k > 3.8)  # 1.5 k h beyond 2.785
+    found = settled(bound, values, allowed)
+    faster = 1.5 * values
+    assert float((found.at(found.x)(faster) - 1.0).abs().max()) < 1e-6
+
+
+def test_a_fast_neighbour_is_no_bound_of_a_fit():
+    """Point kinetics of a reactor with the coefficient of its Doppler feedback: prompt neutrons follow at once."""
+    t = np.arange(0, 60, 0.5)
+    rods = [1e-3 * np.where(t < 5, 0, np.where(t < 20, 1.5, np.where(t < 35, -1.0, 0.8))),
+            1e-3 * np.clip((t - 5) * 0.1, 0, 2.0) * (t < 40)]  # fmt: skip
+    beta, a, sd, rng = 0.0065, 4.8e-4, 0.0107, np.random.default_rng(21)
+    runs = []
+    for rod in rods:
+        states = [np.ones(2)]
+        for first, last, rho in zip(t[:-1], t[1:], rod[:-1], strict=True):
+            def rates(_, s, rho=rho):
+                return [((rho - beta) * s[0] + beta * s[1] - a * (s[0] - 1) * s[0]) / 1e-3, 0.08 * (s[0] - s[1])]
+
+            states.append(solve_ivp(rates, (first, last), states[-1], method="LSODA", rtol=1e-9, atol=1e-11).y[:, -1])
+        n = np.array(states)[:, 0] + sd * rng.standard_normal(len(t))
+        runs.append(tc.Run(time=t, outputs={"n": n}, inputs={"rod": rod}, initial={"n": 1.0, "c": 1.0}, hold="zero"))
+    reactor = tc.ODESimulator(
+        lambda t, s, p, u: {
+            "n": ((p["G"] * u["rod"] - p["be"]) * s["n"] + p["be"] * s["c"]) / 1e-3, "c": p["la"] * (s["n"] - s["c"]),
+        },
+        ["n", "c"],
+        [tc.Parameter("be", low=0.002, high=0.02, initial=0.006), tc.Parameter("la", low=0.01, high=1.0, initial=0.1),
+         tc.Parameter("G", low=0.2, high=3.0, initial=1.0)],
+        observe=("n",),
+    )  # fmt: skip
+    doppler = tc.Term("Doppler feedback", equation="n", rate=lambda t, s, p, u: -p["a"] * (s["n"] - 1) * s["n"] / 1e-3,
+                      parameters=[tc.Parameter("a", low=0.0)])  # fmt: skip
+    d = tc.diagnose(reactor, tc.Recording(runs=runs, noise=sd), [doppler], seed=0, progress=False)
+    assert d.terms == ["Doppler feedback"]
+    told = {one.name: one for one in d.final.estimates}
+    for name, truth in (("be", beta), ("G", 1.0), ("Doppler feedback.a", a)):  # nearly one scale of all three
+        assert told[name].value == pytest.approx(truth, abs=3 * told[name].sd)
+        assert told[name].sd > 0.05 * truth

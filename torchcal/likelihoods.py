@@ -62,8 +62,9 @@ def _number(value: float, name: str) -> None:
 
 def _check_shapes(y: Tensor, **values: Tensor | None) -> None:
     """Raise where the last dimension is not that of the data, which broadcasting would hide."""
-    if y.ndim != 1:
-        raise ShapeError(f"Expected y of shape (n,). Got {tuple(y.shape)}.")
+    if not isinstance(y, Tensor) or y.ndim != 1:
+        got = tuple(y.shape) if isinstance(y, Tensor) else type(y).__name__
+        raise ShapeError(f"Expected y as a tensor of shape (n,). Got {got}.")
     for name, value in values.items():
         if value is not None and value.shape[-1:] != y.shape:
             raise ShapeError(f"Expected {name} of shape (..., {len(y)}), as y. Got {tuple(value.shape)}.")
@@ -399,6 +400,12 @@ def _normal_log_prob(y: Tensor, mean: Tensor, variance: Tensor) -> Tensor:
 
 
 def _default_epsilon(y: Tensor) -> float:
+    _check_shapes(y)
+    if not bool(torch.isfinite(y).all()):
+        raise DomainError(
+            "Expected data that are finite. Got NaN or infinity in y. Leave missing samples out, of y and of the "
+            "moments (recording.observed says which are there)."
+        )
     spread = float(y.std()) if len(y) > 1 else 0.0
     if not spread > 0:
         raise DomainError("Expected data that vary, for a default tolerance. Got constant y. Pass epsilon=.")

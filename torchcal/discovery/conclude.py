@@ -204,7 +204,7 @@ def _improved(simulator: Simulator, best: Model) -> Simulator:
     for q in improved.parameters:
         values = [estimate[name] for name in own if is_value_of(name, q.name)]
         value = sum(values) / max(len(values), 1)
-        if values and q.contains(value) and (q.transform != "log" or value > 0):
+        if values and q.contains(value):
             q = Parameter(q.name, q.unit, q.low, q.high, value, None, q.transform, q.per_run)
         parameters.append(q)
     improved.parameters = tuple(parameters)

@@ -77,8 +77,9 @@ def calibrate_additive(
 
     Raises:
         TorchcalError: A subclass that says what was expected, what came and what to do.
-        ImproperPosteriorError: If the model fits the data exactly, or has as many parameters as there are data:
-            the likelihood then grows without limit as σ → 0.
+        ImproperPosteriorError: If the model fits the data exactly, or has as many parameters as there are data, and
+            the noise is not known: the likelihood then grows without limit as σ → 0. With known noise, if it has as
+            many parameters without two bounds.
 
     Warns:
         ConvergenceWarning: If starts or chains disagree.
@@ -95,13 +96,20 @@ def calibrate_additive(
     check_dtype(recording, plan.dtype)
     observed = recording.observed
     count = int(observed.sum())
-    if count <= len(free):
+    unbounded = sum(parameter.low is None or parameter.high is None for parameter in free)
+    if recording.noise_sd is None and count <= len(free):
         raise ImproperPosteriorError(
             f"Expected more data than parameters for the additive likelihood. Got N = {count} and d = "
             f"{len(free)}: the residuals can vanish, and the likelihood grows without limit as σ → 0. Record more, "
-            "hold parameters fixed, or use torchcal.calibrate."
+            "hold parameters fixed, give the recording's noise=, or use torchcal.calibrate."
         )
-    unbounded = sum(parameter.low is None or parameter.high is None for parameter in free)
+    if count <= unbounded:
+        raise ImproperPosteriorError(
+            f"Expected more data than parameters without two bounds for the additive likelihood. Got N = {count} and "
+            f"{unbounded}: the likelihood does not fall with σ faster than more of their values come to be likely, and "
+            "the posterior has no finite integral. Record more, give bounds, hold parameters fixed, or use "
+            "torchcal.calibrate."
+        )
     if recording.noise_sd is None and plan.samples and count - unbounded <= 2:
         warn(
             f"With N = {count} data and d = {unbounded} parameters without two bounds the posterior has no finite "

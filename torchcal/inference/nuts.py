@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import torch
 from pyro.infer import MCMC, NUTS
 from torch import Tensor
@@ -63,7 +64,9 @@ def run_nuts(
     try:
         for chain in range(num_chains):
             current.clear()
-            with preserve_random_state(seed + chain):
+            # Seeds that follow each other shall not share chains.
+            own = int(np.random.SeedSequence([seed, chain]).generate_state(1)[0])
+            with preserve_random_state(own):
                 start = 0.3 * torch.randn(size, dtype=prior.low.dtype, device=prior.low.device)
                 kernel = NUTS(
                     model, full_mass=True, target_accept_prob=target_accept, max_tree_depth=max_tree_depth

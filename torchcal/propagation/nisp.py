@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from torchcal import polychaos
 from torchcal.checks import by_default_on_cpu, whole
+from torchcal.data.conditions import checked
 from torchcal.embeddings import Embedding, Pattern
 from torchcal.errors import DomainError, EmbeddingError, ShapeError
 from torchcal.propagation import choice, convergence, parameters, polynomials
@@ -116,17 +117,19 @@ class NISP(nn.Module):
         self.trial_spread = trial_spread
         self.sd_floor = None if sd_floor is None else float(sd_floor)
         self.max_elements = None if max_elements is None else whole("max_elements", max_elements, 1)
+        x = checked(x, tuple(x) if isinstance(x, Mapping) else None)
+        # What it is made of its constructor says: no buffer is state that could be loaded into another one.
         self._x_names = tuple(x) if isinstance(x, Mapping) else None
         for i, value in enumerate(x.values() if isinstance(x, Mapping) else [x]):
-            self.register_buffer(f"_x{i}", torch.as_tensor(value).detach().to("cpu", torch.float64))
+            self.register_buffer(f"_x{i}", value.detach().to("cpu", torch.float64), persistent=False)
         position = {name: i for i, name in enumerate(self.pattern.names)}
         self.register_buffer(
             "_template",
             torch.tensor([self.held.get(name, 0.0) for name in simulator.names], dtype=torch.float64),
+            persistent=False,
         )
-        self.register_buffer(
-            "_places", torch.tensor([i for i, name in enumerate(simulator.names) if name in position])
-        )
+        places = torch.tensor([i for i, name in enumerate(simulator.names) if name in position])
+        self.register_buffer("_places", places, persistent=False)
         self._evaluate: Callable[[Tensor], Tensor] | None = None
         self._polynomial: Tensor | None = None
         found, self.degree = polynomials.expansion(self)

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from torchcal.checks import whole
 from torchcal.data import Recording
-from torchcal.data.arrays import to_tensor
-from torchcal.errors import DomainError, RecordingError, ShapeError
+from torchcal.data.conditions import checked
 from torchcal.results import storage
 from torchcal.results.estimate import MapEstimate
 from torchcal.simulators import Conditions
@@ -69,36 +68,8 @@ def thin(draws: Tensor | None, most: int) -> Tensor | None:
 def conditions(x: Any, recording: Recording | None) -> Conditions:
     """New conditions as float64 tensors, with the names of the recording's where there is one."""
     if recording is None:
-        wanted = tuple(x) if isinstance(x, Mapping) else None
-    else:
-        wanted = tuple(recording.x) if isinstance(recording.x, Mapping) else None
-    units = {} if recording is None else recording.units
-    if wanted is None:
-        if isinstance(x, Mapping):
-            raise DomainError(f"Expected conditions as one array, as in the recording. Got a dict {list(x)}.")
-        return _vector(x, "x", units)
-    if not isinstance(x, Mapping) or set(x) != set(wanted):
-        got = list(x) if isinstance(x, Mapping) else type(x).__name__
-        raise DomainError(f"Expected conditions as a dict with {list(wanted)}. Got {got}.")
-    values = {name: _vector(x[name], name, units) for name in wanted}
-    if len({len(value) for value in values.values()}) > 1:
-        raise DomainError(
-            f"Expected conditions of one length. Got { {name: len(v) for name, v in values.items()} }."
-        )
-    return values
-
-
-def _vector(value: Any, name: str, units: Mapping[str, str]) -> Tensor:
-    try:
-        array = to_tensor(value, name, units.get(name))[0]
-    except (RecordingError, ShapeError) as error:
-        raise DomainError(str(error)) from error
-    if array.ndim == 0:
-        array = array[None]
-    if array.ndim != 1 or not len(array) or not bool(torch.isfinite(array).all()):
-        what = f"shape {tuple(array.shape)}" if array.ndim != 1 or not len(array) else "values that are not finite"
-        raise DomainError(f"Expected condition {name!r} as finite numbers of shape (n,). Got {what}.")
-    return array
+        return checked(x, tuple(x) if isinstance(x, Mapping) else None)
+    return checked(x, tuple(recording.x) if isinstance(recording.x, Mapping) else None, recording.units)
 
 
 def indent(text: str) -> str:

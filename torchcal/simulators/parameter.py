@@ -112,13 +112,6 @@ class Parameter:
             raise DomainError(
                 f"Expected transform None or 'log' for parameter {self.name!r}. Got {self.transform!r}."
             )
-        for field in ("initial", "neutral"):
-            value = getattr(self, field)
-            if value is not None and not self.contains(value):
-                raise DomainError(
-                    f"Expected {field} of parameter {self.name!r} between its bounds [{self.low}, {self.high}]. "
-                    f"Got {value}. Move the bounds or the value."
-                )
         if self.transform == "log":
             for field in ("low", "high", "initial", "neutral"):
                 value = getattr(self, field)
@@ -127,15 +120,28 @@ class Parameter:
                         f"Expected a positive {field} for parameter {self.name!r}, which is inferred on a "
                         f"logarithmic scale. Got {value}. Use a small positive bound or drop transform='log'."
                     )
+        for field in ("initial", "neutral"):
+            value = getattr(self, field)
+            if value is not None and not self.contains(value):
+                raise DomainError(
+                    f"Expected {field} of parameter {self.name!r} between its bounds [{self.low}, {self.high}]. "
+                    f"Got {value}. Move the bounds or the value."
+                )
+
+    @property
+    def lowest(self) -> float:
+        """What no value lies below: ``low``; without it 0 on a logarithmic scale, else −∞."""
+        return self.low if self.low is not None else 0.0 if self.transform == "log" else -math.inf
 
     def contains(self, value: float) -> bool:
-        """Whether a value lies within the physical bounds, the bounds included."""
-        return (self.low is None or value >= self.low) and (self.high is None or value <= self.high)
+        """Whether a value lies within the physical bounds, the bounds included; 0 is none on a logarithmic scale."""
+        below = value < self.lowest or (self.transform == "log" and value <= 0)
+        return not below and (self.high is None or value <= self.high)
 
 
 def limits(parameters: Sequence[Parameter]) -> tuple[Tensor, Tensor]:
     """Physical bounds, infinite where there is none, ``(P,)`` twice."""
-    low = [-math.inf if q.low is None else q.low for q in parameters]
+    low = [q.lowest for q in parameters]
     high = [math.inf if q.high is None else q.high for q in parameters]
     return torch.tensor(low, dtype=torch.float64), torch.tensor(high, dtype=torch.float64)
 

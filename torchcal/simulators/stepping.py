@@ -37,6 +37,9 @@ GROWTH = 2.0
 #: Size of h λ from which on explicit steps may magnify what fades; steps on end that do, by which factor in log all
 #: together, until it matters; how many parameter values are looked at; and how often they are halved for that alone.
 UNSTABLE, ON_END, MAGNIFIED, LOOKED_AT, CALMING = 2.5, 3, 7.0, 4, 4
+#: How many times as fast as at those values a fit may want what fades to be: where steps magnified it there, χ² would
+#: rise as at a bound that is none.
+FASTER = 1.5
 #: Implicit steps that are solved at most while their lengths are chosen: a model that jumps needs ever more of them.
 WORK = 200_000
 #: Choices of their lengths in which the error must fall by `CONVERGING`.
@@ -253,17 +256,18 @@ def calmed(
 
 
 def magnified(simulator: Trajectories, values: Tensor, states: Tensor) -> bool:
-    """Whether explicit steps, at some values and their solved states, magnify what fades.
+    """Whether explicit steps, at some values and their solved states, magnify what fades, or would if that were faster.
 
     A fast state at rest may be solved well with such steps, and what a small change makes of it be wrong without limit:
-    several steps on end lie outside the region in which the method is stable.
+    several steps on end lie outside the region in which the method is stable. Where it is `FASTER` alone they lie near
+    its edge, which no fit could cross.
     """
     return _magnifying(simulator, values, states) > 0
 
 
 def _magnifying(simulator: Trajectories, values: Tensor, states: Tensor) -> float:
-    """The largest size of h λ in `UNSTABLE` where steps magnify what fades; 0 where they do not. It is looked at for a
-    few of the values."""
+    """The largest size of h λ, `FASTER`, in `UNSTABLE` where steps magnify what fades so; 0 where they do not. It is
+    looked at for a few of the values."""
     if simulator.implicit:
         return 0.0
     few = torch.linspace(0, len(values) - 1, min(LOOKED_AT, len(values))).long()
@@ -271,6 +275,7 @@ def _magnifying(simulator: Trajectories, values: Tensor, states: Tensor) -> floa
     t, h, u = simulator.grid.flat
     slopes = simulator.steps.slopes_at(values, states[:, :, :-1], t, {name: table[0] for name, table in u.items()})
     growth, size = (torch.zeros(slopes.shape[:2], dtype=slopes.dtype) for _ in range(2))
+    slopes = FASTER * slopes
     possible = (slopes.abs().sum(-1).amax(-1) * h > UNSTABLE) & slopes.isfinite().flatten(2).all(-1)
     if not bool(possible.any()):
         return 0.0

@@ -231,8 +231,8 @@ def _corrected(
 def _room(candidate: Candidate, place: int, sign: int) -> float:
     """How far an amplitude's bounds let it be from neutral, to one side."""
     q, neutral = candidate.problem.parameters[place], float(candidate.neutral[candidate.own.index(place)])
-    end = q.high if sign > 0 else q.low
-    return math.inf if end is None else max(sign * (end - neutral), 0.0)
+    end = q.lowest if sign < 0 else math.inf if q.high is None else q.high
+    return max(sign * (end - neutral), 0.0)
 
 
 def _simulated(search: Search, i: int, column: int, size: float) -> Tensor | None:

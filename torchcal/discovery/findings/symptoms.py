@@ -27,8 +27,8 @@ FAR_SMALLER = 0.15
 #: and the ratio of sd from which on they are told to be unlike.
 COMPARED, UNLIKE, RATIO = 12, 0.01, 2.0
 #: Times what replicates tell of the noise that means of conditions scatter by, from which on that is told where these
-#: are in no order; and levels of a condition that it takes.
-SCATTER, MEANS = 1.5, 8
+#: are in no order; levels of a condition that it takes; and how rarely chance may scatter them so.
+SCATTER, MEANS, RARELY = 1.5, 8, 0.005
 
 
 def symptoms(search: Search, best: Model | None) -> list[str]:
@@ -171,6 +171,10 @@ def more_than_replicates(search: Search, found: Fitted) -> list[str]:
     if max(len(c.unique()) for c in levels.T) < MEANS:
         return rows
     standard = found.residual / search.noise.sd[problem.index]
+    # What was fitted took its share of freedom from the means of all outputs, whichever it acts on.
+    pairs = torch.stack([group[problem.condition_of], problem.output_of])
+    kept = pairs.unique(dim=1).shape[1]
+    freedom = max(kept - len(found.free), 1) / kept
     for number, name in enumerate(problem.recording.outputs):
         mine = problem.output_of == number
         which = group[problem.condition_of[mine]]
@@ -180,10 +184,12 @@ def more_than_replicates(search: Search, found: Fitted) -> list[str]:
         mean = mean / count[seen].sqrt()
         if len(mean) < MEANS:
             continue
-        size = math.sqrt(float(mean.square().sum()) / max(len(mean) - len(found.free), 1))
+        size = math.sqrt(float(mean.square().mean()) / freedom)
         ordered = [mean[levels[seen][:, k].argsort(stable=True)] for k in range(levels.shape[1])]
         slow = max(float(m[1:] @ m[:-1]) for m in ordered)
-        if size > SCATTER and slow < WHITE * float(mean @ mean):
+        half = 0.5 * len(mean) * torch.tensor(freedom, dtype=torch.float64)
+        rare = float(torch.special.gammaincc(half, half * size**2)) < RARELY
+        if rare and size > SCATTER and slow < WHITE * float(mean @ mean):
             of = f" of {name}" if len(problem.recording.outputs) > 1 else ""
             rows.append(
                 f"the means of replicates{of} are {size:.1f} times as far off as these tell, in no order: something "

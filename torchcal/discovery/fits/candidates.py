@@ -86,6 +86,9 @@ class Candidate:
             size = float(self.tangents[middle, :, a].norm())
             values[place] += A_LITTLE * (spread / size if size > 0 else 1.0) * (self.one_sided(place) or 1)
         low, high = self.problem.limits()
+        for i in self.own:
+            if self.problem.parameters[i].transform == "log" and values[i] <= 0:
+                values[i] = A_LITTLE * self.begin[i]
         inside = torch.where((high - low).isfinite(), A_LITTLE * (high - low), torch.zeros_like(low))
         values[self.own] = values[self.own].clamp(low[self.own] + inside[self.own], high[self.own] - inside[self.own])
         return values
@@ -229,10 +232,13 @@ def prepare(
     own, neutral, certain = [], [], []
     terms_names = {term.full(q.name): (term, q) for term in terms for q in term.parameters}
     base_parameters = {q.name: q for q in base.parameters}
+    # What the base calibrates is free already, and no effect of a term's own; of such alone it is the base's.
+    calibrated = {base.parameters[i].name for i in found.free}
+    brings_more = any(term.brings(q.name) for term in terms for q in problem.parameters if q.name not in calibrated)
     for i, q in enumerate(problem.parameters):
         if q.name in terms_names:
             at = neutral_of(terms_names[q.name][1])
-        elif any(term.brings(q.name) for term in terms):
+        elif any(term.brings(q.name) for term in terms) and not (q.name in calibrated and brings_more):
             at = base_parameters[q.name].neutral
             at = float(begin[i]) if at is None else at
         else:

@@ -28,6 +28,8 @@ FINISH = 240
 SLOPES = (12, 5, 24, 48)
 #: How many times longer or shorter than 1 a run must be for rates to be guessed from it.
 LONG = 30.0
+#: How far below the smallest start of a parameter on a logarithmic scale one begins that would not be positive.
+BELOW = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +99,15 @@ class Fitted:
         found = torch.zeros_like(self.values)
         found[self.free] = self.covariance().diagonal().clamp_min(0).sqrt()
         return found
+
+
+def _positive(values: Tensor, log: Tensor) -> Tensor:
+    """Starting values ``(H, free)``, those that a logarithmic scale does not have well below the others' smallest."""
+    if not bool((log & (values <= 0)).any()):
+        return values
+    smallest = torch.where(values > 0, values, torch.full_like(values, torch.inf)).amin(0)
+    small = torch.where(smallest.isfinite(), BELOW * smallest, torch.full_like(smallest, BELOW))
+    return torch.where(log & (values <= 0), small, values)
 
 
 def starts(problem: Problem, count: int, seed: int, fixed: dict[int, float] | None = None) -> Tensor:
@@ -223,7 +234,7 @@ def fit(
     log = torch.tensor([problem.parameters[i].transform == "log" for i in free])
     target = whitening.vector(problem.y if data is None else data)
     values = begin.clone()
-    values[:, free] = values[:, free].clamp(low, high)
+    values[:, free] = _positive(values[:, free].clamp(low, high), log)
 
     def evaluate(
         points: Tensor, target: Tensor, warm: Solution | None, march: bool = True

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 #: Difference of the runs at the same time, as a share of the range, up to which one curve shows them all; and how many
 #: runs the legend names.
 SAME, NAMED_RUNS = 0.02, 6
+#: Times the sd of the better known quarter of the stretches up to which one tells something, and sd of its own from
+#: which on its shift does.
+KNOWN, CLEAR = 4.0, 2.0
 
 
 def needed_shift(
@@ -52,7 +55,7 @@ def needed_shift(
         capsize=2, zorder=3,
     )  # fmt: skip
     if seen.any():
-        sure = seen & (sd <= 4 * np.median(sd[seen]))
+        sure = seen & ((sd <= KNOWN * np.quantile(sd[seen], 0.25)) | (np.abs(shift) > CLEAR * sd))
         low, high = np.min((shift - sd)[sure]), np.max((shift + sd)[sure])
         low, high = min(low, 0.0), max(high, 0.0)
         room = 0.08 * ((high - low) or 1.0)
