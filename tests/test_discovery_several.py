@@ -1,6 +1,7 @@
 """A search with several candidates: terms that their own refit missed, terms that are one, and rivals in a window."""
 
 import dataclasses
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import torchcal as tc
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.rounds import settle
-from torchcal.discovery.several import _one_fewer, _refit_sets, refit_several
+from torchcal.discovery.several import _one_fewer, _refit_sets, _swapped, refit_several
 from torchcal.discovery.windows import _rivals
 
 F64 = torch.float64
@@ -279,3 +280,23 @@ def test_the_order_of_the_list_does_not_decide_where_nothing_else_fits():
     for terms in ([clip, leak, wave], [leak, clip, wave]):
         d = tc.diagnose(base, tc.Recording(x=x, y=y, noise=0.01), terms, progress=False)
         assert set(d.terms) == {"clip", "leak"}, d.verdict
+
+
+@pytest.mark.parametrize("off", [True, False])
+def test_what_a_base_that_is_off_nearly_makes_up_for_is_tried_in_place_of_the_others(off):
+    """A bend of which a line leaves little is no look-alike of a wave, but the linear search may have missed it."""
+    base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    bends = [("slight", lambda x: x + 0.01 * x**2), ("wave", lambda x: (4 * x).sin()), ("root", lambda x: x.sqrt()),
+             ("square", lambda x: x**2)]  # fmt: skip
+    terms = [
+        tc.Term(name, outputs={"y": lambda x, p, y, f=f: y + p["m"] * f(x)}, parameters=[tc.Parameter("m")])
+        for name, f in bends
+    ]
+    noise = 0.1 * torch.randn(60, generator=torch.Generator().manual_seed(0), dtype=F64)
+    y = 1 + X + (1.0 if off else 0.05) * (4 * X).sin() + noise
+    search = Search(Problem.of(base, tc.Recording(x=X, y=y, noise=0.1)), terms, {}, 0, 4, 2, lambda text: None)
+    search.calibrate_base()
+    search.screen_all()
+    assert (search.base.chi2 > 5 * 60) == off
+    swapped = _swapped(search, SimpleNamespace(numbers=(1, 2)))
+    assert {(0, 1), (0, 2)} <= set(swapped) if off else not {(0, 1), (0, 2)} & set(swapped)

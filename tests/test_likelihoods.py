@@ -380,7 +380,7 @@ def test_shapes_that_broadcasting_would_hide_are_refused():
     for kernel in (Marginal(), Full()):
         with pytest.raises(ShapeError, match="samples"):
             kernel.log_prob(Y, draw(8, 1))
-    with pytest.raises(ShapeError, match="y of shape"):
+    with pytest.raises(ShapeError, match=r"y as a tensor of shape \(n,\)"):
         ABC(epsilon=0.1).log_prob(Y[:, None], MEAN, SD)
 
 

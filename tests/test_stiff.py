@@ -453,11 +453,11 @@ def test_steps_leave_room_for_what_a_fit_may_find(k):
 
 
 def test_a_fast_neighbour_is_no_bound_of_a_fit():
-    """Point kinetics of a reactor with the coefficient of its Doppler feedback: prompt neutrons follow at once."""
-    t = np.arange(0, 60, 0.5)
+    """Point kinetics of a reactor with its Doppler feedback: prompt neutrons follow at once, and at the true value of
+    what they follow with, explicit steps were unstable."""
+    t, beta, a, sd, rng = np.arange(0, 60, 0.5), 0.0065, 4.8e-4, 0.0107, np.random.default_rng(21)
     rods = [1e-3 * np.where(t < 5, 0, np.where(t < 20, 1.5, np.where(t < 35, -1.0, 0.8))),
             1e-3 * np.clip((t - 5) * 0.1, 0, 2.0) * (t < 40)]  # fmt: skip
-    beta, a, sd, rng = 0.0065, 4.8e-4, 0.0107, np.random.default_rng(21)
     runs = []
     for rod in rods:
         states = [np.ones(2)]
@@ -468,7 +468,7 @@ def test_a_fast_neighbour_is_no_bound_of_a_fit():
             states.append(solve_ivp(rates, (first, last), states[-1], method="LSODA", rtol=1e-9, atol=1e-11).y[:, -1])
         n = np.array(states)[:, 0] + sd * rng.standard_normal(len(t))
         runs.append(tc.Run(time=t, outputs={"n": n}, inputs={"rod": rod}, initial={"n": 1.0, "c": 1.0}, hold="zero"))
-    reactor = tc.ODESimulator(
+    base = tc.ODESimulator(
         lambda t, s, p, u: {
             "n": ((p["G"] * u["rod"] - p["be"]) * s["n"] + p["be"] * s["c"]) / 1e-3, "c": p["la"] * (s["n"] - s["c"]),
         },
@@ -479,7 +479,7 @@ def test_a_fast_neighbour_is_no_bound_of_a_fit():
     )  # fmt: skip
     doppler = tc.Term("Doppler feedback", equation="n", rate=lambda t, s, p, u: -p["a"] * (s["n"] - 1) * s["n"] / 1e-3,
                       parameters=[tc.Parameter("a", low=0.0)])  # fmt: skip
-    d = tc.diagnose(reactor, tc.Recording(runs=runs, noise=sd), [doppler], seed=0, progress=False)
+    d = tc.diagnose(base, tc.Recording(runs=runs, noise=sd), [doppler], seed=0, progress=False)
     assert d.terms == ["Doppler feedback"]
     told = {one.name: one for one in d.final.estimates}
     for name, truth in (("be", beta), ("G", 1.0), ("Doppler feedback.a", a)):  # nearly one scale of all three

@@ -507,3 +507,15 @@ def test_elapsed_time_is_refused_where_there_is_none() -> None:
     static = tc.Term("bend", outputs={"y": lambda x, p, y: y + p["q"]}, parameters=[tc.Parameter("q")], elapsed="run")
     with pytest.raises(DomainError, match="static simulator, which has no time"):
         extend(tc.Simulator(lambda x, p: p["a"] * x, [tc.Parameter("a")]), [static])
+
+
+@pytest.mark.parametrize("name", ["d", "dose"])
+def test_a_name_looked_up_in_the_only_condition_is_told(name):
+    x = torch.linspace(0, 1, 12, dtype=torch.float64)
+    told = "x is a tensor, as in the recording: name its condition there"
+    base = tc.Simulator(lambda x, p: p["a"] * x, [tc.Parameter("a")])
+    term = tc.Term("bend", outputs={"y": lambda x, p, y: y + p["q"] * x[name] ** 2}, parameters=[tc.Parameter("q")])
+    with pytest.raises(SimulatorError, match=told):
+        tc.diagnose(base, tc.Recording(x=x, y=x), [term], progress=False)
+    with pytest.raises(SimulatorError, match=told):
+        tc.Simulator(lambda x, p: p["a"] * x[name], [tc.Parameter("a")]).at(x)(torch.ones(1, dtype=torch.float64))

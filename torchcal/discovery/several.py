@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchcal.discovery.fits.candidates import Candidate, drivers_scale, prepare, replaces
 from torchcal.discovery.fits.fitting import Fitted
-from torchcal.discovery.hypotheses.beginnings import blind_rows, is_far, make_up
+from torchcal.discovery.hypotheses.beginnings import BENT, blind_rows, is_far, make_up
 from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.hypotheses.screen import screen
 from torchcal.discovery.hypotheses.search import BETTER, Search
@@ -38,8 +38,9 @@ CLOSE, AGAIN = 5.0, 3
 #: Log weight behind a leading pair that leaves noise, down to which pairs are tried the other way round; how many at
 #: most; and the change of χ² from which on that is another model.
 FAR_BEHIND, TURNED, ANOTHER = 30.0, 6, 1.0
-#: Correlation of two tangents from which on a candidate is tried in the other's place beside the leading pair's.
-ALIKE = 0.9
+#: Correlation of two tangents from which on a candidate is tried in the other's place beside the leading pair's; and
+#: what of a tangent may be its own where the base is off, for the candidate to be tried in any place.
+ALIKE, HIDDEN = 0.9, 0.1
 
 
 def refit_several(search: Search) -> None:
@@ -220,16 +221,28 @@ def _enough(search: Search) -> bool:
 
 
 def _swapped(search: Search, lead: Model) -> list[tuple[int, ...]]:
-    """Pairs with another candidate that does nearly the same, at some shapes, in place of one of a pair's terms."""
+    """Pairs with another candidate in place of one of a pair's terms: what does nearly the same, at some shapes, then
+    what the base's parameters nearly make up for, of which a linear search from a base that is off sees little."""
     found: dict[tuple[int, ...], float] = {}
+    hidden = _hidden(search) if search.base.chi2 > BENT * search.base.problem.n else set()
     columns, owner = search.screening.columns, search.screening.owner
     for i in lead.numbers:
         (kept,) = set(lead.numbers) - {i}
         for j in set(range(len(search.candidates))) - {*lead.numbers, *search.gone}:
             alike = (columns[:, owner == i].T @ columns[:, owner == j]).abs()
-            if alike.numel() and float(alike.max()) >= ALIKE:
+            if alike.numel() and (float(alike.max()) >= ALIKE or j in hidden):
                 found[tuple(sorted((kept, j)))] = float(alike.max())
     return sorted(found, key=lambda pair: -found[pair])[:MOST]
+
+
+def _hidden(search: Search) -> set[int]:
+    """Candidates of whose every tangent but a small part is one of the base's."""
+    screening, shares = search.screening, dict[int, float]()
+    for k, i in enumerate(screening.owner.tolist()):
+        tangent = search.candidates[i].tangents[int(screening.shape[k]), :, int(screening.amplitude[k])]
+        size = float(search.base.whitening.vector(tangent).norm())
+        shares[i] = max(shares.get(i, 0.0), float(screening.norm[k]) / max(size, 1e-300))
+    return {i for i, share in shares.items() if share < HIDDEN}
 
 
 def _linear_pairs(search: Search, most: int) -> list[tuple[int, int]]:

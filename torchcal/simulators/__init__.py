@@ -10,7 +10,14 @@ from torchcal.simulators.ode import ODESimulator
 from torchcal.simulators.parameter import Parameter, Scaling, free_parameters, is_value_of, limits
 from torchcal.simulators.slopes import check_slopes
 from torchcal.simulators.solution import Solution
-from torchcal.simulators.static import Conditions, Linearisation, Simulator, asks_for_numbers, check_parameters
+from torchcal.simulators.static import (
+    Conditions,
+    Linearisation,
+    Simulator,
+    asks_for_numbers,
+    check_parameters,
+    nameless_advice,
+)
 from torchcal.simulators.stepping import (
     calmed,
     focused,
@@ -51,6 +58,7 @@ __all__ = [
     "limits",
     "magnified",
     "may_change",
+    "nameless_advice",
     "outgrown",
     "settled",
     "settled_implicitly",

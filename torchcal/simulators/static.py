@@ -19,7 +19,7 @@ from torchcal.simulators.dual import Still, still
 from torchcal.simulators.parameter import Parameter, spans
 from torchcal.simulators.solution import Solution
 
-__all__ = ["Conditions", "Linearisation", "Simulator", "asks_for_numbers", "check_parameters"]
+__all__ = ["Conditions", "Linearisation", "Simulator", "asks_for_numbers", "check_parameters", "nameless_advice"]
 
 _DUAL = threading.RLock()
 """torch keeps one level of forward derivatives for the whole process, and refuses a second thread its own."""
@@ -347,6 +347,14 @@ def asks_for_numbers(error: Exception) -> bool:
     return "numpy()" in str(error) or "converted to Python scalars" in str(error)
 
 
+def nameless_advice(error: Exception, x: Any) -> str:
+    """What to do where a function looked up a name in the one tensor of conditions; "" where it did not."""
+    looked_up = isinstance(error, TypeError | IndexError) and re.search(r"\bstr\b|too many indices", str(error))
+    if isinstance(x, Mapping) or not looked_up:
+        return ""
+    return " Here x is a tensor, as in the recording: name its condition there, x={name: values}, or use x itself."
+
+
 def _advice(error: Exception, x: Conditions, parameters: Sequence[str]) -> str:
     """What to do where a function took x, or what x or p hold, for something else than they are."""
     named = isinstance(x, Mapping)
@@ -371,9 +379,7 @@ def _advice(error: Exception, x: Conditions, parameters: Sequence[str]) -> str:
         return " Tensors that the function holds or makes must be on the device of x and p: tensor.to(x.device)."
     if named and "dict" in str(error):
         return f" Here x is a dict, as in the recording: use {', '.join(f'x[{name!r}]' for name in x)}."
-    if not named and isinstance(error, TypeError | IndexError) and re.search(r"\bstr\b", str(error)):
-        return " Here x is a tensor, as in the recording: name its condition there, x={name: values}, or use x itself."
-    return ""
+    return nameless_advice(error, x)
 
 
 def _output(result: Any, values: Tensor, n: int, what: str) -> Tensor:

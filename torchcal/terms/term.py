@@ -18,6 +18,7 @@ from torchcal.simulators import (
     asks_for_numbers,
     careful,
     is_value_of,
+    nameless_advice,
 )
 
 __all__ = ["Term", "neutral_of", "outer"]
@@ -260,6 +261,7 @@ class Term:
         except Exception as error:
             advice = " Use torch functions on them, without .detach(): derivatives are needed."
             advice = advice if asks_for_numbers(error) else ""
+            advice = advice if letters[0] == "t" else advice or nameless_advice(error, given[0])
             known = "; ".join(", ".join(part) for part in given if isinstance(part, Mapping) and part)
             raise SimulatorError(
                 f"Expected a tensor from every function of the term {self.name!r}. One of them raised "

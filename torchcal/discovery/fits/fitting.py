@@ -231,7 +231,7 @@ def fit(
     """
     low, high = problem.limits()
     low, high = low[free], high[free]
-    log = torch.tensor([problem.parameters[i].transform == "log" for i in free])
+    log = torch.tensor([problem.parameters[i].transform == "log" for i in free], dtype=torch.bool)
     target = whitening.vector(problem.y if data is None else data)
     values = begin.clone()
     values[:, free] = _positive(values[:, free].clamp(low, high), log)
