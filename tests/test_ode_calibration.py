@@ -144,6 +144,32 @@ def test_per_run_parameters_are_inferred_but_not_embedded() -> None:
     assert one.propagate.pattern.embedded == ("k", "room")  # of one run, it is a parameter like any other
 
 
+def test_a_per_run_parameter_is_fixed_in_every_run_by_its_name(tmp_path: Path) -> None:
+    model = tc.ODESimulator(
+        lambda t, s, p, u: {"c": -p["k"] * (s["c"] - p["room"])}, {"c": "K"},
+        [tc.Parameter("k", low=0.0, initial=1.0), tc.Parameter("room", unit="K", per_run=True)],
+    )  # fmt: skip
+    t, rng = np.linspace(0, 3, 25), np.random.default_rng(0)
+    runs = [
+        tc.Run(time=t, outputs={"c": 0.2 + (2.0 - 0.2) * np.exp(-0.8 * t) + 0.02 * rng.standard_normal(25)},
+               initial={"c": 2.0})
+        for _ in range(2)
+    ]  # fmt: skip
+    recording = tc.Recording(runs=runs, noise=0.02)
+    held = tc.calibrate(model, recording, fixed={"room": 0.2}, num_samples=0, num_starts=8, seed=0)
+    assert held.map.parameters == ("k",)
+    assert held.propagate.held == {"room[0]": 0.2, "room[1]": 0.2}
+    held.save(tmp_path / "held.nc")
+    again = tc.results.Calibration.load(tmp_path / "held.nc", simulator=model)
+    torch.testing.assert_close(again.predict().mean, held.predict().mean)
+    one = tc.calibrate(model, recording, fixed={"room": 0.2, "room[1]": 0.3}, num_samples=0, num_starts=8, seed=0)
+    assert one.propagate.held == {"room[0]": 0.2, "room[1]": 0.3}
+    d = tc.diagnose(model, recording, [], fixed={"room": 0.2}, seed=0, progress=False)
+    assert d.verdict == "consistent"
+    with pytest.raises(EmbeddingError, match="Check the spelling"):
+        tc.calibrate(model, recording, fixed={"rooms": 0.2}, num_samples=0)
+
+
 def test_a_dormant_parameter_stays_neutral(recording: tc.Recording) -> None:
     model = tc.ODESimulator(
         lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"] - (p["c"] + p["c2"]) * s["v"] * p["one"] + u["f"]},

@@ -655,6 +655,20 @@ def test_needed_shift_keeps_its_range_despite_a_blind_stretch():
     assert ax.get_title(loc="right") == "rank correlation −0.93"
 
 
+def test_needed_shift_keeps_its_range_where_the_parameter_is_dead_nearly_everywhere():
+    needed = oscillator().shifts[0]
+    m = len(needed.values)
+    sd = torch.full((m,), 1e4, dtype=torch.float64)
+    sd[: m // 3] = 0.01
+    shift = torch.full((m,), 3e3, dtype=torch.float64)
+    shift[: m // 3] = 0.1
+    shift[-1], sd[-1] = 0.5, 0.2  # less well known, but clear
+    told = SimpleNamespace(**{**vars(needed), "shift": shift, "sd": sd})
+    low, high = plots.needed_shift(told).get_ylim()
+    assert -0.1 < low <= 0
+    assert 0.7 < high < 0.8
+
+
 def test_missing_rate_has_a_band_of_two_sd():
     missing = oscillator().missing
     ax = plots.missing_rate(missing, units={"v": "m/s"})

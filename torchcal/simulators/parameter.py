@@ -153,7 +153,8 @@ def free_parameters(
 
     Args:
         parameters: All parameters of a simulator.
-        fixed: Values of parameters that the user holds.
+        fixed: Values of parameters that the user holds; of one that every run has for itself, its name alone is that of
+            all its values but those that are named themselves.
         least: How many must be left free, 1 or 0.
 
     Returns:
@@ -167,11 +168,12 @@ def free_parameters(
         raise DomainError(f"Expected fixed as a dict from parameter names to values. Got {fixed!r}.")
     fixed = dict(fixed or {})
     names = [parameter.name for parameter in parameters]
-    unknown = sorted(set(fixed) - set(names))
+    unknown = sorted(name for name in fixed if not any(is_value_of(one, name) for one in names))
     if unknown:
         raise EmbeddingError(f"Expected fixed parameters among {names}. Got {unknown}. Check the spelling.")
     held: dict[str, float] = {}
-    for name, value in fixed.items():
+    each = {one: value for name, value in fixed.items() for one in names if is_value_of(one, name)}
+    for name, value in {**each, **{name: value for name, value in fixed.items() if name in names}}.items():
         try:
             number = float(value)
         except (TypeError, ValueError):
@@ -179,7 +181,7 @@ def free_parameters(
         if not math.isfinite(number):
             raise DomainError(f"Expected a finite value for the fixed parameter {name!r}. Got {value!r}.")
         parameter = parameters[names.index(name)]
-        if not parameter.contains(number) or (parameter.transform == "log" and number <= 0):
+        if not parameter.contains(number):
             bounds = "positive values" if parameter.transform == "log" else f"[{parameter.low}, {parameter.high}]"
             raise DomainError(f"Expected the fixed parameter {name!r} within {bounds}. Got {number}.")
         held[name] = number
