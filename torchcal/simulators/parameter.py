@@ -172,8 +172,9 @@ def free_parameters(
     if unknown:
         raise EmbeddingError(f"Expected fixed parameters among {names}. Got {unknown}. Check the spelling.")
     held: dict[str, float] = {}
-    each = {one: value for name, value in fixed.items() for one in names if is_value_of(one, name)}
-    for name, value in {**each, **{name: value for name, value in fixed.items() if name in names}}.items():
+    named_last = sorted(fixed.items(), key=lambda item: item[0] in names)
+    each = {one: value for name, value in named_last for one in names if is_value_of(one, name)}
+    for name, value in each.items():
         try:
             number = float(value)
         except (TypeError, ValueError):

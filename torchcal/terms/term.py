@@ -259,9 +259,9 @@ class Term:
         except TorchcalError:
             raise
         except Exception as error:
-            advice = " Use torch functions on them, without .detach(): derivatives are needed."
-            advice = advice if asks_for_numbers(error) else ""
-            advice = advice if letters[0] == "t" else advice or nameless_advice(error, given[0])
+            advice = nameless_advice(error, given[0]) if letters[0] == "x" else ""
+            if asks_for_numbers(error):
+                advice = " Use torch functions on them, without .detach(): derivatives are needed."
             known = "; ".join(", ".join(part) for part in given if isinstance(part, Mapping) and part)
             raise SimulatorError(
                 f"Expected a tensor from every function of the term {self.name!r}. One of them raised "

@@ -233,12 +233,12 @@ def prepare(
     terms_names = {term.full(q.name): (term, q) for term in terms for q in term.parameters}
     base_parameters = {q.name: q for q in base.parameters}
     # What the base calibrates is free already, and no effect of a term's own; of such alone it is the base's.
-    calibrated = {base.parameters[i].name for i in found.free}
-    brings_more = any(term.brings(q.name) for term in terms for q in problem.parameters if q.name not in calibrated)
+    brought = {q.name for q in problem.parameters if any(term.brings(q.name) for term in terms)}
+    brought = brought - {base.parameters[i].name for i in found.free} or brought
     for i, q in enumerate(problem.parameters):
         if q.name in terms_names:
             at = neutral_of(terms_names[q.name][1])
-        elif any(term.brings(q.name) for term in terms) and not (q.name in calibrated and brings_more):
+        elif q.name in brought:
             at = base_parameters[q.name].neutral
             at = float(begin[i]) if at is None else at
         else:
