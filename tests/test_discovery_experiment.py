@@ -1,5 +1,6 @@
 """Experiments that are proposed where hypotheses are tied: which there are, and when more samples are asked for."""
 
+import dataclasses
 import re
 from types import SimpleNamespace
 
@@ -8,6 +9,7 @@ import torch
 
 import torchcal as tc
 from torchcal.discovery.findings import conditions, experiment
+from torchcal.discovery.fits.fitting import fit
 from torchcal.discovery.fits.problem import Problem
 from torchcal.simulators import Trajectories
 
@@ -315,3 +317,32 @@ def test_a_constant_temperature_outside_is_no_input_to_multiply():
     texts = [text for text, _, _ in (*conditions.simple(model), *conditions.bolder(model))]
     assert "the first run again" in texts
     assert not [text for text in texts if "times the in" in text]
+
+
+def test_what_each_run_has_for_itself_is_unknown_in_a_new_one():
+    """Models that differ in the zero of every run's instrument alone are told apart by no run, which has another."""
+    ode = tc.ODESimulator(
+        lambda t, s, p, u: {"x": -p["k"] * s["x"]},
+        {"x": "V"},
+        [tc.Parameter("zero", per_run=True, initial=0.0), tc.Parameter("k", initial=0.4)],
+        observe={"y": lambda t, s, p, u: s["x"] + p["zero"]},
+    )
+    t = torch.linspace(0, 5, 20, dtype=F64)
+    rows = [2 * torch.exp(-0.5 * t) + zero for zero in (0.1, -0.2)]
+    problem = Problem.of(ode, tc.Recording(runs=[tc.Run(time=t, outputs={"y": y}, initial={"x": 2.0}) for y in rows]))
+    white = problem.whitening(torch.full((40,), 0.01, dtype=F64), torch.zeros(1, dtype=F64))
+    found = fit(problem, white, torch.tensor([[0.0, 0.0, 0.4]], dtype=F64), [0, 1, 2])
+    assert found.values.tolist() == pytest.approx([0.1, -0.2, 0.5])
+    blank = tc.Recording(runs=[tc.Run(time=t, outputs={"y": torch.zeros_like(t)}, initial={"x": 2.0})])
+    y, slopes = experiment._predict(found, blank)
+    assert y.tolist() == pytest.approx((2 * torch.exp(-0.5 * t) - 0.05).tolist(), rel=1e-6)
+    assert slopes[:, :2].abs().max() == 0.0
+    assert slopes[:, 2].tolist() == pytest.approx((-2 * t * torch.exp(-0.5 * t)).tolist(), abs=1e-5)
+    assert slopes[:, 3].tolist() == pytest.approx([1.0] * 20)
+    noise = SimpleNamespace(sd=torch.full((40,), 0.01, dtype=F64), correlation=torch.zeros(1, dtype=F64))
+    other = dataclasses.replace(found, values=found.values + torch.tensor([5.0, 3.0, 0.0], dtype=F64))
+    models = [dataclasses.make_dataclass("Rival", ["found"], eq=False)(one) for one in (found, other)]
+    (same,) = experiment._separations([tuple(models)], blank, noise)
+    assert same < 1e-6
+    known = dataclasses.replace(found, free=[2], jacobian=found.jacobian[:, 2:])
+    assert experiment._predict(known, blank)[1].shape == (20, 1)

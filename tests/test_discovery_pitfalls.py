@@ -508,7 +508,7 @@ def flow_curves(seed, *, grid):
     return base, tc.Recording(x={"r": rate, "T": T}, y={"y": y}), terms
 
 
-@pytest.mark.parametrize("grid", [True, False])
+@pytest.mark.parametrize("grid", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_share_of_a_value_that_spans_decades_is_no_physics_among_several_conditions(grid):
     """What a fit leaves of the largest values hides how little the small ones scatter, until they are weighed so.
 
@@ -681,7 +681,7 @@ def test_a_hopeless_base_is_a_misfit_whatever_is_left_looks_like(monkeypatch):
         assert rounds._refit(search, 0.95) is detected
 
 
-@pytest.mark.parametrize("start", [0.0, 259200.0, 1.7e9])
+@pytest.mark.parametrize("start", [pytest.param(0.0, marks=pytest.mark.slow), 259200.0, 1.7e9])
 def test_the_clock_may_begin_anywhere(start):
     # A sensor's drift, and a rate constant that falls: both count from the first sample.
     t, rng = np.linspace(0, 600, 120), np.random.default_rng(5)
@@ -731,6 +731,7 @@ def test_what_the_base_takes_for_slow_noise_is_weighed_with_the_noise_that_a_ter
     assert all(d.noise.sd["y"] < 0.08 for d in found)
 
 
+@pytest.mark.slow
 def test_few_samples_an_orbit_are_no_reason_to_lose_it():
     """Fourteen samples an orbit and unknown velocities: a parabola through twelve of them begins the other way."""
     t = np.linspace(0, 22, 80)

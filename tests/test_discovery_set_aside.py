@@ -288,6 +288,7 @@ def test_a_scale_that_the_base_leaves_open_leaves_no_term_open():
     assert any("a, b" in line for line in d.identifiability)
 
 
+@pytest.mark.slow
 def test_what_does_the_same_as_another_is_not_paired_with_it():
     # In a window an alias may be another hypothesis; beside other terms it is none.
     rng, x = np.random.default_rng(2), np.linspace(-1.3, 1.5, 40)
@@ -401,9 +402,9 @@ def test_a_wild_sample_where_a_second_term_would_be_seen_stays_one(seed):
 
 def test_the_sd_of_a_name_rest_on_the_noise_beside_it():
     # That of the best single term had them five times as large, from three times the noise.
-    seen = [resonant(seed, None) for seed in range(1, 5)]
+    seen = [resonant(seed, None) for seed in (1, 2)]
     named = [d for d in seen if d.verdict == "named"]
-    assert len(named) >= 2
+    assert named
     for d in named:
         known = {e.name: e for e in d.final.estimates}
         assert abs(known["quadratic.c"].value - 0.05) < 4 * known["quadratic.c"].sd
@@ -411,8 +412,15 @@ def test_the_sd_of_a_name_rest_on_the_noise_beside_it():
         assert 0.07 < d.noise.sd["y"] < 0.13
 
 
-@pytest.mark.parametrize("noise", [0.1, None])
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize(
+    ("seed", "noise"),
+    [
+        (0, 0.1),
+        pytest.param(0, None, marks=pytest.mark.slow),
+        pytest.param(1, 0.1, marks=pytest.mark.slow),
+        (1, None),
+    ],
+)
 def test_what_sticks_out_of_two_terms_is_an_outlier_of_both(seed, noise):
     x = torch.linspace(0, 10, 80, dtype=F64)
     terms = [
@@ -456,7 +464,7 @@ def test_a_dip_in_both_of_two_sweeps_is_no_pair_of_outliers():
     assert lost <= 1  # and not all
 
 
-@pytest.mark.parametrize("place", [0, -1])
+@pytest.mark.parametrize("place", [0, pytest.param(-1, marks=pytest.mark.slow)])
 def test_an_outlier_at_the_end_of_an_uneven_run_is_one_beside_the_term_that_explains_the_rest(place):
     # Its neighbours were too unevenly spaced to tell, and beside the term something unknown took its place.
     rng, runs = np.random.default_rng(0), []

@@ -366,6 +366,7 @@ def test_a_term_that_bends_to_a_dip_is_no_name(seed):
         assert d.where[0].spans == (pytest.approx((low, high), abs=1e-3),)
 
 
+@pytest.mark.slow
 def test_where_many_terms_do_the_same_in_a_window_none_of_them_may_be_there():
     """A second band beside the one that is modelled: each of several terms draws it, in the same window."""
     nu, rng = np.linspace(15, 95, 240), np.random.default_rng(3)
@@ -455,7 +456,9 @@ def test_a_gain_of_the_list_is_no_nameless_one(seed):
     assert not any(model.names == ("a change of the gain of y",) for model in search.nameless)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(
+    "seed", [pytest.param(0, marks=pytest.mark.slow), 1, pytest.param(2, marks=pytest.mark.slow)]
+)
 def test_a_bend_that_is_in_no_list_is_no_window_of_a_curved_term(seed):
     """Extinction that grows from an airmass of 2.2 on: a curved term that begins at 2.4 was named there (seed 1)."""
     rng = np.random.default_rng(seed)
@@ -594,6 +597,7 @@ def test_beyond_an_edge_a_term_begins_with_the_other_sign_where_it_may(side, amp
     assert (again.low, again.high) == (18.25, math.inf)
 
 
+@pytest.mark.slow
 def test_a_loss_like_the_bases_is_found_on_its_own_side_of_an_edge():
     """Below 18 degrees it is nearly the base's own: another does nearly that above, with the other sign."""
     t, rng = np.linspace(0, 30, 150), np.random.default_rng(2)

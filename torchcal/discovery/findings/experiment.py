@@ -16,7 +16,7 @@ from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.misfit.noise import Noise
 from torchcal.discovery.records import Experiment
 from torchcal.errors import TorchcalError
-from torchcal.simulators import Trajectories, settled
+from torchcal.simulators import Trajectories, in_run, settled
 
 __all__ = ["propose"]
 
@@ -194,7 +194,7 @@ def _separations(pairs: Sequence[Pair], recording: Recording, noise: Noise) -> l
     distances = []
     for a, b in ((models.index(one), models.index(other)) for one, other in pairs):
         gap = predictions[a] - predictions[b]
-        # Either model may move its parameters, as far as the old data allow.
+        # Either model may move its parameters, as far as the old data allow, which know nothing of a new run's own.
         rows, targets = [], []
         width = slopes[a].shape[1] + slopes[b].shape[1]
         rows.append(torch.cat([slopes[a], -slopes[b]], dim=1))
@@ -204,7 +204,7 @@ def _separations(pairs: Sequence[Pair], recording: Recording, noise: Noise) -> l
             old = models[k].found.whitening(models[k].found.jacobian)
             block = torch.zeros(len(old), width, dtype=torch.float64)
             block[:, first : first + old.shape[1]] = old
-            first += old.shape[1]
+            first += slopes[k].shape[1]
             rows.append(block)
             targets.append(torch.zeros(len(old), dtype=torch.float64))
         design, target = torch.cat(rows), torch.cat(targets)
@@ -241,30 +241,35 @@ def _sd(recording: Recording, noise: Noise) -> Tensor:
 
 
 def _there(found: Fitted, simulator: Trajectories, recording: Recording) -> tuple[Trajectories, Tensor]:
-    """A model at new runs, and its values; initial states are the experimenter's now: known, given in the runs."""
+    """A model at a new run, and its values; initial states are the experimenter's now: known, given in the run."""
     bound = simulator.bind(recording)
-    shared = {name: i for i, name in enumerate(simulator.names)}
-    return bound, torch.tensor([[_value(found, shared, name) for name in bound.names]], dtype=torch.float64)
+    values = [float(found.values[columns].mean()) for columns in _sources(simulator)]
+    return bound, torch.tensor([values], dtype=torch.float64)
+
+
+def _sources(simulator: Trajectories) -> list[list[int]]:
+    """A model's columns behind each of its simulator's parameters: every run's, of what each has for itself."""
+    place = {name: i for i, name in enumerate(simulator.names)}
+    runs = range(len(simulator.runs))
+    names = [p.name for p in simulator.ode.parameters]
+    return [[place[name]] if name in place else [place[in_run(name, r)] for r in runs] for name in names]
 
 
 def _predict(found: Fitted, recording: Recording) -> tuple[Tensor, Tensor]:
+    """A model's data at new conditions, and their slopes by what it fits, then by what a new run has for itself."""
     simulator = found.problem.simulator
     if isinstance(simulator, Trajectories):
         bound, values = _there(found, simulator, recording)
-        shared = {name: i for i, name in enumerate(simulator.names)}
-        columns = [i for i, name in enumerate(bound.names) if name in shared and shared[name] in found.free]
-        result = bound.linearise(bound.x, values, recording.outputs, columns)
-        jacobian = torch.zeros(result.y.shape[-1], len(found.free), dtype=torch.float64)
-        for k, i in enumerate(columns):
-            jacobian[:, found.free.index(shared[bound.names[i]])] = result.jacobian[0, :, k]
-        return result.y[0], jacobian
+        sources = _sources(simulator)
+        fitted = [i for i, columns in enumerate(sources) if set(columns) & set(found.free)]
+        result = bound.linearise(bound.x, values, recording.outputs, fitted)
+        known = torch.zeros(result.y.shape[-1], len(found.free), dtype=torch.float64)
+        anew = []
+        for slope, i in zip(result.jacobian[0].unbind(-1), fitted, strict=True):
+            if simulator.ode.parameters[i].per_run:
+                anew.append(slope)
+            else:
+                known[:, found.free.index(sources[i][0])] = slope
+        return result.y[0], torch.column_stack([known, *anew])
     result = simulator.linearise(recording.x, found.values[None], recording.outputs, found.free)
     return result.y[0], result.jacobian[0]
-
-
-def _value(found: Fitted, shared: dict[str, int], name: str) -> float:
-    if name in shared:
-        return float(found.values[shared[name]])
-    plain = name.split("[")[0]
-    alike = [i for other, i in shared.items() if other.split("[")[0] == plain]
-    return float(torch.stack([found.values[i] for i in alike]).mean()) if alike else 0.0
