@@ -29,6 +29,7 @@ from torchcal.plots import fit as plot_fit
 from torchcal.priors import Flat
 from torchcal.results import AdditiveCalibration, Calibration
 from torchcal.simulators import Simulator, Trajectories
+from torchcal.terms import extend
 
 F64 = torch.float64
 K, C, DRAG = 4.0, 0.3, 0.25
@@ -387,6 +388,56 @@ def test_predictions_that_cannot_be_made(calibration: Calibration) -> None:
         calibration.predict(tc.Recording(x=[0.0, 1.0], y=[0.0, 1.0]))
     with pytest.raises(DomainError, match="as a dict with"):
         calibration.predict({"t": [1.0]})
+
+
+def test_what_a_run_has_for_itself_is_known_of_the_runs_that_were_calibrated_alone() -> None:
+    t = torch.linspace(0, 4, 30, dtype=F64)
+    decay = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"z": -p["k"] * s["z"]},
+        states=["z"],
+        parameters=[tc.Parameter("k", low=0.0, high=3.0, per_run=True)],
+    )
+
+    def run(k: float, start: float | None = None) -> tc.Run:
+        noise = 0.01 * torch.randn(30, generator=torch.Generator().manual_seed(int(10 * k)), dtype=F64)
+        return tc.Run(t, {"z": torch.exp(-k * t) + noise}, initial={} if start is None else {"z": start})
+
+    runs = [run(0.5, 1.0), run(2.0)]
+    found = tc.calibrate_additive(decay, tc.Recording(runs=runs), num_samples=0, seed=0, progress=False)
+    at_data = found.predict().map.mean
+    for r in (0, 1):
+        again = found.predict(runs[r]).map.mean
+        torch.testing.assert_close(again, at_data[30 * r :][:30], rtol=1e-6, atol=1e-6)
+    swapped = found.predict(runs[::-1]).map.mean
+    torch.testing.assert_close(swapped, torch.cat([at_data[30:], at_data[:30]]), rtol=1e-6, atol=1e-6)
+    with pytest.raises(DomainError, match=r"Got \['k\[0\]', 'k\[1\]'"):
+        found.predict([run(1.0, 1.0), run(1.1)])
+    with pytest.raises(DomainError, match=r"Got \['k'\] open"):  # the same times and initial state, other data
+        found.predict(run(1.0, 1.0))
+    single = tc.calibrate_additive(decay, tc.Recording(runs=runs[:1]), num_samples=0, seed=0, progress=False)
+    with pytest.raises(DomainError, match=r"Got \['k'\] open"):
+        single.predict(run(1.0, 1.0))
+
+
+def test_what_counts_from_the_recordings_first_sample_does_so_in_a_later_run() -> None:
+    t = torch.linspace(0, 10, 41, dtype=F64)
+
+    def truth(t: torch.Tensor) -> torch.Tensor:
+        return 2 * torch.exp(-0.3 * t) + 0.05 * t
+
+    decay = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"z": -p["k"] * s["z"]},
+        states=["z"],
+        parameters=[tc.Parameter("k", low=0.0, high=3.0)],
+    )
+    drifting = extend(decay, [term for term in tc.terms.sensor("z") if term.name == "drift of z"])
+    noise = 0.005 * torch.randn(41, generator=torch.Generator().manual_seed(0), dtype=F64)
+    recording = tc.Recording(runs=[tc.Run(100 + t, {"z": truth(t) + noise}, initial={"z": 2.0})])
+    found = tc.calibrate_additive(drifting, recording, num_samples=0, seed=0, progress=False)
+    later = torch.linspace(10, 20, 5, dtype=F64)
+    start = {"z": 2 * float(torch.exp(torch.tensor(-3.0)))}
+    predicted = found.predict(tc.Run(100 + later, {"z": later}, initial=start)).map.mean
+    torch.testing.assert_close(predicted, truth(later), rtol=0, atol=0.01)
 
 
 def test_a_forecast_beyond_the_data_where_no_input_is_needed() -> None:

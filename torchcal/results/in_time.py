@@ -70,7 +70,8 @@ def propagation_in_time(propagate: NISP, recording: Recording, x: Any, alpha: Te
         propagate: Of the calibration.
         recording: The data.
         x: Times ``{"time": (n,), "run": (n,)}`` of the recording's runs (``run`` may be left out where there is one);
-            or a recording in time, a `Run`, or a list of them, whose outputs are not looked at.
+            or a recording in time, a `Run`, or a list of them, on the same clock. One with the times, inputs, known
+            initial states and data of a run of the recording is that run, and what was calibrated of it is known.
         alpha: Coefficients at which steps must be short enough, ``(P,)``.
 
     Raises:
@@ -88,13 +89,14 @@ def propagation_in_time(propagate: NISP, recording: Recording, x: Any, alpha: Te
             raise DomainError(
                 "Expected a recording in time, a Run, or times. Got a static recording (make one with runs=[Run(...)])."
             )
-        other = bound.elsewhere(_blank(runs, recording))
+        alike = _alike(runs, recording)
+        other = bound.elsewhere(_blank(alike, recording), first=bound.layout.first)
         where, picks = other.x, torch.arange(other.recording.n)
-        columns = _columns(bound, other)
+        columns = _columns(bound, other, [_twin(run, recording) for run in alike])
     else:
         where = _times(x, recording)
         extended, picks = _with_times(recording, where)
-        other = bound.elsewhere(extended)
+        other = bound.elsewhere(extended, first=bound.layout.first)
         columns = list(range(len(bound.names)))
     with torch.no_grad():
         xi = propagate.nodes
@@ -104,8 +106,8 @@ def propagation_in_time(propagate: NISP, recording: Recording, x: Any, alpha: Te
     return propagate.copy(x=where, simulator=_Elsewhere(bound, other, columns, picks))
 
 
-def _blank(runs: Sequence[Run], recording: Recording) -> Recording:
-    """Runs without data: what is predicted are the recording's outputs."""
+def _alike(runs: Sequence[Run], recording: Recording) -> list[Run]:
+    """Runs in the recording's units, with its inputs."""
     needed = set(recording.runs[0].inputs) if recording.runs else set()
     for i, run in enumerate(runs):
         if set(run.inputs) != needed:
@@ -114,28 +116,51 @@ def _blank(runs: Sequence[Run], recording: Recording) -> Recording:
                 f"{i}."
             )
     units = {**recording.units, **(recording.runs[0].units if recording.runs else {})}
-    alike = [convert(change(run, outputs={}), units, f"run {i}") for i, run in enumerate(runs)]
-    blank = [{name: torch.zeros_like(run.time) for name in recording.outputs} for run in alike]
-    return Recording(runs=[change(run, outputs=y) for run, y in zip(alike, blank, strict=True)])
+    return [convert(run, units, f"run {i}") for i, run in enumerate(runs)]
 
 
-def _columns(bound: Trajectories, other: Trajectories) -> list[int]:
-    """The place of each of the other runs' parameters among the calibrated ones."""
-    pairs = zip(bound.runs, other.runs, strict=False)
-    same = len(bound.runs) == len(other.runs) and all(
-        a.time.shape == b.time.shape and bool((a.time == b.time).all()) and a.initial == b.initial for a, b in pairs
-    )
-    if same and bound.names == other.names:
-        return list(range(len(bound.names)))
-    own = {*bound.nuisance, *other.nuisance}
-    unknown = [name for name in other.names if name in own or name not in bound.names]
+def _blank(runs: Sequence[Run], recording: Recording) -> Recording:
+    """Runs without data: what is predicted are the recording's outputs."""
+    blank = [{name: torch.zeros_like(run.time) for name in recording.outputs} for run in runs]
+    return Recording(runs=[change(run, outputs=y) for run, y in zip(runs, blank, strict=True)])
+
+
+def _twin(run: Run, recording: Recording) -> int | None:
+    """Which of the recording's runs one is, in the same units: whose data it contradicts nowhere."""
+
+    def agree(given: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> bool:
+        return set(given) <= set(own) and all(
+            bool(((values == own[name]) | values.isnan() | own[name].isnan()).all()) for name, values in given.items()
+        )
+
+    for r, own in enumerate(recording.runs or ()):
+        same = run.initial == own.initial and run.hold == own.hold and torch.equal(run.time, own.time)
+        if same and agree(run.inputs, own.inputs) and agree(run.outputs, own.outputs):
+            return r
+    return None
+
+
+def _columns(bound: Trajectories, other: Trajectories, twins: Sequence[int | None]) -> list[int]:
+    """The place of each of the other runs' parameters among the calibrated ones.
+
+    What each run has for itself is known for the recording's runs alone, ``twins`` of the others.
+    """
+    places = {origin: i for i, origin in enumerate(bound.layout.origins)}
+    found: list[int] = []
+    unknown: list[str] = []
+    for name, (origin, run) in zip(other.names, other.layout.origins, strict=True):
+        twin = None if run is None else twins[run]
+        if (run is None or twin is not None) and (origin, twin) in places:
+            found.append(places[origin, twin])
+        else:
+            unknown.append(name)
     if unknown:
         raise DomainError(
             f"Expected runs of which everything is known but the calibrated parameters. Got {unknown} open (give a "
             "Run its initial= for every state; a per-run parameter is known for the calibrated runs alone: predict at "
             "{'time': ..., 'run': ...} of those)."
         )
-    return [bound.names.index(name) for name in other.names]
+    return found
 
 
 def _times(x: Any, recording: Recording) -> dict[str, Tensor]:

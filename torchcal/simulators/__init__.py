@@ -7,7 +7,7 @@ from torchcal.simulators.external import ExternalSimulator
 from torchcal.simulators.held_out import HeldOutError
 from torchcal.simulators.layout import Values
 from torchcal.simulators.ode import ODESimulator
-from torchcal.simulators.parameter import Parameter, Scaling, free_parameters, in_run, is_value_of, limits
+from torchcal.simulators.parameter import Parameter, Scaling, free_parameters, is_value_of, limits
 from torchcal.simulators.slopes import check_slopes
 from torchcal.simulators.solution import Solution
 from torchcal.simulators.static import (
@@ -54,7 +54,6 @@ __all__ = [
     "check_slopes",
     "focused",
     "free_parameters",
-    "in_run",
     "is_value_of",
     "limits",
     "magnified",

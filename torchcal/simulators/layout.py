@@ -56,29 +56,37 @@ class Layout:
         ode: The simulator.
         recording: What is recorded.
         runs: Its runs.
+        first: When the recording began whose clock this is; by default with the first sample of these runs.
 
     Attributes:
         parameters: Of the columns: the simulator's own, each run's copy of a per-run parameter, unknown initial states.
         initial_names: Of the unknown initial states.
+        origins: What each column is a value of, and of which run where each has its own.
+        first: When the recording began.
     """
 
-    def __init__(self, ode: "ODESimulator", recording: Recording, runs: Sequence[Run]) -> None:
+    def __init__(
+        self, ode: "ODESimulator", recording: Recording, runs: Sequence[Run], first: float | None = None
+    ) -> None:
         self._states = tuple(ode.states)
         self._seen = ode.seen
         start = [float(run.time[0]) for run in runs]
-        self._first = min(start)
-        self._start = torch.tensor(start, dtype=torch.float64) if max(start) > self._first else None
+        self.first = min(start) if first is None else first
+        alike = all(one == self.first for one in start)
+        self._start = None if alike else torch.tensor(start, dtype=torch.float64)
         parameters: list[Parameter] = []
+        self.origins: list[tuple[str, int | None]] = []
         self._places: dict[str, list[int]] = {}
         for parameter in ode.parameters:
-            first = len(parameters)
+            place = len(parameters)
+            self.origins += [(parameter.name, r) for r in (range(len(runs)) if parameter.per_run else [None])]
             if parameter.per_run and len(runs) > 1:
-                self._places[parameter.name] = [first + r for r in range(len(runs))]
+                self._places[parameter.name] = [place + r for r in range(len(runs))]
                 parameters += [
                     dataclasses.replace(parameter, name=in_run(parameter.name, r)) for r in range(len(runs))
                 ]
             else:
-                self._places[parameter.name] = [first]
+                self._places[parameter.name] = [place]
                 parameters.append(parameter)
         # Which parameter, and which run's, each column is; initial states act on no rate.
         self._owner: dict[int, tuple[str, int | None]] = {
@@ -100,6 +108,7 @@ class Layout:
                     name = initial_name(state, r, len(runs))
                     known[state] = ("free", len(parameters))
                     self.initial_names.append(name)
+                    self.origins.append((initial_name(state, 0, 1), r))
                     seen = [one for one in recording.outputs if ode.reads.get(one) == state]
                     parameters.append(Parameter(name, unit=unit, initial=_first_seen(run, seen)))
             self._initial.append(known)
@@ -113,8 +122,8 @@ class Layout:
 
     def _values(self, run_of: Tensor | None) -> Values:
         if self._start is None:
-            return Values({}, self._first, self._first)
-        return Values({}, self._first, self._start if run_of is None else self._start[run_of])
+            return Values({}, self.first, self.first)
+        return Values({}, self.first, self._start if run_of is None else self._start[run_of])
 
     def by_name(self, values: Tensor, run_of: Tensor | None = None) -> Values:
         """Parameters by name, ``(H, 1)`` or ``(H, R)``; those of runs picked by ``run_of`` ``(M,)`` where given."""

@@ -38,6 +38,7 @@ class Trajectories(Simulator):
         subdivide: Steps are this many times shorter than the coarsest that the samples allow.
         denser: The same for each gap between samples of each run, beside that.
         implicit: Whether steps are implicit; by default where the simulator says that it is stiff.
+        first: When the recording began on whose clock the runs are; by default with their first sample.
 
     Attributes:
         grid: Its time steps.
@@ -55,6 +56,7 @@ class Trajectories(Simulator):
         subdivide: int = 1,
         denser: tuple[Tensor, ...] | None = None,
         implicit: bool | None = None,
+        first: float | None = None,
     ) -> None:
         if not isinstance(recording, Recording) or recording.runs is None:
             raise RecordingError(
@@ -75,7 +77,7 @@ class Trajectories(Simulator):
         self.runs = recording.runs
         self._states = tuple(ode.states)
         self.grid = Grid.of(self.runs, max_step=ode.max_step, subdivide=subdivide, denser=denser)
-        self.layout = Layout(ode, recording, self.runs)
+        self.layout = Layout(ode, recording, self.runs, first)
         self.steps = (ImplicitSteps if self.implicit else Steps)(ode, self.layout, self.grid)
         self.parameters = self.layout.parameters
         self.x = recording.x
@@ -103,12 +105,13 @@ class Trajectories(Simulator):
             return self.elsewhere(recording)
         return Trajectories(self.ode, recording, subdivide=self.subdivide, implicit=self.implicit)
 
-    def elsewhere(self, recording: Recording) -> "Trajectories":
+    def elsewhere(self, recording: Recording, *, first: float | None = None) -> "Trajectories":
         """The same simulator for other runs, with steps no longer than these.
 
         Where these differ, no longer than the shortest of them, but at most `MOST_SHORTER` times shorter than usual.
+        The recording began at ``first``; by default with the other runs.
         """
-        other = Trajectories(self.ode, recording, implicit=self.implicit)
+        other = Trajectories(self.ode, recording, implicit=self.implicit, first=first)
         shortest = self.grid.h.max() if self.denser is None else self.grid.h[self.grid.h > 0].min()
         share = math.ceil(float(other.grid.h.max() / shortest) * (1 - 1e-9))
         if self.denser is not None:
@@ -121,7 +124,14 @@ class Trajectories(Simulator):
 
     def with_steps(self, subdivide: int, denser: tuple[Tensor, ...] | None) -> "Trajectories":
         """The same with steps of other lengths."""
-        return Trajectories(self.ode, self.recording, subdivide=subdivide, denser=denser, implicit=self.implicit)
+        return Trajectories(
+            self.ode,
+            self.recording,
+            subdivide=subdivide,
+            denser=denser,
+            implicit=self.implicit,
+            first=self.layout.first,
+        )
 
     def check(self, x: Conditions, values: Tensor, outputs: Sequence[str] | None = None) -> int:
         """As for any simulator; rates must also be written elementwise.

@@ -16,7 +16,7 @@ from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.misfit.noise import Noise
 from torchcal.discovery.records import Experiment
 from torchcal.errors import TorchcalError
-from torchcal.simulators import Trajectories, in_run, settled
+from torchcal.simulators import Trajectories, settled
 
 __all__ = ["propose"]
 
@@ -249,10 +249,8 @@ def _there(found: Fitted, simulator: Trajectories, recording: Recording) -> tupl
 
 def _sources(simulator: Trajectories) -> list[list[int]]:
     """A model's columns behind each of its simulator's parameters: every run's, of what each has for itself."""
-    place = {name: i for i, name in enumerate(simulator.names)}
-    runs = range(len(simulator.runs))
-    names = [p.name for p in simulator.ode.parameters]
-    return [[place[name]] if name in place else [place[in_run(name, r)] for r in runs] for name in names]
+    origins = simulator.layout.origins
+    return [[i for i, (name, _) in enumerate(origins) if name == p.name] for p in simulator.ode.parameters]
 
 
 def _predict(found: Fitted, recording: Recording) -> tuple[Tensor, Tensor]:
