@@ -182,6 +182,7 @@ def test_spread_is_each_outputs_sd_over_what_was_observed():
     ("y", "wanted"),
     [
         ([0.1, 0.1, 0.1], 0.1),
+        ([0.3, 0.1 + 0.2, 0.3], 0.3),  # but for rounding
         ([-4, -4, -4], 4.0),
         ([0, 0, 0], 1.0),
         ([1e-200, 2e-200, 3e-200], 1e-200),

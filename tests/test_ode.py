@@ -603,7 +603,7 @@ def bad_rates(rates) -> tc.ODESimulator:
         (lambda t, s, p, u: s["v"], "rates of .* as a dict. Got Tensor"),
         (lambda t, s, p, u: {"x": s["v"], "v": p["q"] * s["x"]}, r"It raised KeyError: 'q'.*\(k (=|from) [12]"),
         (lambda t, s, p, u: {"x": s["v"], "v": u["g"]}, "It raised KeyError: 'g'"),
-        (lambda t, s, p, u: {"x": s["v"], "v": torch.ones(5, 7)}, r"rate of 'v' of shape .* Write the rates element"),
+        (lambda t, s, p, u: {"x": s["v"], "v": torch.ones(5, 7)}, r"rate of 'v' of shape .* \(write it elementwise"),
         (lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * (1.0 if t > 1 else 2.0)}, "It raised RuntimeError"),
         (lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"].mean()}, "in a batch|at many times at once"),
         (lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"].mean(-1, keepdim=True)}, "in a batch|at many times"),
@@ -682,3 +682,36 @@ def test_binding_again_keeps_or_changes_the_recording() -> None:
     assert other.recording is second
     assert other.subdivide == 4
     assert other.names == ("k", "c", "v(0)")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "got"),
+    [(None, "NoneType"), ("a", "str"), (1j, "complex"), (torch.tensor(1j), "torch.complex64"), ([None], "list")],
+)
+def test_what_is_no_real_number_is_told_of_the_function_that_gave_it(wrong, got) -> None:
+    def decay(**changes) -> tc.ODESimulator:
+        rates = changes.pop("rates", lambda t, s, p, u: {"x": -p["k"] * s["x"]})
+        return tc.ODESimulator(rates, ["x"], [tc.Parameter("k")], **changes)
+
+    run = run_of(np.linspace(0, 2, 7), {"x": 1.0})
+    unknown = tc.Run(run.time, {"x": torch.ones(7, dtype=F64)})
+    for name, simulator, recorded in [
+        ("the rate of 'x'", decay(rates=lambda t, s, p, u: {"x": wrong}), run),
+        ("the output 'x'", decay(observe={"x": lambda t, s, p, u: wrong}), run),
+        ("the initial value of 'x'", decay(initial={"x": lambda s, p: wrong}), unknown),
+    ]:
+        bound = simulator.bind(tc.Recording(runs=[recorded]))
+        with pytest.raises(SimulatorError, match=f"Expected {name} as a tensor of real numbers. Got {got} "):
+            bound.check(bound.x, tensor(1.0).expand(4, -1))
+
+
+def test_plain_numbers_are_taken_with_all_their_digits() -> None:
+    simulator = tc.ODESimulator(
+        lambda t, s, p, u: {"x": 0.1, "y": p["k"]}, ["x", "y"], [tc.Parameter("k")], initial={"x": 0.0, "y": 0.0},
+        observe={"x": lambda t, s, p, u: s["x"], "c": lambda t, s, p, u: 0.1},
+    )  # fmt: skip
+    t = torch.linspace(0, 2, 7, dtype=F64)
+    bound = simulator.bind(tc.Recording(runs=[tc.Run(t, {"x": t, "c": t})]))
+    torch.testing.assert_close(
+        bound.at(bound.x)(tensor(1.0)), torch.cat([0.1 * t, torch.full((7,), 0.1, dtype=F64)]), rtol=1e-14, atol=1e-15
+    )

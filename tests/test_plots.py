@@ -15,6 +15,7 @@ from torchcal.data import Recording
 from torchcal.embeddings import Gaussian, PolynomialChaos
 from torchcal.errors import DomainError, ShapeError, TorchcalError
 from torchcal.plots import densities, style
+from torchcal.plots.selection import close
 from torchcal.prediction import additive_prediction, embedded_prediction
 from torchcal.propagation import NISP
 from torchcal.simulators import Parameter, Simulator
@@ -694,3 +695,10 @@ def test_an_axis_without_a_label_keeps_the_corner_of_the_one_it_shares_ticks_wit
     assert told.get_ylabel() == "k [1e7/second]"
     assert bare.yaxis.get_major_formatter().get_offset() == "1e7"
     plt.close(figure)
+
+
+def test_instants_of_a_clock_are_told_apart():
+    times = np.array([1.7e9, 1.7e9 + 600, 1.7e9 + 3600])
+    assert close(times, 1.7e9).tolist() == [True, False, False]
+    assert close(np.array([1050.0, 1050.0]), 1050.0001).tolist() == [True, True]
+    assert close(np.linspace(0, 1, 4), 0.333333).tolist() == [False, True, False, False]

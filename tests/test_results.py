@@ -701,3 +701,30 @@ def test_another_simulator_than_the_calibrated_one_is_refused(tmp_path):
     with pytest.raises(tc.errors.DomainError, match="predicts something else"):
         tc.results.Calibration.load(tmp_path / "line.nc", simulator=other)
     tc.results.Calibration.load(tmp_path / "line.nc", simulator=line)
+
+
+@pytest.mark.parametrize("in_time", [False, True])
+def test_an_output_that_was_held_out_whole_survives_a_round_trip(tmp_path, in_time):
+    a, b = 2 * T + 0.1 * T**2, 3 * T**2 + 0.1
+    if in_time:
+        simulator = tc.ODESimulator(
+            lambda t, s, p, u: {"a": p["k"] + 0 * s["a"]},
+            ["a"],
+            [tc.Parameter("k")],
+            observe={"a": lambda t, s, p, u: s["a"], "b": lambda t, s, p, u: s["a"] ** 2},
+        )
+        data = tc.Recording(runs=[tc.Run(T, {"a": a, "b": b}, initial={"a": 0.0})], missing=True)
+    else:
+        simulator = tc.Simulator(lambda x, p: {"a": p["k"] * x, "b": p["k"] * x**2}, [tc.Parameter("k")])
+        data = tc.Recording(x=T, y={"a": a, "b": b}, missing=True)
+    kept = data.masked(torch.arange(2 * N) < N)
+    for calibrate, kind in ((tc.calibrate, Calibration), (tc.calibrate_additive, AdditiveCalibration)):
+        result = quietly(calibrate, simulator, kept, num_samples=0, num_starts=4, seed=0)
+        result.save(tmp_path / "result.nc")
+        loaded = kind.load(tmp_path / "result.nc", simulator=simulator)
+        assert torch.equal(loaded.recording.observed, kept.observed)
+        assert torch.equal(loaded.recording.spread, kept.spread)
+        assert torch.equal(loaded.recording.y.isnan(), kept.y.isnan())
+        whole = quietly(calibrate, simulator, data, num_samples=0, num_starts=4, seed=0)
+        whole.save(tmp_path / "whole.nc")
+        assert kind.load(tmp_path / "whole.nc").recording.missing is True  # as given, though nothing is

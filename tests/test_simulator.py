@@ -287,3 +287,20 @@ def test_a_function_that_raises_is_told_with_the_values_it_was_called_with() -> 
     values = torch.tensor([[1.0, 2.0], [1.0, 5.0]], dtype=torch.float64)
     with pytest.raises(SimulatorError, match=r"ValueError: not here\. .* shape \(2, 1\) \(a = 1, b from 2 to 5\)"):
         base.at(torch.zeros(3, dtype=torch.float64))(values)
+
+
+def test_random_numbers_in_a_small_output_are_found_beside_a_large_one():
+    def both(x, p, noise):
+        strain = 2e-3 * p["a"] * x
+        return {"stress": 2e8 * p["a"] * x, "strain": strain * (1 + noise * torch.rand_like(strain))}
+
+    x = torch.linspace(0.1, 1, 5, dtype=torch.float64)
+    only = [tc.Parameter("a")]
+    with pytest.raises(SimulatorError, match="in a batch as one at a time"):
+        tc.Simulator(lambda x, p: both(x, p, 0.2), only).check(x, values(8, 1), ["stress", "strain"])
+    assert tc.Simulator(lambda x, p: both(x, p, 0.0), only).check(x, values(8, 1), ["stress", "strain"]) == 10
+
+
+def test_parameter_values_are_floating_point_numbers():
+    with pytest.raises(ShapeError, match=r"floating-point numbers\. Got torch.int64"):
+        tc.Simulator(line, AB).at(X)(torch.tensor([1, 2]))

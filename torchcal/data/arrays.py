@@ -10,6 +10,7 @@ from torch import Tensor
 from torchcal.errors import RecordingError, ShapeError
 
 __all__ = [
+    "ROUNDING",
     "check_finite",
     "check_lengths",
     "declared_units",
@@ -21,6 +22,10 @@ __all__ = [
     "unit_of",
     "value_range",
 ]
+
+ROUNDING = 16 * torch.finfo(torch.float64).eps
+"""Relative sd and difference up to which numbers are one but for rounding: a sum that some hundred steps conserve is
+off by a few epsilon."""
 
 
 #: Bend of a conversion between units, relative to its numbers, up to which it is linear but for rounding.
@@ -209,11 +214,12 @@ def check_lengths(arrays: Mapping[str, Tensor]) -> None:
 
 
 def sample_spread(values: Tensor) -> Tensor:
-    """Sample sd, scaled first so that its squares neither vanish nor overflow."""
+    """Sample sd, scaled first so that its squares neither vanish nor overflow; of a constant its size."""
     scale = values.abs().max()
     if bool(values.min() < values.max()):
-        sd = (values / scale).std() * scale
-        if bool(sd > 0) and bool(torch.isfinite(sd)):
+        relative = (values / scale).std()
+        sd = relative * scale
+        if bool(relative > ROUNDING) and bool(sd > 0) and bool(torch.isfinite(sd)):
             return sd
     return scale if bool(scale > 0) else torch.ones_like(scale)
 

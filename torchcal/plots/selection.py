@@ -51,9 +51,9 @@ class View:
 
 
 def close(values: np.ndarray, target: float) -> np.ndarray:
-    """Where values equal a target up to rounding."""
+    """Where values equal a target up to a millionth of their range, or of itself where there is but one of them."""
     span = float(np.ptp(values)) if len(values) else 0.0
-    return np.isclose(values, target, rtol=1e-6, atol=1e-9 * span)
+    return np.isclose(values, target, rtol=8 * np.finfo(float).eps, atol=1e-6 * (span or abs(target)))
 
 
 def conditions_of(x: Any, recording: Recording | None) -> dict[str, np.ndarray]:

@@ -196,20 +196,33 @@ def _rebuild(module: Any, spec: Mapping[str, Any]) -> Any:
 def _recording(groups: Mapping[str, Any], meta: Mapping[str, Any]) -> Recording:
     info = meta["recording"]
     x: Any = dict(groups["constant_data"]) if info["named"] else groups["constant_data"]["x"]
-    y = {name: groups["observed_data"][name] for name in info["outputs"]}
+    held_out = info.get("held_out", {})
+    y = {name: _filled(groups["observed_data"][name], name in held_out) for name in info["outputs"]}
     noise: Any = info["noise"]
     if "noise" in groups:
         noise = groups["noise"]["sd"]
-    missing = any(bool(value.isnan().any()) for value in y.values())
+    missing = info.get("missing", any(bool(value.isnan().any()) for value in y.values()))
     if info.get("runs"):
-        return Recording(runs=_runs(groups, info["runs"]), noise=noise, missing=missing, units=_units(info))
-    return Recording(x=x, y=y, noise=noise, missing=missing, units=info["units"])
+        recording = Recording(runs=_runs(groups, y, info["runs"]), noise=noise, missing=missing, units=_units(info))
+    else:
+        recording = Recording(x=x, y=y, noise=noise, missing=missing, units=info["units"])
+    if held_out:
+        recording = recording.masked(torch.tensor([name not in held_out for name in y]).repeat_interleave(recording.n))
+        spread = recording.split(recording.spread)
+        known = [torch.full_like(old, held_out.get(name, float(old[0]))) for name, old in spread.items()]
+        object.__setattr__(recording, "spread", torch.cat(known))
+    return recording
 
 
-def _runs(groups: Mapping[str, Any], specs: list[dict[str, Any]]) -> list[Run]:
+def _filled(values: Tensor, held_out: bool) -> Tensor:
+    """Something for data that are held out whole, until they are."""
+    return torch.zeros_like(values) if held_out else values
+
+
+def _runs(groups: Mapping[str, Any], y: Mapping[str, Tensor], specs: list[dict[str, Any]]) -> list[Run]:
     lengths = [spec["samples"] for spec in specs]
     time = groups["constant_data"]["time"].split(lengths)
-    outputs = {name: values.split(lengths) for name, values in groups["observed_data"].items()}
+    outputs = {name: values.split(lengths) for name, values in y.items()}
     inputs = {name: values.split(lengths) for name, values in groups.get("inputs", {}).items()}
     return [
         Run(

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcal.data import Run
+from torchcal.data import Recording, Run
 from torchcal.errors import DomainError, MissingDependencyError
 from torchcal.files import replacing
 from torchcal.propagation import RuleChoice
@@ -228,6 +228,8 @@ def _tree(groups: dict[str, Any], result: Any, extra: Mapping[str, Any]) -> Any:
             "named": isinstance(recording.x, Mapping),
             "outputs": list(recording.outputs),
             "noise": "none" if isinstance(recording.noise, str) else None,
+            "missing": recording.missing,
+            "held_out": _held_out(recording),
             "units": dict(recording.units),
             "runs": None if recording.runs is None else [_run_fields(run) for run in recording.runs],
         },
@@ -235,6 +237,12 @@ def _tree(groups: dict[str, Any], result: Any, extra: Mapping[str, Any]) -> Any:
     tree = _optional("xarray").DataTree.from_dict({f"/{name}": group for name, group in groups.items()})
     tree.attrs["torchcal"] = json.dumps(meta)
     return tree
+
+
+def _held_out(recording: Recording) -> dict[str, float]:
+    """Spread of the outputs that are held out whole, whose data do not tell it."""
+    observed, spread = recording.split(recording.observed), recording.split(recording.spread)
+    return {name: float(spread[name][0]) for name, seen in observed.items() if not bool(seen.any())}
 
 
 def _run_fields(run: Run) -> dict[str, Any]:

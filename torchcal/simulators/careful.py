@@ -4,13 +4,14 @@ import copy
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchcal.errors import SimulatorError
 from torchcal.simulators.dual import transformed
 
-__all__ = ["careful"]
+__all__ = ["careful", "real"]
 
 
 def careful(seen: set[int], what: str, function: Callable[..., Any], **given: Any) -> Any:
@@ -47,6 +48,35 @@ def careful(seen: set[int], what: str, function: Callable[..., Any], **given: An
     if not any(transformed(value) for one in given.values() for _, value in _named("", one)):  # there it cannot be seen
         seen.add(id(function))
     return result
+
+
+def real(value: Any, like: Tensor, shape: torch.Size, what: str) -> Tensor:
+    """What a user's function gave, as real numbers of some shape.
+
+    Args:
+        value: A tensor or a number.
+        like: Tensor of the dtype that numbers get.
+        shape: Wanted, which it is spread over.
+        what: It, in words.
+
+    Raises:
+        SimulatorError: If it is no real number, or has another shape.
+    """
+    if not isinstance(value, Tensor):
+        numbers = np.asarray(value)
+        value = torch.as_tensor(numbers, dtype=like.dtype) if numbers.dtype.kind in "biuf" else value
+    if not isinstance(value, Tensor) or value.is_complex():
+        got = f"{value.dtype}" if isinstance(value, Tensor) else type(value).__name__
+        raise SimulatorError(
+            f"Expected {what} as a tensor of real numbers. Got {got} (compute it with torch from what is given)."
+        )
+    value = value if value.dtype == like.dtype else value.to(like)
+    try:
+        return value if value.shape == shape else value.expand(shape)
+    except RuntimeError as error:
+        raise SimulatorError(
+            f"Expected {what} of shape {tuple(shape)}. Got {tuple(value.shape)} (write it elementwise)."
+        ) from error
 
 
 def _copied(value: Any) -> Any:

@@ -5,11 +5,9 @@ import dataclasses
 import torch
 from torch import Tensor
 
-__all__ = ["NUMBERS", "HeldOutError", "mean_and_sd", "root_mean_square"]
+from torchcal.data import ROUNDING
 
-CONSTANT = 16 * torch.finfo(torch.float64).eps
-"""Sd and error, relative to the mean, up to which an output is one number but for rounding: a sum that some hundred
-steps conserve is off by a few epsilon."""
+__all__ = ["NUMBERS", "HeldOutError", "mean_and_sd", "root_mean_square"]
 
 NUMBERS = ("max_abs", "rms", "mean", "sd")
 """The tensors of a `HeldOutError`."""
@@ -40,7 +38,7 @@ class HeldOutError:
     @property
     def relative(self) -> Tensor:
         """rms over sd, ``(outputs,)``; 0 where the rms is rounding of the sd, or of the mean of a constant output."""
-        size = CONSTANT * self.mean.abs()
+        size = ROUNDING * self.mean.abs()
         rounding = (self.rms <= 1e-13 * self.sd) | ((self.sd <= size) & (self.rms <= size))
         return torch.where(rounding, 0.0, self.rms / self.sd)
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchcal.data import Recording, Run
 from torchcal.display import raised
 from torchcal.errors import RecordingError, SimulatorError
-from torchcal.simulators.careful import careful
+from torchcal.simulators.careful import careful, real
 from torchcal.simulators.parameter import Parameter, in_run
 
 if TYPE_CHECKING:
@@ -181,7 +181,7 @@ class Layout:
 
     def start(self, values: Tensor) -> Tensor:
         """Initial states ``(H, R, S)``."""
-        rows = []
+        rows, one = [], values[..., :1].shape
         for r, known in enumerate(self._initial):
             entries: dict[str, Tensor] = {}
             own = {name: values[..., places[0 if len(places) == 1 else r], None]
@@ -197,7 +197,7 @@ class Layout:
                         entries[state] = entries[value]
                     elif callable(value):
                         found = careful(self._seen, f"the initial value of {state!r}", value, s=entries, p=own)
-                        entries[state] = found + torch.zeros_like(values[..., :1])
+                        entries[state] = real(found, values, one, f"the initial value of {state!r}")
                 except SimulatorError:
                     raise
                 except Exception as error:

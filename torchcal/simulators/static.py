@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from torchcal.checks import whole
-from torchcal.data import Recording
+from torchcal.data import ROUNDING, Recording
 from torchcal.display import raised
 from torchcal.errors import DomainError, ShapeError, SimulatorError
 from torchcal.simulators.careful import careful
@@ -43,7 +43,10 @@ class Linearisation:
 
 
 def check_values(values: Tensor, names: Sequence[str]) -> None:
-    """Raise unless values are ``(*batch, d)``, one for each parameter."""
+    """Raise unless values are real numbers ``(*batch, d)``, one for each parameter."""
+    if not isinstance(values, Tensor) or not values.is_floating_point():
+        got = values.dtype if isinstance(values, Tensor) else type(values).__name__
+        raise ShapeError(f"Expected parameter values as a tensor of floating-point numbers. Got {got} (use .double()).")
     if values.ndim == 0 or values.shape[-1] != len(names):
         raise ShapeError(
             f"Expected parameter values of shape (*batch, {len(names)}): {', '.join(names)}. Got {tuple(values.shape)}."
@@ -287,7 +290,9 @@ class Simulator:
             alone = evaluate(values[good[0]])
             nested = evaluate(values[good].reshape(2, 1, -1))[:, 0]
         difference = torch.maximum((together[good[0]] - alone).abs(), (together[good] - nested).abs().amax(0))
-        if not bool((difference <= 1e-6 * together[good].abs().amax()).all()):
+        size = together[good].abs().amax(0)  # and the largest of each output:
+        own = size.unflatten(0, (-1, _length(x))).amax(1, keepdim=True).expand(-1, _length(x)).flatten()
+        if not bool((difference <= (1e-6 * own).clamp_min(ROUNDING * float(size.max()))).all()):
             raise SimulatorError(
                 "Expected the same outputs for parameter values in a batch as one at a time. Got a difference "
                 f"of {float(difference.max()):.3g}. Write the simulator elementwise: p[name] has shape "

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchcal.display import raised
 from torchcal.errors import SimulatorError
-from torchcal.simulators.careful import careful
+from torchcal.simulators.careful import careful, real
 from torchcal.simulators.grid import Grid
 from torchcal.simulators.layout import Layout, Values
 from torchcal.simulators.parameter import spans
@@ -71,19 +71,8 @@ class Steps:
         if not isinstance(rates, Mapping) or set(rates) != set(names):
             got = list(rates) if isinstance(rates, Mapping) else type(rates).__name__
             raise SimulatorError(f"Expected the rates of {list(names)} as a dict. Got {got}.")
-        columns = []
-        for name in names:
-            rate = rates[name]
-            if not isinstance(rate, Tensor):
-                rate = torch.as_tensor(float(rate), dtype=s.dtype)
-            try:
-                columns.append(rate.expand(s.shape[:-1]) if rate.shape != s.shape[:-1] else rate)
-            except RuntimeError as error:
-                raise SimulatorError(
-                    f"Expected the rate of {name!r} of shape {tuple(s.shape[:-1])} (batch, runs). "
-                    f"Got {tuple(rate.shape)}. Write the rates elementwise."
-                ) from error
-        return torch.stack(columns, dim=-1)
+        shape = s.shape[:-1]  # (batch, runs)
+        return torch.stack([real(rates[name], s, shape, f"the rate of {name!r}") for name in names], dim=-1)
 
     def step(self, s: Tensor, t: Tensor, h: Tensor, p: Values, u: dict[str, Tensor]) -> Tensor:
         """One Runge–Kutta step of every point ``(H, M, states)``; t, h ``(M,)``, u ``(3, M)``."""

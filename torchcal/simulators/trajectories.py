@@ -10,12 +10,12 @@ from torch import Tensor
 from torchcal.data import Recording
 from torchcal.display import raised
 from torchcal.errors import DomainError, RecordingError, SimulatorError
-from torchcal.simulators.careful import careful
+from torchcal.simulators.careful import careful, real
 from torchcal.simulators.grid import Grid
 from torchcal.simulators.implicit import ImplicitSteps
 from torchcal.simulators.layout import Layout
 from torchcal.simulators.solution import Solution
-from torchcal.simulators.static import Conditions, Linearisation, Simulator
+from torchcal.simulators.static import Conditions, Linearisation, Simulator, check_values
 from torchcal.simulators.steps import POINTS, Steps
 
 if TYPE_CHECKING:
@@ -162,6 +162,7 @@ class Trajectories(Simulator):
         size = max(1, NUMBERS // self.grid.nodes.numel() // len(self._states))
 
         def evaluate(values: Tensor) -> Tensor:
+            check_values(values, self.names)
             batch = values.shape[:-1]
             flat = values.reshape(-1, values.shape[-1]).to(device="cpu", dtype=torch.float64)
             result = torch.cat([self._differentiable(piece, wanted) for piece in flat.split(size)])
@@ -316,7 +317,7 @@ class Trajectories(Simulator):
                 raise SimulatorError(
                     f"Expected the output {name!r} as a tensor. Its function raised {raised(error)}."
                 ) from error
-            parts.append(torch.as_tensor(value, dtype=seen.dtype).expand(seen.shape[:-1]))
+            parts.append(real(value, seen, seen.shape[:-1], f"the output {name!r}"))
         return torch.cat(parts, dim=-1)
 
 
