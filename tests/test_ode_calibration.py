@@ -2,6 +2,7 @@
 
 import warnings
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -519,6 +520,22 @@ def test_runs_of_all_kinds_survive_a_file(tmp_path: Path) -> None:
         )  # fmt: skip
         assert torch.equal(run.inputs["in/flow"], old.inputs["in/flow"])
     torch.testing.assert_close(back.predict().map.mean, found.predict().map.mean, rtol=1e-12, atol=1e-12)
+
+
+def test_a_model_in_time_with_another_constant_is_not_the_one_that_was_calibrated(tmp_path: Path) -> None:
+    t = torch.linspace(0, 2, 20, dtype=F64)
+
+    def model(c: float, **options: Any) -> tc.ODESimulator:
+        rates = lambda t, s, p, u: {"z": -c * p["k"] * s["z"]}  # noqa: E731
+        return tc.ODESimulator(rates, ["z"], [tc.Parameter("k", low=0.0, high=3.0)], **options)
+
+    data = tc.Recording(runs=[tc.Run(t, {"z": torch.exp(-t) + 0.01 * torch.sin(40 * t)}, initial={"z": 1.0})])
+    for calibrate, kind in ((tc.calibrate, Calibration), (tc.calibrate_additive, AdditiveCalibration)):
+        calibrate(model(1.0), data, num_samples=0, seed=0).save(tmp_path / "o.nc")
+        kind.load(tmp_path / "o.nc", simulator=model(1.0))
+        kind.load(tmp_path / "o.nc", simulator=model(1.0, stiff=True))  # other steps
+        with pytest.raises(DomainError, match="predicts something else"):
+            kind.load(tmp_path / "o.nc", simulator=model(2.0))
 
 
 def test_a_static_result_and_a_model_in_time_do_not_mix(tmp_path: Path) -> None:

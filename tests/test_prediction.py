@@ -354,6 +354,9 @@ def test_scores_refuse_what_has_no_score():
         scores(y, Moments(y, y), level=2.0)
     with pytest.raises(DomainError, match="sd > 0"):
         scores(y, Moments(y, 0 * y))
+    with pytest.raises(DomainError, match=r"finite data\. Got an infinite one"):
+        scores(y / 0, Moments(y, y))
+    assert scores(1e14 * y, Moments(y, y)).coverage == 0.0
 
 
 def test_masked_data_count_nowhere():

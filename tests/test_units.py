@@ -8,7 +8,7 @@ import torch
 from pyro.infer import MCMC, NUTS
 
 import torchcal as tc
-from torchcal.errors import DomainError
+from torchcal.errors import DomainError, RecordingError
 from torchcal.prediction import Moments
 
 X = torch.linspace(0.1, 1.0, 9, dtype=torch.float64)
@@ -92,11 +92,16 @@ def test_scores_refuse_units_that_a_prediction_does_not_know():
     y = quantity([1000.0, 2500.0], "mm")
     assert tc.scores(y.to("m").magnitude, moments, noise=0.1) == plain
     for data, noise, label in [(y, 0.1, "y"), ([1.0, 2.5], quantity(100.0, "mm"), "noise"), (list(y), 0.1, "y")]:
-        with pytest.raises(DomainError, match=rf"Expected {label} as numbers.* Got a Quantity in 'millimeter' \("):
+        with pytest.raises(DomainError, match=rf"Expected {label} as numbers.* Got some in 'millimeter' \("):
             tc.scores(data, moments, noise=noise)
     xarray = pytest.importorskip("xarray")
-    with pytest.raises(DomainError, match="Expected y as numbers"):
-        tc.scores(xarray.DataArray(y, dims="n"), moments)
+    for data in (xarray.DataArray(y, dims="n"), xarray.DataArray([1.0, 2.5], dims="n", attrs={"units": "mm"})):
+        with pytest.raises(DomainError, match="Expected y as numbers"):
+            tc.scores(data, moments)
+    noise = xarray.DataArray(0.1, attrs={"units": "cm"})
+    with pytest.raises(RecordingError, match="a known unit of output 'y', because noise has one"):
+        tc.Recording(x=[0.0, 1.0], y=[1.0, 2.0], noise=noise)
+    assert tc.Recording(x=[0.0, 1.0], y=[1.0, 2.0], noise=noise, units={"y": "cm"}).noise.tolist() == [0.1, 0.1]
 
 
 @pytest.mark.slow

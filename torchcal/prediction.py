@@ -290,16 +290,18 @@ def scores(y: Any, moments: Moments | Prediction, *, noise: Any = None, level: f
     if not 0 < level < 1:
         raise DomainError(f"Expected level between 0 and 1. Got {level!r}.")
     known = ~torch.isnan(y)
+    if bool(y.isinf().any()):
+        raise DomainError("Expected finite data. Got an infinite one (correct it, or give NaN where one is missing).")
     if not bool(known.any()):
         raise DomainError("Expected at least one datum that is not missing. Got NaN alone.")
     error = (y - moments.mean)[known]
     sd = moments.sd if noise is None else (moments.sd.square() + _noise_sd(noise, moments.sd).square()).sqrt()
     sd = sd[known]
-    least = ROUNDING * torch.maximum(moments.mean[known].abs(), y[known].abs())
+    least = ROUNDING * moments.mean[known].abs()
     if not bool((sd > least).all()):
         worst = float(sd[~(sd > least)][0])
         nothing = math.isnan(worst) or bool(moments.mean[known].isnan().any())
-        told = "NaN" if nothing else f"{worst:.3g}, which is 0 but for rounding"
+        told = "NaN" if nothing else f"{worst:.3g}" + ", which is 0 but for rounding" * (worst >= 0)
         raise DomainError(f"Expected sd > 0 for a log score. Got {told}. Give noise=, or compare the means alone.")
     quantile = math.sqrt(2) * float(torch.erfinv(torch.tensor(level, dtype=torch.float64)))
     z = error / sd
@@ -315,7 +317,7 @@ def scores(y: Any, moments: Moments | Prediction, *, noise: Any = None, level: f
 def _check_plain(value: Any, label: str) -> None:
     if (unit := unit_of(value)) is not None:
         raise DomainError(
-            f"Expected {label} as numbers in the unit of the prediction, which does not know it. Got a Quantity in "
+            f"Expected {label} as numbers in the unit of the prediction, which does not know it. Got some in "
             f"{unit!r} (convert it yourself: give {label}.to(unit).magnitude)."
         )
 

@@ -68,12 +68,21 @@ def is_quantity(value: Any) -> bool:
 
 
 def unit_of(value: Any) -> str | None:
-    """The unit of a Quantity, of a DataArray that holds one, or of the first of a list of them; None without one."""
+    """The unit of a Quantity, of a DataArray, or of the first of a list of them; None without one."""
     if isinstance(value, list | tuple) and value:
         value = value[0]
     elif not isinstance(value, Tensor) and not is_quantity(value) and hasattr(value, "attrs"):
-        value = getattr(value, "data", None)
+        if not is_quantity(getattr(value, "data", None)):
+            return _spelled(value)
+        value = value.data
     return str(value.units) if is_quantity(value) else None
+
+
+def _spelled(value: Any) -> str | None:
+    """The unit that a DataArray or a Series names among its attributes."""
+    attributes = getattr(value, "attrs", None)
+    spelled = attributes.get("units") if isinstance(attributes, Mapping) else None
+    return spelled if isinstance(spelled, str) else None
 
 
 def to_tensor(
@@ -84,11 +93,9 @@ def to_tensor(
     With ``difference`` the value is a difference (an sd): an offset between units (K, degC) is left out.
     """
     if not isinstance(value, Tensor) and not is_quantity(value):
-        attributes = getattr(value, "attrs", None)
-        spelled = attributes.get("units") if isinstance(attributes, Mapping) else None
-        if attributes is not None and is_quantity(getattr(value, "data", None)):
+        if hasattr(value, "attrs") and is_quantity(getattr(value, "data", None)):
             value = value.data
-        elif isinstance(spelled, str):
+        elif (spelled := _spelled(value)) is not None:
             if unit is not None and spelled != unit:
                 raise RecordingError(
                     f"Expected {label} in {unit!r}. Got attrs['units'] = {spelled!r} "

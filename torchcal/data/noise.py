@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchcal.data.arrays import is_quantity, to_tensor
+from torchcal.data.arrays import to_tensor, unit_of
 from torchcal.errors import DomainError, RecordingError, ShapeError
 
 __all__ = ["noise_sd"]
@@ -30,7 +30,7 @@ def noise_sd(noise: Any, outputs: tuple[str, ...], n: int, units: Mapping[str, s
     for i, name in enumerate(outputs):
         label = f"noise[{name!r}]" if is_dict else "noise"
         value = noise[name] if is_dict else noise
-        if is_quantity(value) and name not in units:
+        if unit_of(value) is not None and name not in units:
             raise RecordingError(
                 f"Expected a known unit of output {name!r}, because {label} has one. Got none (give units=)."
             )
