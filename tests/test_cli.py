@@ -13,7 +13,7 @@ import torch
 
 import torchcal as tc
 from torchcal import cli
-from torchcal.errors import InterruptionWarning, TorchcalWarning, warn
+from torchcal.errors import InterruptionWarning, TorchcalError, TorchcalWarning, warn
 
 PROBLEM = """
 import torch
@@ -159,6 +159,31 @@ def test_what_was_cut_short_is_written_and_is_no_success(problem, tmp_path, monk
     assert warnings.showwarning is shown
     monkeypatch.undo()
     assert cli.main(["calibrate", str(problem), "--quiet"]) == 0
+
+
+def test_a_missing_package_for_the_result_is_told_before_any_work(problem, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(cli, "calibrate", lambda *args, **options: pytest.fail("worked before it looked"))
+    monkeypatch.setitem(sys.modules, "h5netcdf", None)
+    assert cli.main(["calibrate", str(problem), "--quiet", "--out", str(tmp_path / "r.nc")]) == 1
+    assert "Expected h5netcdf" in capsys.readouterr().err
+
+
+def test_what_cannot_be_saved_is_printed_all_the_same(problem, tmp_path, capsys, monkeypatch):
+    def full(*_):
+        raise TorchcalError("the disk is full")
+
+    monkeypatch.setattr(tc.results.Calibration, "save", full)
+    monkeypatch.setattr(tc.discovery.Diagnosis, "report", full)
+    assert cli.main(["calibrate", str(problem), "--quiet", "--out", str(tmp_path / "r.nc")]) == 1
+    told = capsys.readouterr()
+    assert told.out.startswith("Calibration with embedded model error")
+    assert "the disk is full" in told.err
+    files = ["--report", str(tmp_path / "r.html"), "--out", str(tmp_path / "r.json")]
+    assert cli.main(["diagnose", str(problem), "--quiet", *files]) == 1
+    told = capsys.readouterr()
+    assert told.out.startswith("Verdict: named: bend")
+    assert "the disk is full" in told.err
+    assert json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))["terms"] == ["bend"]
 
 
 def test_it_tells_its_version(capsys):

@@ -5,6 +5,7 @@ further arguments, ``calibrate_options`` and ``diagnose_options``.
 """
 
 import argparse
+import contextlib
 import importlib.metadata
 import importlib.util
 import inspect
@@ -23,6 +24,7 @@ from torchcal.errors import DomainError, InterruptionWarning, TorchcalError
 from torchcal.files import check_target
 from torchcal.inference import calibrate
 from torchcal.results import AdditiveCalibration, Calibration
+from torchcal.results.storage import netcdf_modules
 
 __all__ = ["main"]
 
@@ -118,12 +120,14 @@ def _calibrate(given: argparse.Namespace) -> None:
     problem = _problem(given.problem)
     if given.out is not None:
         check_target(given.out)
+        netcdf_modules()
     options = _options(problem, "calibrate_options", calibrate, given, target_ess=given.target_ess)
     warnings.simplefilter("always", InterruptionWarning)  # by which the status is known, whatever the file filters
     result = calibrate(problem.simulator, problem.recording, **options)
-    if given.out is not None:
-        result.save(given.out)
-    print(result)
+    with contextlib.ExitStack() as end:
+        end.callback(print, result)  # also where it cannot be saved
+        if given.out is not None:
+            end.callback(result.save, given.out)
 
 
 def _diagnose(given: argparse.Namespace) -> None:
@@ -134,11 +138,12 @@ def _diagnose(given: argparse.Namespace) -> None:
     options = _options(problem, "diagnose_options", diagnose, given)
     warnings.simplefilter("always", InterruptionWarning)
     result = diagnose(problem.simulator, problem.recording, getattr(problem, "candidates", ()), **options)
-    if given.report is not None:
-        result.report(given.report)
-    if given.out is not None:
-        result.save(given.out)
-    print(result)
+    with contextlib.ExitStack() as end:  # each of them whatever becomes of the others, the last one first
+        end.callback(print, result)
+        if given.out is not None:
+            end.callback(result.save, given.out)
+        if given.report is not None:
+            end.callback(result.report, given.report)
 
 
 def _show(given: argparse.Namespace) -> None:
