@@ -2,6 +2,8 @@
 
 import json
 import math
+import os
+import stat
 
 import pytest
 import torch
@@ -43,6 +45,39 @@ def test_a_path_that_cannot_be_written_is_told(tmp_path):
         with pytest.raises(DomainError, match=told):
             check_target(path)
     assert check_target(str(tmp_path / "a.txt")) == tmp_path / "a.txt"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links need rights there")
+def test_a_link_is_written_through(tmp_path):
+    (tmp_path / "store").mkdir()
+    for name, old in [("there.txt", True), ("not_yet.txt", False)]:
+        target, link, second = tmp_path / "store" / name, tmp_path / name, tmp_path / f"second_{name}"
+        if old:
+            target.write_text("old")
+        link.symlink_to(target)
+        second.symlink_to(name)
+        with replacing(second) as temporary:
+            assert temporary.parent == target.parent  # on the same disk, or it could not be replaced at once
+            temporary.write_text("new")
+        assert link.is_symlink()
+        assert second.is_symlink()
+        assert target.read_text() == "new"
+    (tmp_path / "lost.txt").symlink_to(tmp_path / "no" / "a.txt")
+    with pytest.raises(DomainError, match="no folder"):
+        check_target(tmp_path / "lost.txt")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no pipes with names there")
+def test_what_is_no_file_is_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("pipe")
+    (tmp_path / "round").symlink_to("round")
+    for path in (tmp_path / "pipe", tmp_path / "link", tmp_path / "round"):
+        with pytest.raises(DomainError, match="would be replaced"), replacing(path):
+            pass
+    with pytest.raises(DomainError, match="would be replaced"):
+        check_target(os.devnull)
+    assert stat.S_ISFIFO((tmp_path / "pipe").stat().st_mode)
 
 
 def test_a_diagnosis_is_saved_as_numbers(tmp_path):
