@@ -316,6 +316,16 @@ def test_results_that_are_one_real_number(right, values):
     assert ExternalSimulator(lambda x, p: right, PARAMETERS).at(X)(values).unique().tolist() == [2.0]
 
 
+@pytest.mark.parametrize("dtype", [float, int])
+def test_a_masked_value_is_missing(dtype, values):
+    masked = np.ma.masked_array([-999, 2, 3, -999], [True, False, False, True], dtype=dtype)
+    result = ExternalSimulator(lambda x, p: masked, PARAMETERS, vectorized=True).at(X)(values)
+    np.testing.assert_equal(result.numpy(), np.tile([np.nan, 2.0, 3.0, np.nan], (3, 1)))
+    result = ExternalSimulator(lambda x, p: {"y": masked[0], "z": masked[:1]}, PARAMETERS).at(X)(values)
+    assert result.isnan().all()
+    assert masked.data[0] == -999
+
+
 @pytest.mark.parametrize("wrong", [1.0, np.ones(3), np.ones((4, 1)), np.ones(1)])
 def test_a_vectorized_result_of_the_wrong_shape(wrong, values):
     with pytest.raises(SimulatorError, match=r"shape \(4,\)"):

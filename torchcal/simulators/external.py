@@ -37,7 +37,8 @@ class ExternalSimulator(Simulator):
         function: ``function(x, p)`` with ``p`` a dict of floats. ``x`` is a float, or a dict of them where the
             conditions are named; it returns a number, or a dict of them for several outputs. With ``vectorized``
             ``x`` holds numpy arrays ``(n,)``, and it returns arrays ``(n,)``. It must give the same numbers for
-            the same arguments. Where it has no answer it may return nan; arithmetic errors count as none.
+            the same arguments. Where it has no answer it may return nan or a masked value; arithmetic errors count
+            as none.
         parameters: In the order in which results list them.
         executor: Any ``concurrent.futures.Executor``; None calls the function here. For a process pool the
             function must be defined at the top level of a module. All parameter values of a call go in one map,

@@ -163,6 +163,8 @@ def _read(result: Any, shape: tuple[int, ...]) -> Value:
 def _numbers(value: Any, shape: tuple[int, ...], what: str) -> Array:
     wanted = f"an array of shape {shape}" if shape else "one real number"
     plain = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    if isinstance(value, np.ma.MaskedArray) and value.dtype.kind in "fiu":
+        value = np.ma.filled(value.astype(np.float64), np.nan)  # what is masked is missing, whatever number lies below
     try:
         array = np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
     except Exception as error:
