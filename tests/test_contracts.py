@@ -288,6 +288,33 @@ def test_integers_of_numpy_are_whole_numbers():
     assert tc.build_surrogate(line, conditions=(0, 1), parameters=box, order=two).order == 2
 
 
+def test_integers_of_numpy_are_seeds_and_counts(tmp_path):
+    one, two, ten = (np.int64(number) for number in (1, 2, 10))
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a", low=0, high=2), tc.Parameter("b")])
+    recording = tc.Recording(x=T, y=1 + T + 0.1 * T**2)
+    for calibrate in (tc.calibrate, tc.calibrate_additive):
+        found, same = (
+            calibrate(line, recording, num_samples=0, num_starts=starts, seed=seed)
+            for starts, seed in ((ten, one), (10, 1))
+        )
+        found.save(tmp_path / "a.nc")
+        assert torch.equal(found.map.alpha, same.map.alpha)
+        assert type(found.settings["seed"]) is int
+    likelihood = tc.likelihoods.Marginal(num_samples=ten)
+    assert type(likelihood.num_samples) is int
+    fit = tc.calibrate(line, recording, num_samples=0)
+    for draw in (fit.sample_outputs, fit.sample_parameters):
+        assert torch.equal(draw(ten, kind="map", seed=one), draw(10, kind="map", seed=1))
+    with pytest.raises(DomainError, match="seed"):
+        fit.sample_outputs(3, kind="map", seed="one")
+    box = [tc.Parameter("a", low=0, high=1), tc.Parameter("b", low=0, high=1)]
+    surrogate = tc.build_surrogate(line, conditions=(0, 1), parameters=box, order=two, holdout=ten, seed=one)
+    again = tc.PolynomialSurrogate(surrogate.coefficients, conditions=(0, 1), parameters=box, order=two)
+    for one_of_them in (surrogate, again):
+        one_of_them.save(tmp_path / "s.npz")
+    assert surrogate.error.num == 10
+
+
 @pytest.mark.parametrize(("fixed", "told"), [({"a": None}, "a finite value"), ({"a": -1.0}, "positive values")])
 def test_diagnose_takes_the_fixed_values_that_calibrate_takes(fixed, told):
     model = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a", transform="log"), tc.Parameter("b")])

@@ -271,7 +271,8 @@ class Marginal(Likelihood):
     name = "marginal"
 
     def __post_init__(self) -> None:
-        _check_samples(self.num_samples, self.bandwidth, self.floor)
+        object.__setattr__(self, "num_samples", whole("num_samples", self.num_samples, 2))
+        _check_kernels(self.bandwidth, self.floor)
 
     def resolve(
         self, y: Tensor, spread: Tensor, num_embedded: int, noise: Tensor | None = None
@@ -314,7 +315,8 @@ class Full(Likelihood):
     name = "full"
 
     def __post_init__(self) -> None:
-        _check_samples(self.num_samples, self.bandwidth, self.floor)
+        object.__setattr__(self, "num_samples", whole("num_samples", self.num_samples, 2))
+        _check_kernels(self.bandwidth, self.floor)
 
     def resolve(
         self, y: Tensor, spread: Tensor, num_embedded: int, noise: Tensor | None = None
@@ -412,8 +414,7 @@ def _default_epsilon(y: Tensor) -> float:
     return DEFAULT_TOLERANCE * spread
 
 
-def _check_samples(num_samples: int, bandwidth: float | None, floor: float | Tensor | None) -> None:
-    whole("num_samples", num_samples, 2)
+def _check_kernels(bandwidth: float | None, floor: float | Tensor | None) -> None:
     if bandwidth is not None:
         _number(bandwidth, "bandwidth")
     if floor is not None:

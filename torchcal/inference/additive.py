@@ -91,7 +91,7 @@ def calibrate_additive(
     plan = Plan(
         num_samples, num_chains, num_warmup, sampler, seed, dtype, target_accept, progress, target_ess
     )
-    check_run(num_starts, device)
+    seed, num_starts = plan.seed, check_run(num_starts, device)
     simulator, free = check_inputs(simulator, recording, fixed)
     check_dtype(recording, plan.dtype)
     observed = recording.observed

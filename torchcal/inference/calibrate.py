@@ -129,7 +129,7 @@ def calibrate(
     plan = Plan(
         num_samples, num_chains, num_warmup, sampler, seed, dtype, target_accept, progress, target_ess
     )
-    check_run(num_starts, device)
+    seed, num_starts = plan.seed, check_run(num_starts, device)
     embedding = Gaussian() if embedding is None else embedding
     if not isinstance(embedding, Embedding):
         instead = " (write Gaussian(), with brackets)" if isinstance(embedding, type) else ""

@@ -108,18 +108,19 @@ def check_dtype(recording: Recording, dtype: torch.dtype) -> None:
             )
 
 
-def check_run(num_starts: int, device: torch.device | str | None) -> None:
-    """Raise for a number of starts or a device that cannot be used, or where no derivatives are taken."""
+def check_run(num_starts: int, device: torch.device | str | None) -> int:
+    """The number of starts; raise for one or a device that cannot be used, or where no derivatives are taken."""
     outside_inference_mode()
-    whole("num_starts", num_starts, 1)
+    num_starts = whole("num_starts", num_starts, 1)
     if device is None:
-        return
+        return num_starts
     try:
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError, TypeError) as error:
         raise DomainError(
             f"Expected a device that torch can use here. Got {device!r} ({error}). Use 'cpu', or leave it out."
         ) from error
+    return num_starts
 
 
 def warn_of_tails(problem: Problem) -> None:

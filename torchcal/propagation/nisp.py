@@ -269,7 +269,7 @@ class NISP(nn.Module):
 
     def draw_germ(self, num: int, *, seed: int) -> Tensor:
         """Independent draws of ξ, ``(num, germs)``."""
-        generator = torch.Generator().manual_seed(seed)
+        generator = torch.Generator().manual_seed(whole("seed", seed, 0))
         draws = self.pattern.basis.sample((num, self.pattern.num_germs), generator=generator)
         return draws.to(self.nodes)
 

@@ -165,7 +165,7 @@ class Calibration(Result):
         return kind
 
     def _joint_draws(self, propagate: NISP, num: int, kind: str, seed: int) -> tuple[Tensor, Tensor]:
-        num = whole("num", num, 0)
+        num, seed = whole("num", num, 0), whole("seed", seed, 0)
         like = propagate.nodes
         xi = propagate.draw_germ(num, seed=seed)
         draws = self.draws

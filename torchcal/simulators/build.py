@@ -99,8 +99,7 @@ def build_surrogate(
     dim = len(bounds) + len(parameters)
     order = whole("order", order, 1)
     counts = _check_nodes(nodes, order, dim)
-    whole("holdout", holdout, 10)
-    whole("seed", seed, 0)
+    holdout, seed = whole("holdout", holdout, 10), whole("seed", seed, 0)
     if not (isinstance(threshold, int | float) and threshold > 0):
         raise DomainError(f"Expected threshold > 0. Got {threshold!r}.")
     external = not isinstance(simulator, Simulator) or isinstance(simulator, ExternalSimulator)

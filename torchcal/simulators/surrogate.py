@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchcal import polychaos
+from torchcal.checks import whole
 from torchcal.errors import DomainError, ExtrapolationWarning, ShapeError, SimulatorError, warn
 from torchcal.simulators.design import read_npz, write_npz
 from torchcal.simulators.held_out import NUMBERS, HeldOutError
@@ -89,7 +90,7 @@ class PolynomialSurrogate(Simulator):
     ) -> None:
         super().__init__(self._elementwise, parameters, degree=order)
         self.condition_names, self.condition_bounds = check_box(conditions, self.parameters)
-        self.order = order
+        self.order = whole("order", order, 0)
         self.outputs = None if outputs is None else tuple(outputs)
         self.error = error
         self.nodes = nodes if nodes is None or isinstance(nodes, int) else tuple(nodes)
