@@ -77,6 +77,20 @@ def test_free_parameters_refuses_what_it_cannot_hold():
         free_parameters(AB, {"a": math.inf})
 
 
+def test_only_what_each_run_has_for_itself_is_called_by_its_name_alone():
+    named = [tc.Parameter("k[1]"), tc.Parameter("c")]
+    with pytest.raises(EmbeddingError, match=r"Got \['k'\]"):
+        free_parameters(named, {"k": 7.0})
+    assert free_parameters(named, {"k[1]": 7.0})[1] == {"k[1]": 7.0}
+    _, held = free_parameters([tc.Parameter("k"), *named], {"k": 7.0})
+    assert held == {"k": 7.0}
+    runs = [tc.Run([0.0, 1.0, 2.0], outputs={"z": [1.0, 0.6, 0.4]}) for _ in range(2)]
+    model = tc.ODESimulator(lambda t, s, p, u: {"z": -p["k"] * s["z"]}, ["z"], [tc.Parameter("k", per_run=True)])
+    bound = model.bind(tc.Recording(runs=runs)).parameters
+    assert free_parameters(bound, {"k": 2.0, "z(0)[1]": 1.0})[1] == {"k[0]": 2.0, "k[1]": 2.0, "z(0)[1]": 1.0}
+    assert free_parameters(bound, {"z(0)": 1.0})[1] == {"z(0)[0]": 1.0, "z(0)[1]": 1.0}
+
+
 # --- scaling --------------------------------------------------------------------------------------
 
 SCALED = [

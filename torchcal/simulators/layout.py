@@ -110,7 +110,8 @@ class Layout:
                     self.initial_names.append(name)
                     self.origins.append((initial_name(state, 0, 1), r))
                     seen = [one for one in recording.outputs if ode.reads.get(one) == state]
-                    parameters.append(Parameter(name, unit=unit, initial=_first_seen(run, seen)))
+                    guess = _first_seen(run, seen)
+                    parameters.append(Parameter(name, unit=unit, initial=guess, per_run=len(runs) > 1))
             self._initial.append(known)
         self.parameters = tuple(parameters)
 

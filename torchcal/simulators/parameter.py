@@ -146,6 +146,11 @@ def limits(parameters: Sequence[Parameter]) -> tuple[Tensor, Tensor]:
     return torch.tensor(low, dtype=torch.float64), torch.tensor(high, dtype=torch.float64)
 
 
+def _is_called(parameter: Parameter, name: str) -> bool:
+    """Whether it has the name, or is one run's value of a parameter that has; another's name may only look so."""
+    return parameter.name == name or (parameter.per_run and is_value_of(parameter.name, name))
+
+
 def free_parameters(
     parameters: Sequence[Parameter], fixed: Mapping[str, float] | None = None, *, least: int = 1
 ) -> tuple[tuple[Parameter, ...], dict[str, float]]:
@@ -168,12 +173,13 @@ def free_parameters(
         raise DomainError(f"Expected fixed as a dict from parameter names to values. Got {fixed!r}.")
     fixed = dict(fixed or {})
     names = [parameter.name for parameter in parameters]
-    unknown = sorted(name for name in fixed if not any(is_value_of(one, name) for one in names))
+    called = {name: [q.name for q in parameters if _is_called(q, name)] for name in fixed}
+    unknown = sorted(name for name, found in called.items() if not found)
     if unknown:
         raise EmbeddingError(f"Expected fixed parameters among {names}. Got {unknown}. Check the spelling.")
     held: dict[str, float] = {}
     named_last = sorted(fixed.items(), key=lambda item: item[0] in names)
-    each = {one: value for name, value in named_last for one in names if is_value_of(one, name)}
+    each = {one: value for name, value in named_last for one in called[name]}
     for name, value in each.items():
         try:
             number = float(value)
