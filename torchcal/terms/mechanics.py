@@ -5,6 +5,7 @@ from typing import Any
 
 import torch
 
+from torchcal.errors import DomainError
 from torchcal.simulators import Parameter
 from torchcal.terms.pieces import (
     Quantity,
@@ -53,9 +54,10 @@ def mechanics(
     Args:
         position: State of the position, or names of its components.
         velocity: State of the velocity, or names of its components.
-        force: Input that drives the body: adds errors of its gain and its lag.
+        force: Input that drives the body: adds errors of its gain and its lag. One degree of freedom alone.
         stiffness: What multiplies −position in a model made for small angles, name of a parameter or function
-            ``f(p)``: the large-angle term is then its exact completion, with a fraction that is 1 in nature.
+            ``f(p)``: the large-angle term is then its exact completion, with a fraction that is 1 in nature. One
+            degree of freedom alone, and not with ``angle=False``.
         angle: Whether the position may be an angle in rad; otherwise there is no large-angle term.
         label: Added to the names of the terms, where several bodies need them.
         length: Unit of the position, for reports.
@@ -65,7 +67,8 @@ def mechanics(
         The terms, with SI units unless ``length`` and ``time`` say otherwise.
 
     Raises:
-        DomainError: If a name is empty, or positions and velocities do not match.
+        DomainError: If a name is empty, positions and velocities do not match, or ``force`` or ``stiffness`` is given
+            where there is no term for it.
 
     Source: B. Armstrong-Hélouvry, P. Dupont & C. Canudas de Wit (1994), Automatica 30, 1083-1138 (friction).
 
@@ -75,8 +78,19 @@ def mechanics(
     units = Units(length, time)
     if not (isinstance(position, str) and isinstance(velocity, str)):
         positions = check_names(position, "positions", (2, 3))
+        for name, value in (("force", force), ("stiffness", stiffness)):
+            if value is not None:
+                raise DomainError(
+                    f"Expected {name}= with one position alone. Got {value!r} with {list(positions)} (leave it out; "
+                    "errors of a drive in a plane or in space are terms of your own)."
+                )
         return _in_space(positions, check_names(velocity, "velocities", (len(positions),)), units, label)
     x, v = check_name(position, "position"), check_name(velocity, "velocity")
+    if stiffness is not None and not angle:
+        raise DomainError(
+            f"Expected stiffness= with a position that may be an angle, for the large-angle term. Got {stiffness!r} "
+            "with angle=False (leave one of the two out)."
+        )
     terms: list[Term] = []
     add = adder(terms, v, label)
 
