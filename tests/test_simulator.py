@@ -209,6 +209,17 @@ def test_a_result_of_the_wrong_kind_is_named(function, message):
         tc.Simulator(function, AB).at(X)(values(3, 2))
 
 
+def test_names_that_can_be_gone_through_but_once_are_kept():
+    both = tc.Simulator(lambda x, p: {"u": p["a"] * x, "v": p["a"]}, iter([tc.Parameter("a", low=0, high=1)]))
+    evaluate = both.at(torch.zeros(3, dtype=torch.float64), iter(["v"]))
+    for _ in range(2):
+        assert evaluate(torch.ones(1, dtype=torch.float64)).tolist() == [1.0, 1.0, 1.0]
+    assert tc.build_surrogate(both, conditions=(0, 1), order=1, outputs=iter(["v"])).outputs == ("v",)
+    rates = lambda t, s, p, u: {"x": -p["k"] * s["x"], "z": s["x"]}  # noqa: E731
+    model = tc.ODESimulator(rates, iter(["x", "z"]), iter([tc.Parameter("k")]), observe=iter(["z"]))
+    assert (list(model.states), model.names, model.outputs) == (["x", "z"], ("k",), ("z",))
+
+
 def test_a_missing_output_is_named():
     with pytest.raises(SimulatorError, match=r"\['y'\] missing"):
         tc.Simulator(lambda x, p: {"z": p["a"] * x}, AB).at(X, ["y"])(values(2, 2))

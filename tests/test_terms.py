@@ -417,6 +417,17 @@ def test_terms_that_do_not_fit_a_static_simulator() -> None:
         wrong.at(X)(tensor(1.0, 1.0, 0.0))
 
 
+def test_what_can_be_gone_through_but_once_is_kept() -> None:
+    drag = tc.Term("n", equation="v", rate=RATE, parameters=iter(A))
+    assert [q.name for q in drag.parameters] == ["a"]
+    with pytest.raises(DomainError, match=r"Expected parameters=\[Parameter"):
+        tc.Term("n", equation="v", rate=RATE, parameters=iter([]))
+    with pytest.raises(DomainError, match="to do something"):
+        tc.Term("n", frees=iter(()))
+    for simulator in (body(), body().bind(recording())):
+        assert "n.a" in extend(simulator, iter([drag])).names
+
+
 def test_the_same_term_twice_is_refused() -> None:
     term = BY_HAND["rate"][0]
     with pytest.raises(DomainError, match=r"drag.d.*more than once"):

@@ -95,6 +95,7 @@ def build_surrogate(
     0.250000
     """
     parameters = _choose_parameters(simulator, parameters)
+    outputs = None if outputs is None else tuple(outputs)
     names, bounds = check_box(conditions, parameters)
     dim = len(bounds) + len(parameters)
     order = whole("order", order, 1)
@@ -132,12 +133,12 @@ def build_surrogate(
         model = _TorchModel(simulator, names, parameters, outputs)  # type: ignore[arg-type]
         on_grid, held_out = model.grid(x_nodes, p_nodes), model.pairs(x_random, p_random)
         found = model.outputs
-    if found is None and outputs is not None and tuple(outputs) != ("y",):  # which is what it is called elsewhere
+    if found is None and outputs is not None and outputs != ("y",):  # which is what it is called elsewhere
         raise SimulatorError(
             f"Expected outputs {list(outputs)}. Got one without a name. Return a dict of them, or leave outputs= out."
         )
     if found is not None:
-        kept = found if outputs is None else tuple(outputs)
+        kept = found if outputs is None else outputs
         missing = [name for name in kept if name not in found]
         if missing:
             raise SimulatorError(f"Expected outputs {list(kept)}. Got {list(found)}: {missing} missing.")

@@ -61,6 +61,8 @@ class ODESimulator(Simulator):
     ) -> None:
         if not callable(rates):
             raise DomainError(f"Expected rates as a function f(t, s, p, u). Got {type(rates).__name__}.")
+        if not isinstance(states, str | Mapping):
+            states = tuple(states)
         if isinstance(states, str) or not states or any(not isinstance(name, str) or not name for name in states):
             raise DomainError(f"Expected states as a dict from names to units. Got {states!r}.")
         if len(set(states)) < len(states):
@@ -101,6 +103,7 @@ class ODESimulator(Simulator):
             if not observe or not all(callable(function) for function in observe.values()):
                 raise DomainError("Expected observe as {output: function(t, s, p, u)}. Got something else in it.")
             return dict(observe)
+        observe = tuple(observe)
         if unknown := [name for name in observe if name not in self.states]:
             raise DomainError(f"Expected observed states among {list(self.states)}. Got {unknown}.")
         if not observe:

@@ -137,6 +137,7 @@ class Simulator:
             ``(*batch, n_outputs * n)`` with one output after another.
         """
         n = _length(x)
+        outputs = None if outputs is None else tuple(outputs)
         # A copy: whatever the function does, the recording stays as it is.
         x = {name: _copied(value) for name, value in x.items()} if isinstance(x, Mapping) else _copied(x)
 

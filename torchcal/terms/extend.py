@@ -30,6 +30,7 @@ def extend(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
     Raises:
         DomainError: If a term names an equation, output or parameter that the simulator does not have.
     """
+    terms = tuple(terms)
     if isinstance(simulator, Trajectories):
         ode = _extend_ode(simulator.ode, terms)
         return Trajectories(ode, simulator.recording, subdivide=simulator.subdivide, denser=simulator.denser,

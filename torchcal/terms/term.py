@@ -141,8 +141,7 @@ class Term:
             if equation in every:
                 raise DomainError(f"Expected one rate for {equation!r} in the term {name!r}. Got two.")
             every[equation] = rate
-        if isinstance(frees, str):
-            frees = (frees,)
+        frees = (frees,) if isinstance(frees, str) else tuple(frees)
         parts = [*every.values(), *(outputs or {}).values(), *(shifts or {}).values()]
         if not parts and not frees:
             raise DomainError(
@@ -155,6 +154,7 @@ class Term:
                 f"Expected a list of parameters of the term {name!r}. Got one, {parameters!r} (write "
                 "parameters=[Parameter(...)])."
             )
+        parameters = tuple(parameters)  # what can be gone through but once is kept
         if parts and not parameters:
             raise DomainError(
                 f"Expected parameters=[Parameter(...)] for the term {name!r}. Got none, so that nothing could be "
@@ -201,8 +201,8 @@ class Term:
         put(self, "initial", {state: (initial or {}).get(state, 0.0) for state in states or {}})
         put(self, "outputs", dict(outputs or {}))
         put(self, "shifts", dict(shifts or {}))
-        put(self, "frees", tuple(frees))
-        put(self, "parameters", tuple(parameters))
+        put(self, "frees", frees)
+        put(self, "parameters", parameters)
         put(self, "formula", formula)
         put(self, "description", description)
         put(self, "scales", dict(scales or {}))
