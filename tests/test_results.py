@@ -683,6 +683,17 @@ def test_names_of_the_files_own_dimensions_are_taken(name, tmp_path):
     same(Calibration.load(tmp_path / "result.nc").recording, result.recording)
 
 
+@pytest.mark.parametrize(("condition", "output"), [("x", "."), (".", "y")])
+def test_a_name_of_a_dot_is_taken(condition, output, tmp_path):
+    simulator = tc.Simulator(
+        lambda x, p: {output: p["a"] * x[condition], "|": p["a"] + x[condition]}, [tc.Parameter("a")]
+    )
+    data = tc.Recording(x={condition: T}, y={output: T + 1, "|": T**2})
+    result = quietly(tc.calibrate, simulator, data, num_samples=0, num_starts=4)
+    result.save(tmp_path / "result.nc")
+    same(Calibration.load(tmp_path / "result.nc").recording, result.recording)
+
+
 def test_names_with_a_slash_are_taken(tmp_path):
     simulator = tc.Simulator(lambda x, p: {"p/q": p["a/b"] * x["m/s"], "r": p["a/b"] + x["m/s"]}, [tc.Parameter("a/b")])
     data = tc.Recording(x={"m/s": T}, y={"p/q": T + 1, "r": T**2})

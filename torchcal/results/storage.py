@@ -162,7 +162,7 @@ def _named_dataset(dimension: str, values: Mapping[str, Tensor]) -> Any:
     """A dataset of variables with a user's names, changed where a file cannot have them."""
     variables: dict[str, Any] = {}
     for name, value in values.items():
-        key = name.replace("/", "|")
+        key = "|" if name == "." else name.replace("/", "|")  # "." is HDF5's name of the group itself
         while key == dimension or key in variables or (key != name and key in values):
             key += "_"
         variables[key] = (dimension, value.numpy(), {} if key == name else {NAME: name})
