@@ -539,6 +539,17 @@ def test_from_csv_with_a_delimiter_at_the_end_of_each_line(tmp_path):
     assert (recording.x.tolist(), recording.y.tolist()) == ([1, 3], [2, 4])
 
 
+def test_from_csv_with_two_columns_of_one_name(tmp_path):
+    pytest.importorskip("pandas")
+    path = tmp_path / "twice.csv"
+    path.write_text("a, b, c, b, c.1\n1, 2, 3, 4, 5\n2, 3, 4, 5, 6\n")
+    for x, y in (("a", ["c", "b"]), (["b"], "a")):
+        with pytest.raises(RecordingError, match=r"one column 'b' in .*twice\.csv\. Got 2 of that name"):
+            Recording.from_csv(path, x=x, y=y)
+    recording = Recording.from_csv(path, x="a", y=["c", "c.1"])
+    assert recording.y.tolist() == [3, 4, 5, 6]
+
+
 def test_from_csv_without_pandas(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(MissingDependencyError, match="pip install pandas"):

@@ -29,8 +29,8 @@ def check_columns(frame: Any, names: Sequence[str], instead: str) -> None:
             raise RecordingError(f"Expected each column once. Got {name!r} twice (leave one out).")
 
 
-def read_csv(path: str | os.PathLike[str]) -> Any:
-    """A CSV file with a header line as a pandas DataFrame; a file that is not a table is an error."""
+def read_csv(path: str | os.PathLike[str], names: Sequence[str]) -> Any:
+    """A CSV file with a header line as a pandas DataFrame; one that is no table, or has a name twice, is an error."""
     try:
         import pandas
     except ImportError as error:
@@ -41,9 +41,21 @@ def read_csv(path: str | os.PathLike[str]) -> Any:
         with warnings.catch_warnings():
             # Lines longer than the header: by default pandas shifts every column by one, without a word.
             warnings.simplefilter("error", pandas.errors.ParserWarning)
-            return pandas.read_csv(path, skipinitialspace=True, index_col=False)
+            frame = pandas.read_csv(path, skipinitialspace=True, index_col=False)
+            suspects = [name for name in names if f"{name}.1" in frame.columns]  # what pandas makes of a second one
+            if not suspects:
+                return frame
+            options = {"header": None, "nrows": 1, "dtype": str, "keep_default_na": False}
+            header = list(pandas.read_csv(path, skipinitialspace=True, index_col=False, **options).iloc[0])
     except (ValueError, pandas.errors.ParserWarning) as error:
         raise RecordingError(
             f"Expected a CSV file with a header line in {os.fspath(path)}. Got: {error} "
             "(read it with pandas.read_csv and its options, then use Recording.from_frame)."
         ) from error
+    for name in suspects:
+        if header.count(name) > 1:
+            raise RecordingError(
+                f"Expected one column {name!r} in {os.fspath(path)}. Got {header.count(name)} of that name (rename "
+                "them in the file)."
+            )
+    return frame

@@ -390,9 +390,9 @@ class Recording:
 
         Raises:
             MissingDependencyError: If pandas is not installed.
-            RecordingError: If the file is not a table, or as `from_frame`.
+            RecordingError: If the file is not a table or names one of the columns twice, or as `from_frame`.
         """
-        return cls.from_frame(read_csv(path), x, y, **options)
+        return cls.from_frame(read_csv(path, [*column_names(x), *column_names(y)]), x, y, **options)
 
     def __repr__(self) -> str:
         lost = int((~self.observed).sum())
