@@ -229,6 +229,14 @@ def test_parameters_with_bounds_initial_or_logarithm_get_their_own_step():
     np.testing.assert_allclose(widest, [0.05, 1e-10, 1e-4, 1e-13], rtol=1e-9)
 
 
+def test_an_initial_value_gives_a_tiny_parameter_its_scale():
+    value = 3e-7
+    wave = ExternalSimulator(lambda x, p: math.sin(1e6 * p["a"] * x), [Parameter("a", initial=value)])
+    leaf = torch.tensor([value], dtype=torch.float64, requires_grad=True)
+    wave.at(torch.ones(1, dtype=torch.float64))(leaf).sum().backward()
+    assert float(leaf.grad) == pytest.approx(1e6 * math.cos(1e6 * value), rel=1e-6)
+
+
 # --- executors -----------------------------------------------------------------------------------------
 
 

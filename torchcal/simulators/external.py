@@ -27,11 +27,12 @@ class ExternalSimulator(Simulator):
     .. math:: \frac{\partial f}{\partial \lambda_j} \approx
         \frac{f(\lambda + h_j e_j) - f(\lambda - h_j e_j)}{2 h_j}, \qquad h_j = \mathtt{step} \cdot s_j
 
-    with :math:`s_j` half the parameter's range where it has two bounds, otherwise the largest of
-    :math:`|\lambda_j|` and ``|initial|`` (1 where there is neither), and :math:`|\lambda_j|` on a logarithmic
-    scale. The points lie up to a step outside the bounds; where one side has no answer, the other and the middle give
-    the slope. A gradient costs 2d evaluations for each row of parameter
-    values, and is computed only where it is asked for.
+    with :math:`s_j` half the parameter's range where it has two bounds, :math:`|\lambda_j|` on a logarithmic scale,
+    and otherwise the largest of :math:`|\lambda_j|` and ``|initial|``, or 1 where both are 0. A parameter that has
+    neither a bound nor ``initial`` may cross 0, beside which :math:`|\lambda_j|` is no scale: :math:`s_j` is then at
+    least 1. Give ``initial``, or bounds, where a parameter is far smaller than 1. The points lie up to a step outside
+    the bounds; where one side has no answer, the other and the middle give the slope. A gradient costs 2d evaluations
+    for each row of parameter values, and is computed only where it is asked for.
 
     Args:
         function: ``function(x, p)`` with ``p`` a dict of floats. ``x`` is a float, or a dict of them where the
