@@ -4,7 +4,7 @@ Newton's law says that water loses heat in proportion to its excess over the sur
 
 .. math:: \frac{dT}{dt} = -k (T - T_a).
 
-Hot water also evaporates, at a rate that follows its vapour pressure: forty times more at 95 °C than at 21 °C. The
+Hot water also evaporates, at a rate that follows its vapour pressure: 34 times as much at 95 °C as at 21 °C. The
 recording is of a real mug, and calibration hides what is missing: with k, the room's temperature and the first
 temperature free, Newton's law errs by 1.48 °C, against steps of 0.1 °C, and only after it has made the room 27 °C
 warm (33 °C, calibrated to the first two hours alone). With evaporation 0.09 °C is left, in a room that is a little
