@@ -14,11 +14,6 @@ def _root(h):  # type: ignore[no-untyped-def]
     return h / np.sqrt(np.sqrt(h**2 + 1e-8))
 
 
-def _above(z, threshold, width):  # type: ignore[no-untyped-def]
-    z = (z - threshold) / width
-    return width * (np.maximum(z, 0) + np.log1p(np.exp(-abs(z))))
-
-
 def _draw_tank(rng: Rng) -> Setting:
     runs = []
     for _ in range(int(rng.integers(1, 3))):

@@ -8,7 +8,6 @@ from benchmarks.concealed.families.inputs import sines, steps, times
 
 Rng = np.random.Generator
 ZERO = 273.15
-SIGMA = 5.670374419e-8
 
 
 def vapour(celsius):  # type: ignore[no-untyped-def]
