@@ -612,7 +612,6 @@ def test_a_distant_third_body_is_a_tide():
         (lambda: mechanics(force=""), "force"),
         (lambda: mechanics(*PLANE, force="F"), "force= with one position"),
         (lambda: mechanics(*SPACE, stiffness="k"), "stiffness= with one position"),
-        (lambda: mechanics(stiffness="k", angle=False), "with angle=False"),
         (lambda: mechanics(stiffness=""), "stiffness"),
         (lambda: mechanics(label=""), "label"),
         (lambda: mechanics(length=""), "length"),

@@ -57,7 +57,7 @@ def mechanics(
         force: Input that drives the body: adds errors of its gain and its lag. One degree of freedom alone.
         stiffness: What multiplies −position in a model made for small angles, name of a parameter or function
             ``f(p)``: the large-angle term is then its exact completion, with a fraction that is 1 in nature. One
-            degree of freedom alone, and not with ``angle=False``.
+            degree of freedom alone.
         angle: Whether the position may be an angle in rad; otherwise there is no large-angle term.
         label: Added to the names of the terms, where several bodies need them.
         length: Unit of the position, for reports.
@@ -68,7 +68,7 @@ def mechanics(
 
     Raises:
         DomainError: If a name is empty, positions and velocities do not match, or ``force`` or ``stiffness`` is given
-            where there is no term for it.
+            with several.
 
     Source: B. Armstrong-Hélouvry, P. Dupont & C. Canudas de Wit (1994), Automatica 30, 1083-1138 (friction).
 
@@ -86,11 +86,6 @@ def mechanics(
                 )
         return _in_space(positions, check_names(velocity, "velocities", (len(positions),)), units, label)
     x, v = check_name(position, "position"), check_name(velocity, "velocity")
-    if stiffness is not None and not angle:
-        raise DomainError(
-            f"Expected stiffness= with a position that may be an angle, for the large-angle term. Got {stiffness!r} "
-            "with angle=False (leave one of the two out)."
-        )
     terms: list[Term] = []
     add = adder(terms, v, label)
 
