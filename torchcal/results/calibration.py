@@ -69,18 +69,13 @@ class Calibration(Result):
         Args:
             x: Conditions, ``(n,)`` or a dict of them, arrays of any kind; the data's by default. In time: other times
                 ``{"time": (n,), "run": (n,)}`` of the recording's runs; or other runs, as a recording in time, a
-                `Run` or a list of them, with every initial state given and outputs that are not looked at.
+                `Run` or a list of them, with every initial state given.
             function: ``function(x, p)`` of the same parameters, for another quantity of interest; its conditions
                 may have other names than the data's.
             max_draws: At most this many draws, evenly spaced, are averaged over.
         """
-        if self.propagate is None:
-            if x is None and function is None and self.stored is not None:
-                return self.stored
-            raise DomainError(
-                "Expected a simulator to predict with. Got a calibration that was loaded without one. Use "
-                "Calibration.load(path, simulator=...)."
-            )
+        if self.propagate is None and x is None and function is None and self.stored is not None:
+            return self.stored
         with warned_once():
             propagate = self.propagation_at(x, function=function)
             return embedded_prediction(propagate, self.map.alpha, thin(self.draws, max_draws))

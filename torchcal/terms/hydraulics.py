@@ -11,6 +11,7 @@ from torchcal.terms.pieces import (
     amplitude,
     check_name,
     excess,
+    lagging,
     own_name,
     quantity,
     shape,
@@ -99,8 +100,6 @@ def _second(h: str, label: str | None, units: Units) -> Term:
 
 def _inflow(inflow: str, h: str, downstream: str | None, label: str | None, units: Units) -> list[Term]:
     unit = f"{units.length}/({units.time} [{inflow}])"
-    lag = titled("pump lag", label)
-    hidden = f"{lag}: {inflow}"
     rates: dict[str, Callable[..., Any]] = {h: lambda t, s, p, u: -p["b"] * u[inflow]}
     formula = f"d{h}/dt ∋ -b {inflow}"
     if downstream is not None:
@@ -114,13 +113,8 @@ def _inflow(inflow: str, h: str, downstream: str | None, label: str | None, unit
              parameters=[amplitude("g", unit, low=0.0), shape("u0", f"[{inflow}]")], scales={"u0": inflow},
              formula=f"d{h}/dt ∋ -g max({inflow} - u0, 0)",
              description="Beyond u0 the pump delivers less than it is asked for."),
-        Term(lag,
-             rates={h: lambda t, s, p, u: p["g"] * (s[hidden] - u[inflow]),
-                    hidden: lambda t, s, p, u: (u[inflow] - s[hidden]) / p["tau"]},
-             states={hidden: f"[{inflow}]"}, initial={hidden: 0.0},
-             parameters=[amplitude("g", unit, low=0.0), shape("tau", units.time)], scales={"tau": "t"}, takes=inflow,
-             formula=f"d{h}/dt ∋ g (z - {inflow}), dz/dt = ({inflow} - z)/tau, z(0) = 0",
-             description="The pump follows its command only after a time tau."),
+        lagging(titled("pump lag", label), h, inflow, unit, units.time,
+                "The pump follows its command only after a time tau."),
     ]  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from torchcal.terms.pieces import (
     check_name,
     check_names,
     excess,
+    lagging,
     magnitude,
     own_name,
     quantity,
@@ -163,20 +164,13 @@ def _viscoelastic(v: str, label: str | None, units: Units) -> Term:
 
 
 def _actuator(force: str, v: str, label: str | None, units: Units) -> list[Term]:
-    lag = titled("actuator lag", label)
-    hidden = f"{lag}: {force}"
     unit = f"{units.length}/({units.time}^2 [{force}])"
     return [
         Term(titled("actuator gain error", label), equation=v, rate=lambda t, s, p, u: p["g"] * u[force],
              parameters=[amplitude("g", unit)], formula=f"d{v}/dt ∋ g {force}",
              description="The drive acts more or less strongly than the model says."),
-        Term(lag,
-             rates={v: lambda t, s, p, u: p["g"] * (s[hidden] - u[force]),
-                    hidden: lambda t, s, p, u: (u[force] - s[hidden]) / p["tau"]},
-             states={hidden: f"[{force}]"}, initial={hidden: 0.0},
-             parameters=[amplitude("g", unit, low=0.0), shape("tau", units(0, -1))], scales={"tau": "t"}, takes=force,
-             formula=f"d{v}/dt ∋ g (z - {force}), dz/dt = ({force} - z)/tau, z(0) = 0",
-             description="The drive's force follows its command only after a time tau."),
+        lagging(titled("actuator lag", label), v, force, unit, units.time,
+                "The drive's force follows its command only after a time tau."),
     ]  # fmt: skip
 
 

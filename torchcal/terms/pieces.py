@@ -21,6 +21,7 @@ __all__ = [
     "check_names",
     "check_positive",
     "excess",
+    "lagging",
     "magnitude",
     "own_name",
     "quantity",
@@ -67,6 +68,34 @@ def adder(terms: list[Term], equation: str, label: str | None) -> Callable[..., 
         )  # fmt: skip
 
     return add
+
+
+def lagging(name: str, equation: str, drive: str, unit: str, time: str, description: str) -> Term:
+    """What an input drives follows it only after a time.
+
+    Args:
+        name: Of the term.
+        equation: State whose rate the input drives.
+        drive: The input.
+        unit: Of the rate that an input of 1 drives.
+        time: Unit of time.
+        description: Of the term.
+    """
+    hidden = f"{name}: {drive}"
+    return Term(
+        name,
+        rates={
+            equation: lambda t, s, p, u: p["g"] * (s[hidden] - u[drive]),
+            hidden: lambda t, s, p, u: (u[drive] - s[hidden]) / p["tau"],
+        },
+        states={hidden: f"[{drive}]"},
+        initial={hidden: 0.0},
+        parameters=[amplitude("g", unit, low=0.0), shape("tau", time)],
+        scales={"tau": "t"},
+        takes=drive,
+        formula=f"d{equation}/dt ∋ g (z - {drive}), dz/dt = ({drive} - z)/tau, z(0) = 0",
+        description=description,
+    )
 
 
 def check_name(value: Any, what: str) -> str:

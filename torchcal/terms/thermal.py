@@ -12,6 +12,7 @@ from torchcal.terms.pieces import (
     amplitude,
     check_name,
     check_positive,
+    lagging,
     own_name,
     quantity,
     shape,
@@ -183,18 +184,11 @@ def _second(T: str, ambient: float | str, label: str | None, time: str, unit: st
 
 
 def _heater(heater: str, T: str, label: str | None, time: str) -> list[Term]:
-    lag = titled("heater lag", label)
-    hidden = f"{lag}: {heater}"
     unit = f"K/({time} [{heater}])"
     return [
         Term(titled("heater gain error", label), equation=T, rate=lambda t, s, p, u: p["g"] * u[heater],
              parameters=[amplitude("g", unit)], formula=f"d{T}/dt ∋ g {heater}",
              description="The heater delivers more or less than the model says."),
-        Term(lag,
-             rates={T: lambda t, s, p, u: p["g"] * (s[hidden] - u[heater]),
-                    hidden: lambda t, s, p, u: (u[heater] - s[hidden]) / p["tau"]},
-             states={hidden: f"[{heater}]"}, initial={hidden: 0.0},
-             parameters=[amplitude("g", unit, low=0.0), shape("tau", time)], scales={"tau": "t"}, takes=heater,
-             formula=f"d{T}/dt ∋ g (z - {heater}), dz/dt = ({heater} - z)/tau, z(0) = 0",
-             description="The heater's own heat capacity delays its effect by a time tau."),
+        lagging(titled("heater lag", label), T, heater, unit, time,
+                "The heater's own heat capacity delays its effect by a time tau."),
     ]  # fmt: skip
