@@ -1,5 +1,6 @@
 """What looks like missing physics and is none, and names that stand in for what is in no list."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,7 +9,9 @@ import torch
 from scipy.integrate import solve_ivp
 
 import torchcal as tc
+from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.verdicts import verdict
+from torchcal.discovery.verdicts.doubts import _shared
 from torchcal.display import NONE
 
 F64 = torch.float64
@@ -440,3 +443,57 @@ def test_two_outputs_share_what_was_fitted_to_their_replicates():
         d = diagnose(base, tc.Recording(x=x, y={**y, "u": y["u"] + 2 * wave(x, 4)}), [term])
         assert d.terms == ["fourth"]
         assert not any("preparation" in row for row in d.symptoms)
+
+
+def exchanger(seed, truth):
+    """Heat and effectiveness of a counter-flow exchanger on a grid of two flows, with noise of unknown size."""
+    hot, cold = (v.ravel() for v in np.meshgrid(np.linspace(0.2, 1.2, 6), np.linspace(0.2, 1.2, 5), indexing="ij"))
+
+    def outputs(x, UA, exp):
+        first, second = 4.18 * x["hot"], 4.17 * x["cold"]
+        e = exp(-UA * (1 / first - 1 / second))
+        effectiveness = (1 - e) / (1 - first / second * e)
+        return {"Q": effectiveness * first * 60e3, "eff": effectiveness}
+
+    base = tc.Simulator(lambda x, p: outputs(x, p["UA"], torch.exp), [tc.Parameter("UA", low=0.0, initial=1.0)])
+
+    def grows(flow):
+        return tc.Term(
+            f"grows with {flow}", shifts={"UA": lambda x, p: p["UA"] * ((x[flow] / 0.6) ** p["n"] - 1)},
+            parameters=[tc.Parameter("n")],
+        )  # fmt: skip
+
+    rng, x = np.random.default_rng(seed), {"hot": hot, "cold": cold}
+    y = outputs(x, truth(hot, cold), np.exp)
+    y = {name: y[name] + sd * rng.standard_normal(30) for name, sd in (("Q", 710.0), ("eff", 0.0142))}
+    return base, tc.Recording(x=x, y=y), [grows("hot"), grows("cold")]
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)])
+def test_what_is_left_of_two_outputs_alike_is_no_noise_of_theirs(seed):
+    # A switch that is in no list was two smooth dependences, and the rest noise three times as large as it was.
+    d = diagnose(*exchanger(seed, lambda hot, cold: 1.8 - 0.3 / (1 + np.exp((hot * cold - 0.5) / 0.02))))
+    assert d.verdict in ("ambiguous", "unexplained")
+    assert d.verdict == "unexplained" or ["none of these"] in d.tied
+    assert "goes with what it leaves of another" in " ".join(str(d).split())
+
+
+def test_outputs_with_noise_of_their_own_share_nothing():
+    d = diagnose(*exchanger(0, lambda hot, cold: 1.6 * (hot / 0.6) ** 0.3))
+    assert d.verdict == "named"
+    assert d.terms == ["grows with hot"]
+    p = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        base, recording, _ = exchanger(seed, lambda hot, cold: 1.6 + 0 * hot)
+        problem = Problem.of(base, recording)
+        e = torch.as_tensor(rng.standard_normal(60))
+        slopes = torch.as_tensor(rng.standard_normal((60, 4)))
+        slopes[30:] += slopes[:30]  # what is fitted acts on both
+        left = e - slopes @ torch.linalg.lstsq(slopes, e[:, None]).solution[:, 0]
+        p.append(_shared(problem, left * torch.tensor([3.0, 0.5]).repeat_interleave(30), slopes))
+    # Uniform: the number below a tenth is within four of its sd.
+    assert abs(sum(one < 0.1 for one in p) - 20) < 4 * math.sqrt(18)
+    common = left + 2 * torch.as_tensor(rng.standard_normal(30)).repeat(2)
+    assert _shared(problem, common, slopes) < 1e-4
+    assert _shared(problem, common[:30].repeat(2), slopes[:, :0]) < 1e-4

@@ -1,6 +1,7 @@
 """Why the best explanation of a recording may be no name, however probable it is."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 
@@ -21,7 +22,7 @@ from torchcal.errors import TorchcalError
 from torchcal.simulators import Trajectories
 from torchcal.terms import Term
 
-__all__ = ["by_hold", "distinct", "doubt", "left_open", "unfit"]
+__all__ = ["by_hold", "distinct", "doubt", "in_common", "left_open", "unfit"]
 
 #: Correlation from sample to sample from which on noise of unknown size may be physics that a term has left.
 SLOWEST = 0.85
@@ -30,6 +31,10 @@ SLOWEST = 0.85
 EVEN, MANY = 0.55, 30
 #: Correlation along the rows of a grid, in sd, from which on what is left may be noise in the order of the recording.
 ALONG = 3.3
+#: Probability by chance of the correlation of what is left of two outputs, of all pairs of them, below which it may be
+#: physics that acts on both, though noise of unknown size was taken to be as large; and data to spare of each, from
+#: which on that can be told.
+IN_COMMON, FEW = 0.01, 8
 #: Distance of a term's amplitudes from neutral, in their joint sd, up to which the data leave them open.
 OPEN = 0.1
 #: The same of a term that acts in a window, where most terms can do what a few data want, of one of several, which may
@@ -52,7 +57,7 @@ UNSEEN = 1e-7
 def doubt(search: Search, model: Model) -> str:
     """Why a model is no name, however probable, in a sentence; empty if it may be one."""
     found = _no_better(search, model) or unfit(search, model) or by_hold(search, model) or only_together(search, model)
-    return found or ("" if search.exact else _noise_or_physics(search, model))
+    return found or ("" if search.exact else _noise_or_physics(search, model) or in_common(search, model))
 
 
 def unfit(search: Search, model: Model) -> str:
@@ -269,6 +274,52 @@ def _noise_or_physics(search: Search, model: Model) -> str:
 def _evenness(e: Tensor) -> float:
     """Robust over plain sd."""
     return 1.4826 * float(e.abs().median()) / max(float(e.square().mean().sqrt()), 1e-300)
+
+
+def in_common(search: Search, model: Model) -> str:
+    """Whether what a model leaves of one output goes with what it leaves of another, in a sentence; empty if not."""
+    noise, problem = beside(search, model), model.found.problem
+    white = noise.whitening(problem)
+    if not noise.open or _shared(problem, white.vector(model.found.residual), white(model.found.jacobian)) >= IN_COMMON:
+        return ""
+    return (
+        "What it leaves of one output goes with what it leaves of another, as physics that acts on both would, or "
+        "noise that they share: a known noise sd or replicates would tell."
+    )
+
+
+def _shared(problem: Problem, e: Tensor, jacobian: Tensor) -> float:
+    """Probability by chance of the largest correlation of two outputs' residuals at the same conditions; 1 of one
+    output.
+
+    Residuals of a fit are e = (I − H) ε, whose products have the mean tr(M (I − H)) and the variance
+    2 tr((M (I − H))²), M picking pairs of data (half of each twice).
+    """
+    outputs = problem.output_of.unique().tolist()
+    q = torch.linalg.svd(jacobian / jacobian.norm(dim=0).clamp_min(1e-300), full_matrices=False)
+    q = q.U[:, q.S > UNSEEN * q.S.max()] if len(q.S) else q.U
+    place = torch.full((problem.recording.n, len(outputs)), -1)
+    for k, output in enumerate(outputs):
+        mine = (problem.output_of == output).nonzero()[:, 0]
+        place[problem.condition_of[mine], k] = mine
+    worst, pairs = 1.0, math.comb(len(outputs), 2)
+    for a, b in itertools.combinations(range(len(outputs)), 2):
+        both = place[(place[:, a] >= 0) & (place[:, b] >= 0)][:, [a, b]]
+        one, other = both.unbind(1)
+        left = [len(rows) - float(q[rows].square().sum()) for rows in (one, other)]
+        if min(left) < FEW:
+            continue
+        sizes = [float(e[rows].square().sum()) / freedom for rows, freedom in zip((one, other), left, strict=True)]
+        if min(sizes) <= 0.0:
+            continue
+        product = float(e[one] @ e[other]) / math.sqrt(sizes[0] * sizes[1])
+        cross = q[one].T @ q[other]
+        mean = -float(cross.trace())
+        twice = 0.5 * (cross + cross.T)
+        spread = len(both) - float(q[one].square().sum() + q[other].square().sum()) + 2.0 * float(twice.square().sum())
+        z = abs(product - mean) / math.sqrt(max(spread, 1.0))
+        worst = min(worst, pairs * math.erfc(z / math.sqrt(2.0)))
+    return worst
 
 
 def _along_rows(problem: Problem, e: Tensor) -> float:

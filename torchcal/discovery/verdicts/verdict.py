@@ -14,7 +14,7 @@ from torchcal.discovery.misfit.places import Place
 from torchcal.discovery.misfit.structure import Structure
 from torchcal.discovery.verdicts.by_share import decide_exact, nearly
 from torchcal.discovery.verdicts.decision import Decision, certain, groups_of, other_names, tie_other_names, weigh
-from torchcal.discovery.verdicts.doubts import by_hold, doubt, unfit
+from torchcal.discovery.verdicts.doubts import by_hold, doubt, in_common, unfit
 from torchcal.discovery.verdicts.instruments import no_instrument, only_instruments
 from torchcal.discovery.verdicts.proof import prove
 from torchcal.discovery.verdicts.together import only_together
@@ -181,7 +181,9 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     rival = any(m.weight > best.weight - BEHIND for m in search.nameless)
     local = rival and all(model.window is not None for model in decision.tied_models)
     told = decision.tied_models[0] if decision.tied_models else best
-    decision.doubt = unfit(search, told) or by_hold(search, told) or only_together(search, told)
+    decision.doubt = (
+        unfit(search, told) or by_hold(search, told) or only_together(search, told) or in_common(search, told)
+    )
     # Windows, instruments and several terms, of which they share none, bend to what no term of the list explains.
     shared = set(best.names).intersection(*(m.names for m in decision.tied_models))
     pliant = all(
