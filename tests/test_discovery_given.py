@@ -169,3 +169,32 @@ def test_a_recording_with_another_noise_is_the_same_otherwise() -> None:
     assert other.y is data.y
     with pytest.raises(DomainError, match="sd > 0"):
         data.with_noise(0.0)
+
+
+@pytest.mark.parametrize("in_time", [False, True])
+def test_a_bound_that_is_wrong_is_told(in_time):
+    x = torch.linspace(0, 1, 40, dtype=torch.float64)
+    sd = 0.01 * torch.randn(40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    a, b = tc.Parameter("a", unit="V", low=0.0, high=2.0), tc.Parameter("b", unit="1/s", low=0.0, high=10.0)
+
+    def told(shift: float) -> tuple[str, list[str]]:
+        y = 3 * torch.exp(-2 * x) + shift * torch.sin(9 * x) + sd
+        offset = tc.Term("offset", outputs={"y": lambda *given: given[-1] + given[-3 if in_time else 1]["o"]},
+                         parameters=[tc.Parameter("o")])  # fmt: skip
+        if in_time:
+            base = tc.ODESimulator(
+                lambda t, s, p, u: {"z": -p["b"] * s["z"]}, ["z"], [a, b], initial={"z": lambda s, p: p["a"]},
+                observe={"y": lambda t, s, p, u: s["z"]},
+            )  # fmt: skip
+            data = tc.Recording(runs=[tc.Run(x, {"y": y})], noise=0.01)
+        else:
+            base = tc.Simulator(lambda x, p: p["a"] * torch.exp(-p["b"] * x), [a, b])
+            data = tc.Recording(x=x, y={"y": y}, noise=0.01)
+        d = tc.diagnose(base, data, [offset], seed=0, progress=False)
+        return d.verdict, d.symptoms
+
+    verdict, rows = told(0.0)
+    assert verdict != "consistent"
+    assert rows[0].startswith(("without its bound a is 3.0", "without its bound a is 2.9"))
+    assert rows[0].endswith(" V, and the base leaves no more than noise: a bound that is wrong looks like this")
+    assert not any(row.startswith("without its bound") for row in told(0.1)[1])  # something else is missing

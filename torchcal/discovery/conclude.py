@@ -24,7 +24,7 @@ from torchcal.discovery.misfit.noise import Noise
 from torchcal.discovery.records import Scores, Table
 from torchcal.discovery.verdicts import explain
 from torchcal.discovery.verdicts.decision import Decision
-from torchcal.discovery.verdicts.given import begun_elsewhere, held_otherwise
+from torchcal.discovery.verdicts.given import begun_elsewhere, held_otherwise, unbounded
 from torchcal.discovery.verdicts.lost import is_lost, misfit_in_spreads
 from torchcal.discovery.verdicts.verdict import PLAINLY_WHITE
 from torchcal.errors import ConvergenceWarning, warn
@@ -100,7 +100,7 @@ def conclude(
     apart = unlike(search, left) if decision.verdict in ("consistent", "named") else []
     any_unlike = bool(apart)
     if decision.verdict != "consistent":
-        apart = [*begun_elsewhere(search), *more_than_replicates(search, left), *apart]
+        apart = [*unbounded(search), *begun_elsewhere(search), *more_than_replicates(search, left), *apart]
     if decision.verdict in ("ambiguous", "unexplained"):
         apart = [*held_otherwise(search), *apart]
     remaining, depends = 0.0 if decision.verdict == "consistent" else 1.0, ""

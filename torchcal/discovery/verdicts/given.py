@@ -1,5 +1,6 @@
-"""What was given beside the outputs: noise, initial values, and how inputs go on between samples."""
+"""What was given beside the outputs: noise, bounds, initial values, and how inputs go on between samples."""
 
+import copy
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
@@ -12,22 +13,24 @@ from torchcal.discovery.fits.fitting import Fitted, fit
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.likeliest import settled
+from torchcal.discovery.misfit.noise import Noise
 from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.misfit.structure import analyse
-from torchcal.display import placed
+from torchcal.display import placed, with_unit
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators import Trajectories
 from torchcal.simulators.layout import initial_name
 
-__all__ = ["as_good", "begun_elsewhere", "held_otherwise", "resolved", "told_apart"]
+__all__ = ["as_good", "begun_elsewhere", "held_otherwise", "resolved", "told_apart", "unbounded"]
 
 #: χ² of the base up to which double precision still tells log evidences apart by a hundredth.
 DIGITS = 1e14
 #: Smallest noise sd that is gone by at first, in the output's spread.
 SMALLEST = 1e-12
-#: Probability by chance of what is left, from which on it is noise; and noise sd up to which an initial value that is
+#: Probability by chance of what is left, from which on it is noise, and where a bound forbade what leaves so much less
+#: than that; and noise sd up to which an initial value that is
 #: found free is the one that was given: of one given as the first value recorded, and of any other.
-NOISE, CONFIRMED, ELSEWHERE = 0.05, 0.2, 1.0
+NOISE, HARDLY, CONFIRMED, ELSEWHERE = 0.05, 0.01, 0.2, 1.0
 #: Change of an input from sample to sample, in its sd, from which on it matters how it goes on between them.
 FAR = 0.5
 #: How inputs may go on that go on in a way that can be mistaken for it.
@@ -51,6 +54,37 @@ def told_apart(base: Fitted) -> Tensor | None:
     """The sd ``(n_total,)`` that a given noise must be taken for where evidences cannot be told apart with it."""
     noise = base.problem.recording.noise
     return math.sqrt(base.chi2 / DIGITS) * noise if isinstance(noise, Tensor) and base.chi2 > DIGITS else None
+
+
+def unbounded(search: Search) -> list[str]:
+    """Bounds that the calibrated base runs to, in words, where noise alone is left without them."""
+    base = search.base
+    stuck = [i for i, at in zip(base.free, base.at_bound.tolist(), strict=True) if at]
+    if search.exact or search.stop.is_set() or not stuck:
+        return []
+    twin = copy.copy(base.problem.simulator)
+    twin.parameters = tuple(
+        dataclasses.replace(q, low=None, high=None) if i in stuck else q for i, q in enumerate(twin.parameters)
+    )
+    noise = search.noise
+    try:
+        found = fit(base.problem.with_simulator(twin), base.whitening, base.values[None], base.free)
+        if found is not None and noise.open:
+            noise = settled(found, noise, search.tangents)[0]
+    except (SimulatorError, DomainError):
+        return []
+    if found is None or not _noise_alone(search, found, noise, HARDLY):
+        return []
+    names = [twin.parameters[i].name for i in stuck]
+    values = [
+        with_unit(placed(float(found.values[i]), abs(float(found.values[i] - base.values[i]))), twin.parameters[i].unit)
+        for i in stuck
+    ]
+    its, are = ("its bound", "is") if len(names) == 1 else ("their bounds", "are")
+    return [
+        f"without {its} {' and '.join(names)} {are} {' and '.join(values)}, and the base leaves no more than noise: a "
+        "bound that is wrong looks like this"
+    ]
 
 
 def begun_elsewhere(search: Search) -> list[str]:
@@ -211,8 +245,8 @@ def _refitted(search: Search, part: Fitted, twin: Recording, freed: Mapping[str,
         return None
 
 
-def _noise_alone(search: Search, found: Fitted) -> bool:
-    return analyse(Residual(found, search.noise, seed=search.seed)).p_value >= NOISE
+def _noise_alone(search: Search, found: Fitted, noise: Noise | None = None, least: float = NOISE) -> bool:
+    return analyse(Residual(found, noise or search.noise, seed=search.seed)).p_value >= least
 
 
 def _rmse(found: Fitted) -> float:
