@@ -479,8 +479,8 @@ def test_two_terms_that_do_much_the_same_may_stand_for_one_law(second, told):
     values = torch.tensor([0.3, 1.0, 2.0], dtype=F64)
     model = SimpleNamespace(
         found=SimpleNamespace(
-            values=values, y=values @ shapes, whitening=lambda change: change / 0.1,
-            problem=SimpleNamespace(
+            values=values, y=values @ shapes, whitening=lambda change: change / 0.1, free=[0, 1, 2],
+            jacobian=shapes.T, problem=SimpleNamespace(
                 parameters=[tc.Parameter(name) for name in ("a", "one.q", "two.q")],
                 evaluate=lambda rows, columns: (rows @ shapes, None, None),
             ),

@@ -46,7 +46,8 @@ APART = 5.0
 STARTS, AGAIN, RIVAL, ELSEWHERE = 4, 60, 4.0, 4.0
 #: By how much lower in χ² a fit from there is the one that is told.
 DEEPER = 0.1
-#: Correlation of what two accepted terms do to the data from which on one law between them may look like their sum.
+#: Correlation of what two accepted terms do to the data, beside what the base may do, from which on one law between
+#: them may look like their sum.
 ONE_LAW = 0.9
 #: A parameter depends on what acts beside it when that moves it by more than this many of its sd.
 MOVED = 2.0
@@ -201,7 +202,8 @@ def _alike(search: Search, i: int, j: int) -> float:
 
 
 def one_law(model: Model) -> list[str]:
-    """Pairs of accepted terms that do nearly the same to the data: a law between them looks like their sum."""
+    """Pairs of accepted terms that do nearly the same to the data, beside what the base's parameters do: a law between
+    them looks like their sum."""
     found, candidate = model.found, model.candidate
     names = [q.name for q in found.problem.parameters]
     without = found.values.repeat(len(candidate.terms), 1)
@@ -212,7 +214,10 @@ def one_law(model: Model) -> list[str]:
     if len(without) < 2:
         return []
     change = found.whitening((found.y - found.problem.evaluate(without, [])[0]).T)
-    unit = change / change.norm(dim=0).clamp_min(1e-300)
+    slopes = found.whitening(found.jacobian[:, [k for k, i in enumerate(found.free) if i not in candidate.own]])
+    slopes = slopes / slopes.norm(dim=0).clamp_min(1e-300)
+    left = change - slopes @ torch.linalg.lstsq(slopes, change, rcond=1e-10, driver="gelsd").solution
+    unit = left / left.norm(dim=0).clamp_min(1e-8 * float(change.norm()) + 1e-300)  # rounding is like nothing
     rows = []
     for i, j in itertools.combinations(range(len(candidate.terms)), 2):
         alike = float(unit[:, i] @ unit[:, j])

@@ -20,8 +20,6 @@ def only_together(search: Search, model: Model) -> str:
         )
     if search.exact or len(model.names) < 2:
         return ""
-    if alike := one_law(model):
-        return f"Of its terms {alike[0]}."
     screening = search.screening
     for i in model.numbers:
         candidate = search.candidates[i]
@@ -30,6 +28,8 @@ def only_together(search: Search, model: Model) -> str:
                 f"Alone, {candidate.name} does what the base's own parameters do; beside the rest that may only make "
                 "up for a shape that no term has."
             )
+    if alike := one_law(model):
+        return f"Of its terms {alike[0]}."
     if other_minima(search, model):
         return "Other sizes of its terms fit about as well: what they do is told together alone."
     return ""
