@@ -471,10 +471,18 @@ def test_directions_that_share_a_parameter_are_one_line():
     assert explain._merged([]) == []
 
 
-@pytest.mark.parametrize(("second", "told"), [(lambda x: x**3, True), (lambda x: torch.sin(40 * x), False)])
-def test_two_terms_that_do_much_the_same_may_stand_for_one_law(second, told):
+@pytest.mark.parametrize(
+    ("first", "second", "told"),
+    [
+        (lambda x: x**2, lambda x: x**3, True),
+        (lambda x: x**2, lambda x: torch.sin(40 * x), False),
+        # alike in what the base does too, and in nothing else
+        (lambda x: 1 + 0.1 * torch.sin(40 * x), lambda x: 1 + 0.1 * torch.cos(40 * x), False),
+    ],
+)
+def test_two_terms_that_do_much_the_same_may_stand_for_one_law(first, second, told):
     x = torch.linspace(0.3, 1.0, 200, dtype=F64)
-    shapes = torch.stack([torch.ones_like(x), x, second(x)])
+    shapes = torch.stack([torch.ones_like(x), first(x), second(x)])
     terms = [tc.Term(name, outputs={"y": lambda x, p, y: y}, parameters=[tc.Parameter("q")]) for name in ("one", "two")]
     values = torch.tensor([0.3, 1.0, 2.0], dtype=F64)
     model = SimpleNamespace(
