@@ -222,3 +222,16 @@ def test_an_interruption_ends_quietly(problem, capsys, monkeypatch):
 def test_the_module_runs_as_a_command():
     done = subprocess.run([sys.executable, "-m", "torchcal.cli", "--help"], capture_output=True, text=True, check=True)
     assert all(command in done.stdout for command in ("calibrate", "diagnose", "show"))
+
+
+def test_every_file_that_cannot_be_written_is_told_and_the_result_printed(capsys):
+    def fails(what):
+        def write():
+            raise TorchcalError(f"no {what}")
+
+        return write
+
+    with pytest.raises(TorchcalError, match="no report") as told:
+        cli._finish("the result", [fails("report"), lambda: None, fails("file")])
+    assert told.value.__notes__ == ["TorchcalError: no file"]
+    assert capsys.readouterr().out == "the result\n"

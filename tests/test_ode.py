@@ -2,6 +2,8 @@
 
 import itertools
 import math
+from decimal import Decimal
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -686,7 +688,8 @@ def test_binding_again_keeps_or_changes_the_recording() -> None:
 
 @pytest.mark.parametrize(
     ("wrong", "got"),
-    [(None, "NoneType"), ("a", "str"), (1j, "complex"), (torch.tensor(1j), "torch.complex64"), ([None], "list")],
+    [(None, "NoneType"), ("a", "str"), (1j, "complex"), (torch.tensor(1j), "torch.complex64"), ([None], "list"),
+     ([torch.ones(1, requires_grad=True)], "list")],
 )
 def test_what_is_no_real_number_is_told_of_the_function_that_gave_it(wrong, got) -> None:
     def decay(**changes) -> tc.ODESimulator:
@@ -705,10 +708,11 @@ def test_what_is_no_real_number_is_told_of_the_function_that_gave_it(wrong, got)
             bound.check(bound.x, tensor(1.0).expand(4, -1))
 
 
-def test_plain_numbers_are_taken_with_all_their_digits() -> None:
+@pytest.mark.parametrize("tenth", [0.1, Fraction(1, 10), Decimal("0.1"), np.float64(0.1)])
+def test_plain_numbers_are_taken_with_all_their_digits(tenth) -> None:
     simulator = tc.ODESimulator(
-        lambda t, s, p, u: {"x": 0.1, "y": p["k"]}, ["x", "y"], [tc.Parameter("k")], initial={"x": 0.0, "y": 0.0},
-        observe={"x": lambda t, s, p, u: s["x"], "c": lambda t, s, p, u: 0.1},
+        lambda t, s, p, u: {"x": tenth, "y": p["k"]}, ["x", "y"], [tc.Parameter("k")], initial={"x": 0.0, "y": 0.0},
+        observe={"x": lambda t, s, p, u: s["x"], "c": lambda t, s, p, u: tenth},
     )  # fmt: skip
     t = torch.linspace(0, 2, 7, dtype=F64)
     bound = simulator.bind(tc.Recording(runs=[tc.Run(t, {"x": t, "c": t})]))

@@ -415,6 +415,16 @@ def test_what_a_run_has_for_itself_is_known_of_the_runs_that_were_calibrated_alo
         found.predict([run(1.0, 1.0), run(1.1)])
     with pytest.raises(DomainError, match=r"Got \['k'\] open"):  # the same times and initial state, other data
         found.predict(run(1.0, 1.0))
+    # A run that was held out is itself, whatever another of the same times was; one that shares no datum is none.
+    kept = tc.Recording(runs=[run(0.5), run(2.0)]).masked(torch.arange(60) >= 30)
+    held = tc.calibrate_additive(
+        decay, kept, num_samples=0, seed=0, fixed={"k[0]": 1.0, "z(0)[0]": 5.0}, progress=False
+    )
+    at_data = held.predict().map.mean
+    for same in (kept, tc.Recording(runs=[run(0.5), run(2.0)])):
+        torch.testing.assert_close(held.predict(same).map.mean, at_data, rtol=1e-6, atol=1e-6)
+    with pytest.raises(DomainError, match=r"Got \['k', 'z\(0\)'\] open"):
+        held.predict(run(0.7))
     single = tc.calibrate_additive(decay, tc.Recording(runs=runs[:1]), num_samples=0, seed=0, progress=False)
     with pytest.raises(DomainError, match=r"Got \['k'\] open"):
         single.predict(run(1.0, 1.0))

@@ -701,4 +701,5 @@ def test_instants_of_a_clock_are_told_apart():
     times = np.array([1.7e9, 1.7e9 + 600, 1.7e9 + 3600])
     assert close(times, 1.7e9).tolist() == [True, False, False]
     assert close(np.array([1050.0, 1050.0]), 1050.0001).tolist() == [True, True]
-    assert close(np.linspace(0, 1, 4), 0.333333).tolist() == [False, True, False, False]
+    assert close(np.linspace(0, 1, 4), 0.3333333).tolist() == [False, True, False, False]
+    assert close(np.logspace(-9, -2, 8), 1e-9).tolist() == [True] + [False] * 7

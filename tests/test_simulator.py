@@ -317,13 +317,28 @@ def test_a_function_that_raises_is_told_with_the_values_it_was_called_with() -> 
 def test_random_numbers_in_a_small_output_are_found_beside_a_large_one():
     def both(x, p, noise):
         strain = 2e-3 * p["a"] * x
-        return {"stress": 2e8 * p["a"] * x, "strain": strain * (1 + noise * torch.rand_like(strain))}
+        return {"stress": 2e6 * p["a"] * x, "strain": strain * (1 + noise * torch.rand_like(strain))}
 
     x = torch.linspace(0.1, 1, 5, dtype=torch.float64)
     only = [tc.Parameter("a")]
     with pytest.raises(SimulatorError, match="in a batch as one at a time"):
         tc.Simulator(lambda x, p: both(x, p, 0.2), only).check(x, values(8, 1), ["stress", "strain"])
     assert tc.Simulator(lambda x, p: both(x, p, 0.0), only).check(x, values(8, 1), ["stress", "strain"]) == 10
+
+
+def test_what_rounding_leaves_of_a_system_that_is_solved_is_no_difference():
+    n = 40
+    matrix = torch.diag(torch.full((n,), 2.0)) - torch.diag(torch.ones(n - 1), 1) - torch.diag(torch.ones(n - 1), -1)
+    matrix, x = matrix.double(), torch.linspace(0, 1, n, dtype=torch.float64)
+
+    def solved(x, p):
+        rows = 100.0 * p["a"].unsqueeze(-1) * matrix
+        right = 1e4 * torch.ones(*p["a"].shape[:-1], n, 1, dtype=torch.float64)
+        found = torch.linalg.solve(rows, right)
+        return {"T": found[..., 0], "closing": (rows @ found - right)[..., 0] / 1e4}
+
+    simulator = tc.Simulator(solved, [tc.Parameter("a")])
+    assert simulator.check(x, 1 + values(8, 1).abs(), ["T", "closing"]) == 2 * n
 
 
 def test_parameter_values_are_floating_point_numbers():

@@ -530,3 +530,12 @@ def test_a_name_looked_up_in_the_only_condition_is_told(name):
         tc.diagnose(base, tc.Recording(x=x, y=x), [term], progress=False)
     with pytest.raises(SimulatorError, match=told):
         tc.Simulator(lambda x, p: p["a"] * x[name], [tc.Parameter("a")]).at(x)(torch.ones(1, dtype=torch.float64))
+
+
+def test_nothing_is_no_list_of_parameters_or_states():
+    with pytest.raises(DomainError, match="so that nothing could be"):
+        tc.Term("drag", equation="v", rate=lambda t, s, p, u: -s["v"], parameters=None)
+    with pytest.raises(DomainError, match="to do something"):
+        tc.Term("drag", frees=None)
+    with pytest.raises(DomainError, match="states as a dict"):
+        tc.ODESimulator(lambda t, s, p, u: {}, None, [tc.Parameter("k")])

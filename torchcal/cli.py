@@ -5,7 +5,7 @@ further arguments, ``calibrate_options`` and ``diagnose_options``.
 """
 
 import argparse
-import contextlib
+import functools
 import importlib.metadata
 import importlib.util
 import inspect
@@ -124,10 +124,7 @@ def _calibrate(given: argparse.Namespace) -> None:
     options = _options(problem, "calibrate_options", calibrate, given, target_ess=given.target_ess)
     warnings.simplefilter("always", InterruptionWarning)  # by which the status is known, whatever the file filters
     result = calibrate(problem.simulator, problem.recording, **options)
-    with contextlib.ExitStack() as end:
-        end.callback(print, result)  # also where it cannot be saved
-        if given.out is not None:
-            end.callback(result.save, given.out)
+    _finish(result, [] if given.out is None else [functools.partial(result.save, given.out)])
 
 
 def _diagnose(given: argparse.Namespace) -> None:
@@ -138,12 +135,23 @@ def _diagnose(given: argparse.Namespace) -> None:
     options = _options(problem, "diagnose_options", diagnose, given)
     warnings.simplefilter("always", InterruptionWarning)
     result = diagnose(problem.simulator, problem.recording, getattr(problem, "candidates", ()), **options)
-    with contextlib.ExitStack() as end:  # each of them whatever becomes of the others, the last one first
-        end.callback(print, result)
-        if given.out is not None:
-            end.callback(result.save, given.out)
-        if given.report is not None:
-            end.callback(result.report, given.report)
+    wanted = [(result.report, given.report), (result.save, given.out)]
+    _finish(result, [functools.partial(write, path) for write, path in wanted if path is not None])
+
+
+def _finish(result: object, writes: Sequence[Callable[[], object]]) -> None:
+    """Write a result and print it, each whatever becomes of the others; the first error has notes of the others."""
+    errors: list[BaseException] = []
+    for write in writes:
+        try:
+            write()
+        except BaseException as error:
+            errors.append(error)
+    print(result)
+    if errors:
+        for other in errors[1:]:
+            errors[0].add_note(f"{type(other).__name__}: {other}")
+        raise errors[0]
 
 
 def _show(given: argparse.Namespace) -> None:

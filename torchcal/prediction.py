@@ -318,7 +318,7 @@ def _check_plain(value: Any, label: str) -> None:
     if (unit := unit_of(value)) is not None:
         raise DomainError(
             f"Expected {label} as numbers in the unit of the prediction, which does not know it. Got some in "
-            f"{unit!r} (convert it yourself: give {label}.to(unit).magnitude)."
+            f"{unit!r} (convert it yourself: give {label}.to(unit).magnitude, or the .values of a DataArray)."
         )
 
 

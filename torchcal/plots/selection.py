@@ -51,9 +51,10 @@ class View:
 
 
 def close(values: np.ndarray, target: float) -> np.ndarray:
-    """Where values equal a target up to a millionth of their range, or of itself where there is but one of them."""
+    """Where values equal a target up to a millionth of itself, and of their range where they differ."""
     span = float(np.ptp(values)) if len(values) else 0.0
-    return np.isclose(values, target, rtol=8 * np.finfo(float).eps, atol=1e-6 * (span or abs(target)))
+    few = 1e-6 * min(abs(target), span or abs(target))  # of a clock, and of what spans decades
+    return np.isclose(values, target, rtol=8 * np.finfo(float).eps, atol=max(few, 1e-9 * span))
 
 
 def conditions_of(x: Any, recording: Recording | None) -> dict[str, np.ndarray]:

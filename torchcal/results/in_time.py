@@ -92,7 +92,7 @@ def propagation_in_time(propagate: NISP, recording: Recording, x: Any, alpha: Te
         alike = _alike(runs, recording)
         other = bound.elsewhere(_blank(alike, recording), first=bound.layout.first)
         where, picks = other.x, torch.arange(other.recording.n)
-        columns = _columns(bound, other, [_twin(run, recording) for run in alike])
+        columns = _columns(bound, other, _twins(alike, recording))
     else:
         where = _times(x, recording)
         extended, picks = _with_times(recording, where)
@@ -125,19 +125,37 @@ def _blank(runs: Sequence[Run], recording: Recording) -> Recording:
     return Recording(runs=[change(run, outputs=y) for run, y in zip(runs, blank, strict=True)])
 
 
-def _twin(run: Run, recording: Recording) -> int | None:
-    """Which of the recording's runs one is, in the same units: whose data it contradicts nowhere."""
+def _twins(runs: Sequence[Run], recording: Recording) -> list[int | None]:
+    """Which of the recording's runs each is, in the same units.
 
-    def agree(given: Mapping[str, Tensor], own: Mapping[str, Tensor]) -> bool:
-        return set(given) <= set(own) and all(
-            bool(((values == own[name]) | values.isnan() | own[name].isnan()).all()) for name, values in given.items()
+    All of them in turn, where there are as many and none contradicts its own; else the only one that a run shares
+    data with and does not contradict.
+    """
+    known = recording.runs or ()
+    if len(runs) == len(known) and all(_may_be(run, own) for run, own in zip(runs, known, strict=True)):
+        return list(range(len(known)))
+    found: list[int | None] = []
+    for run in runs:
+        mine = [r for r, own in enumerate(known) if _may_be(run, own) and _shares_data(run, own)]
+        found.append(mine[0] if len(mine) == 1 else None)
+    return found
+
+
+def _may_be(run: Run, own: Run) -> bool:
+    """Whether two runs are of the same times, inputs and known initial states, and differ in no datum of both."""
+
+    def agree(given: Mapping[str, Tensor], other: Mapping[str, Tensor]) -> bool:
+        return set(given) <= set(other) and all(
+            bool(((values == other[name]) | values.isnan() | other[name].isnan()).all())
+            for name, values in given.items()
         )
 
-    for r, own in enumerate(recording.runs or ()):
-        same = run.initial == own.initial and run.hold == own.hold and torch.equal(run.time, own.time)
-        if same and agree(run.inputs, own.inputs) and agree(run.outputs, own.outputs):
-            return r
-    return None
+    same = run.initial == own.initial and run.hold == own.hold and torch.equal(run.time, own.time)
+    return same and agree(run.inputs, own.inputs) and agree(run.outputs, own.outputs)
+
+
+def _shares_data(run: Run, own: Run) -> bool:
+    return any(bool((values == own.outputs[name]).any()) for name, values in run.outputs.items())
 
 
 def _columns(bound: Trajectories, other: Trajectories, twins: Sequence[int | None]) -> list[int]:

@@ -63,7 +63,11 @@ def real(value: Any, like: Tensor, shape: torch.Size, what: str) -> Tensor:
         SimulatorError: If it is no real number, or has another shape.
     """
     if not isinstance(value, Tensor):
-        numbers = np.asarray(value)
+        try:
+            numbers = np.asarray(value)
+            numbers = np.asarray(float(value)) if numbers.dtype == object and not numbers.ndim else numbers
+        except Exception:  # what does not become numbers is told below
+            numbers = np.asarray("")
         value = torch.as_tensor(numbers, dtype=like.dtype) if numbers.dtype.kind in "biuf" else value
     if not isinstance(value, Tensor) or value.is_complex():
         got = f"{value.dtype}" if isinstance(value, Tensor) else type(value).__name__

@@ -62,7 +62,7 @@ class ODESimulator(Simulator):
         if not callable(rates):
             raise DomainError(f"Expected rates as a function f(t, s, p, u). Got {type(rates).__name__}.")
         if not isinstance(states, str | Mapping):
-            states = tuple(states)
+            states = () if states is None else tuple(states)
         if isinstance(states, str) or not states or any(not isinstance(name, str) or not name for name in states):
             raise DomainError(f"Expected states as a dict from names to units. Got {states!r}.")
         if len(set(states)) < len(states):

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 
 from torchcal.checks import whole
-from torchcal.data import ROUNDING, Recording
+from torchcal.data import Recording
 from torchcal.display import raised
 from torchcal.errors import DomainError, ShapeError, SimulatorError
 from torchcal.simulators.careful import careful
@@ -23,6 +23,9 @@ __all__ = ["Conditions", "Linearisation", "Simulator", "asks_for_numbers", "chec
 
 _DUAL = threading.RLock()
 """torch keeps one level of forward derivatives for the whole process, and refuses a second thread its own."""
+
+#: Share of the largest output that rounding may leave of another one, of a difference or of a system that is solved.
+CANCELLED = 1e-12
 
 Conditions = Tensor | Mapping[str, Tensor]
 
@@ -293,7 +296,7 @@ class Simulator:
         difference = torch.maximum((together[good[0]] - alone).abs(), (together[good] - nested).abs().amax(0))
         size = together[good].abs().amax(0)  # and the largest of each output:
         own = size.unflatten(0, (-1, _length(x))).amax(1, keepdim=True).expand(-1, _length(x)).flatten()
-        if not bool((difference <= (1e-6 * own).clamp_min(ROUNDING * float(size.max()))).all()):
+        if not bool((difference <= (1e-6 * own).clamp_min(CANCELLED * float(size.max()))).all()):
             raise SimulatorError(
                 "Expected the same outputs for parameter values in a batch as one at a time. Got a difference "
                 f"of {float(difference.max()):.3g}. Write the simulator elementwise: p[name] has shape "

@@ -141,7 +141,7 @@ class Term:
             if equation in every:
                 raise DomainError(f"Expected one rate for {equation!r} in the term {name!r}. Got two.")
             every[equation] = rate
-        frees = (frees,) if isinstance(frees, str) else tuple(frees)
+        frees = (frees,) if isinstance(frees, str) else tuple(frees or ())
         parts = [*every.values(), *(outputs or {}).values(), *(shifts or {}).values()]
         if not parts and not frees:
             raise DomainError(
@@ -154,7 +154,7 @@ class Term:
                 f"Expected a list of parameters of the term {name!r}. Got one, {parameters!r} (write "
                 "parameters=[Parameter(...)])."
             )
-        parameters = tuple(parameters)  # what can be gone through but once is kept
+        parameters = () if parameters is None else tuple(parameters)  # what can be gone through but once is kept
         if parts and not parameters:
             raise DomainError(
                 f"Expected parameters=[Parameter(...)] for the term {name!r}. Got none, so that nothing could be "
