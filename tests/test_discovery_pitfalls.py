@@ -333,7 +333,8 @@ def test_what_all_likely_models_share_is_no_name_where_its_own_fit_is_bad():
     y = 5 * torch.exp(-x / 2) - 0.1 * x**1.5 + noise
     d = diagnose(base, tc.Recording(x=x, y=y, noise=0.04), terms)
     assert d.verdict == "ambiguous"
-    assert all("quad" in tied for tied in d.tied)
+    assert all("quad" in tied for tied in d.tied if tied != ["none of these"])
+    assert len(d.tied) >= 2
 
 
 def test_a_few_replicates_do_not_bound_what_a_term_may_leave():
