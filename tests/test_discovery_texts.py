@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import torchcal as tc
-from torchcal.discovery.findings import symptoms, where, words
+from torchcal.discovery.findings import called, symptoms, where, words
 from torchcal.discovery.findings import where_in_words as where_text
 from torchcal.discovery.findings.where_in_words import where_in_words
 from torchcal.discovery.fits import local
@@ -21,6 +21,7 @@ from torchcal.discovery.misfit.channels import Channel
 from torchcal.discovery.misfit.places import Place
 from torchcal.discovery.records import Estimate, Experiment, Hypothesis, Limit, Location, MissingRate, Table
 from torchcal.discovery.verdicts import doubts, explain
+from torchcal.display import NONE
 from torchcal.plots.discovery.pieces import likeliest_with
 from torchcal.report import diagnosis_page
 
@@ -30,7 +31,7 @@ WHOLE, PART = ((0.0, 10.0),), ((2.0, 5.0),)
 
 
 def row(terms, probability, **more):
-    more = {"refitted": terms != words.NONE, "misfit_removed": 0.9, **more}
+    more = {"refitted": terms != NONE, "misfit_removed": 0.9, **more}
     return Hypothesis(tuple(terms), 0.0, probability, **more)
 
 
@@ -49,7 +50,7 @@ def finding(verdict="named", **more):
 
 
 def said(d):
-    return " ".join(part for part in getattr(words, f"_{d.verdict}")(d) if part)
+    return " ".join(part for part in getattr(words, d.verdict)(d) if part)
 
 
 # --- where -----------------------------------------------------------------------------------------------------
@@ -257,7 +258,7 @@ def test_a_rival_does_not_hold_the_name():
 @pytest.mark.parametrize(
     ("rows", "told"),
     [
-        ([row(words.NONE, 0.02), row(["spring"], 0.01)], "something that is not in this library, has a probability of "
+        ([row(NONE, 0.02), row(["spring"], 0.01)], "something that is not in this library, has a probability of "
          "0.02 (3.9 behind"),
         ([row([], 0.02), row(["spring"], 0.01)], "the base alone, has a probability of 0.02"),
         ([row(["spring"], 0.0), row([], 0.0)], "spring, has a probability of < 0.001 (more than 100 behind"),
@@ -333,7 +334,7 @@ def test_an_estimate_that_depends_on_what_acts_beside_it_is_told():
     ],
 )  # fmt: skip
 def test_why_the_best_of_the_library_is_no_name(source, best, unknown, told):
-    rows = [row(["drag"], 0.05, **{"misfit_removed": 1.0, **best}), row(words.NONE, unknown)]
+    rows = [row(["drag"], 0.05, **{"misfit_removed": 1.0, **best}), row(NONE, unknown)]
     noise = SimpleNamespace(source=source, correlation={})
     assert f"removes 99.9 % of the misfit beyond noise{told}" in said(finding("unexplained", ranking=rows, noise=noise))
 
@@ -361,19 +362,19 @@ def test_no_sign_is_told_with_what_chance_has_to_do_for_it(p, told):
 
 
 def test_a_probability_below_what_names_is_told_below_it():
-    d = finding("ambiguous", tied=[["drag"], list(words.NONE)], ranking=[row(["drag"], 0.8496), row(words.NONE, 0.15)])
+    d = finding("ambiguous", tied=[["drag"], list(NONE)], ranking=[row(["drag"], 0.8496), row(NONE, 0.15)])
     assert "has a probability of 0.84, which is too little" in said(d)
 
 
 def test_what_was_not_refitted_has_removed_nothing_that_is_known():
-    table = Table([Hypothesis(words.NONE, 1.0, 0.4), row(["drag"], 0.6)], ("terms", "misfit_removed"))
+    table = Table([Hypothesis(NONE, 1.0, 0.4), row(["drag"], 0.6)], ("terms", "misfit_removed"))
     assert [line.split()[-1] for line in str(table).splitlines()[1:]] == ["-", "0.9"]
 
 
 @pytest.mark.parametrize(("separation", "told"), [(12.34, "12.3"), (99.96, "100"), (35e4, "more than 100")])
 def test_no_distance_is_told_by_thousands(separation, told):
     experiment = Experiment("longer", separation)
-    assert f"(predicted distance {told}" in words._experiment(finding(experiment=experiment))[0]
+    assert f"(predicted distance {told}" in called.experiment_told(finding(experiment=experiment))[0]
     assert f"would differ there by {told}" in diagnosis_page._experiment(finding(experiment=experiment))
 
 
@@ -574,8 +575,8 @@ def test_what_acts_beside_one_of_the_tied_is_told_without_them():
 
 @pytest.mark.parametrize(("share", "told"), [(0.2, "probability 0.20"), (0.0, "though its probability is < 0.001")])
 def test_something_unknown_that_tied_hypotheses_may_stand_for_is_told_with_its_probability(share, told):
-    tied = [["drag"], ["lag"], list(words.NONE)]
-    rows = [row(["drag"], 0.5), row(["lag"], 0.3), row(words.NONE, share)]
+    tied = [["drag"], ["lag"], list(NONE)]
+    rows = [row(["drag"], 0.5), row(["lag"], 0.3), row(NONE, share)]
     text = said(finding("ambiguous", tied=tied, ranking=rows))
     assert f"Nor can these data exclude something that is not in the library ({told})." in text
 
@@ -655,9 +656,9 @@ def test_one_change_for_all_runs_does_not_differ_from_run_to_run(rates, told):
 
 
 def test_a_best_term_that_removes_nothing_is_not_told():
-    rows = [row(("drag",), 0.1, misfit_removed=0.0), row(words.NONE, 0.9)]
+    rows = [row(("drag",), 0.1, misfit_removed=0.0), row(NONE, 0.9)]
     assert "The best of the library" not in said(finding("unexplained", ranking=rows))
-    rows = [row(("drag",), 0.1, misfit_removed=0.5), row(words.NONE, 0.9)]
+    rows = [row(("drag",), 0.1, misfit_removed=0.5), row(NONE, 0.9)]
     assert "The best of the library, drag, removes 50 %" in said(finding("unexplained", ranking=rows))
 
 

@@ -88,11 +88,6 @@ class Layout:
             else:
                 self._places[parameter.name] = [place]
                 parameters.append(parameter)
-        # Which parameter, and which run's, each column is; initial states act on no rate.
-        self._owner: dict[int, tuple[str, int | None]] = {
-            place: (name, None if len(places) == 1 else r)
-            for name, places in self._places.items() for r, place in enumerate(places)
-        }  # fmt: skip
         self._initial: list[dict[str, Any]] = []
         self.initial_names: list[str] = []
         for r, run in enumerate(runs):
@@ -118,7 +113,7 @@ class Layout:
     @property
     def nuisance(self) -> tuple[str, ...]:
         """What each run has for itself: unknown initial states and per-run parameters."""
-        own = [i for i, (_, run) in sorted(self._owner.items()) if run is not None]
+        own = [i for places in self._places.values() if len(places) > 1 for i in places]
         return (*(self.parameters[i].name for i in own), *self.initial_names)
 
     def _values(self, run_of: Tensor | None) -> Values:
@@ -171,7 +166,7 @@ class Layout:
             own = dict(zip(names, grads[1:], strict=True))
             rows = []
             for column in columns:
-                name, run = self._owner.get(column, ("", None))
+                name, run = self.origins[column]  # initial states act on no rate
                 grad = own.get(name)
                 if grad is None:
                     rows.append(torch.zeros_like(part))

@@ -1,0 +1,94 @@
+"""How hypotheses, probabilities and experiments are called in a sentence."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from torchcal.display import NONE, up_to
+
+__all__ = [
+    "LISTED",
+    "LITTLE",
+    "accepted",
+    "called",
+    "chance",
+    "experiment_told",
+    "holds_named",
+    "joined",
+    "log_odds_behind",
+    "rmse_unit",
+    "unknown_share",
+    "with_region",
+]
+
+#: Share of the misfit beyond noise below which there is hardly any to remove.
+LITTLE = 0.005
+#: Probability from which on the base, or something unknown, is told beside what is named or tied.
+LISTED = 0.05
+#: Pairs of hypotheses that an experiment leaves, of which the paragraph lists so many.
+UNTOLD = 3
+
+
+def chance(p: float) -> str:
+    """A probability in a sentence."""
+    return f"{p:.2g}" if p >= 0.001 else "< 0.001"
+
+
+def joined(names: list[str]) -> str:
+    """Names in a sentence."""
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
+
+
+def rmse_unit(d: Any) -> str:
+    """What errors of several outputs are divided by."""
+    return " of each output's spread" if len(d.recording.outputs) > 1 else ""
+
+
+def log_odds_behind(p: float, first: float) -> float:
+    """Log odds of a probability behind another one."""
+    return math.log(first / p) if p > 0 and first > 0 else math.inf
+
+
+def unknown_share(d: Any) -> float:
+    """Probability of something that is not in the library."""
+    return float(sum(row.probability for row in d.ranking if row.terms == NONE))
+
+
+def called(d: Any, terms: Sequence[str]) -> str:
+    """A hypothesis in a sentence, with the range that it acts in."""
+    if tuple(terms) == NONE:
+        return "something that is not in this library"
+    if not terms:
+        return "the base alone"
+    rows = [row for row in d.ranking if (row.refitted or row.region) and set(row.terms) == set(terms)]
+    best = max(rows, key=lambda row: row.probability, default=None)
+    return " with ".join(terms) + (f" where {best.region}" if best is not None and best.region else "")
+
+
+def accepted(d: Any) -> Any:
+    """The row of the ranking that is named."""
+    mine = [row for row in d.ranking if row.refitted and set(row.terms) == set(d.terms)]
+    return next((row for row in mine if row.region == d.settings.get("region")), mine[0] if mine else d.ranking[0])
+
+
+def with_region(d: Any, name: str) -> str:
+    """A named term in a sentence, with the range that it acts in."""
+    region = accepted(d).region
+    return f"{name}, where {region}" if region else name
+
+
+def holds_named(d: Any, row: Any) -> bool:
+    """Whether a row of the ranking has the named terms, alone or with others."""
+    return bool(row.refitted and row.physical and not row.note and set(row.terms) >= set(d.terms))
+
+
+def experiment_told(d: Any) -> list[str]:
+    """What would tell tied hypotheses apart, if anything."""
+    if d.experiment is None:
+        return []
+    distance = f"predicted distance {up_to(d.experiment.separation)} noise sd"
+    text = f"What would tell them apart: {d.experiment.description} ({distance})"
+    untold = [f"{a} from {b}" for a, b in d.experiment.untold]
+    if len(untold) > UNTOLD + 1:
+        untold = [*untold[:UNTOLD], f"{len(untold) - UNTOLD} other pairs apart"]
+    return [text + (f"; none that was tried in thought tells {', or '.join(untold)}." if untold else ".")]
