@@ -261,6 +261,30 @@ def test_a_sound_derivative_is_not_refused(name):
     assert diagnose(tc.Simulator(function, parameters), recording).verdict == "consistent"
 
 
+@pytest.mark.parametrize("given", [None, 8.0])
+def test_a_shape_may_lie_beyond_the_range_that_was_recorded_unless_a_bound_was_given(given):
+    x = torch.linspace(0.05, 10, 80, dtype=F64)
+    y = 2 * x / (x + 0.3) + 1.5 * x / (x + 20) + 0.01 * noise(80, 2)
+    one_site = tc.Simulator(
+        lambda x, p: p["q"] * x / (x + p["K"]),
+        [tc.Parameter("q", low=0.1, high=10, initial=2.0), tc.Parameter("K", low=0.01, high=10, initial=0.5)],
+    )
+    second = tc.Term(
+        "second site", outputs={"y": lambda x, p, y: y + p["a"] * x / (x + p["far"])},
+        parameters=[tc.Parameter("a", low=0.0), tc.Parameter("far", low=0.0, high=given)], scales={"far": "x"},
+    )  # fmt: skip
+    d = diagnose(one_site, tc.Recording(x=x, y=y, noise=0.01), [second])
+    if given is None:
+        far = next(e for e in d.final.estimates if e.name == "second site.far")
+        assert d.terms == ["second site"]
+        assert far.value == pytest.approx(20, abs=4 * far.sd)
+        assert not far.at_bound
+        assert {q.name: q for q in d.improved.parameters}["second site.far"].high == 40.0
+    else:
+        assert d.terms == []
+        assert any(row.note == "at its bound: second site.far" for row in d.ranking)
+
+
 def test_a_jump_that_is_tried_at_a_datum_is_no_lost_derivative():
     jump = tc.Term(
         "jump", outputs={"y": lambda x, p, y: y + p["h"] * torch.sign(x - p["x0"])},

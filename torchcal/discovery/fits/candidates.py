@@ -14,11 +14,11 @@ from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.trial import check_repeats, place_of
 from torchcal.errors import DomainError, SimulatorError
-from torchcal.simulators import Parameter, free_parameters
+from torchcal.simulators import Parameter, free_parameters, is_value_of
 from torchcal.terms import Term, extend
 from torchcal.terms.term import neutral_of
 
-__all__ = ["Candidate", "base_columns", "drivers_scale", "prepare", "spread_values"]
+__all__ = ["Candidate", "base_columns", "drivers_scale", "prepare", "spread_values", "widened"]
 
 #: Points of a grid of shape parameters: along one, two, three and more of them.
 GRID_POINTS = (1, 9, 5, 4)
@@ -27,6 +27,8 @@ DRIVER_POINTS = (0, 7, 3, 2)
 #: Range of a shape parameter measured on a driver's scale; on that of time it begins at a share of the usual gap
 #: between samples where that is less: lags and delays may be as fast as these show, however long the recording.
 SCALE_RANGE, OF_A_GAP = (0.02, 1.0), 0.1
+#: How many times as far a fit may go that an end of such a range holds back: nobody gave that end.
+WIDER = 4.0
 #: Share of the data's spread that a candidate adds when it is tried.
 A_LITTLE = 0.03
 #: Change of the outputs, relative to their size, that counts as none.
@@ -190,6 +192,47 @@ def _narrowed(low: float, high: float, parameter: Parameter) -> tuple[float, flo
         below = parameter.high / ratio if parameter.high > 0 else parameter.high - high
         return low if low < parameter.high else below, parameter.high
     return low, high
+
+
+def widened(base: Problem, candidate: Candidate, held_back: Sequence[str], given: Sequence[Term]) -> Candidate | None:
+    """A candidate with room for parameters that stay at ends which nobody gave: those of a driver's scale (`sized`).
+
+    Args:
+        base: Problem that the candidate extends.
+        candidate: With the ranges that a fit wants to leave.
+        held_back: Names of the parameters that a bound holds back.
+        given: Its terms with the bounds that the user gave.
+
+    Returns:
+        It with wider ranges, or None where one of those parameters has no such range.
+    """
+    own = {
+        term.full(q.name): q for term in given for q in term.parameters
+        if q.name in term.scales and (q.low is None or q.high is None)
+    }  # fmt: skip
+    if not all(any(is_value_of(name, one) for one in own) for name in held_back):
+        return None
+    terms = []
+    for term in candidate.terms:
+        parameters = []
+        for q in term.parameters:
+            name = term.full(q.name)
+            if any(is_value_of(one, name) for one in held_back):
+                q = _with_room(q, own[name])
+            parameters.append(q)
+        terms.append(dataclasses.replace(term, parameters=tuple(parameters)))
+    problem = base.with_simulator(extend(base.simulator, terms))
+    return dataclasses.replace(candidate, terms=tuple(terms), problem=problem)
+
+
+def _with_room(sought: Parameter, given: Parameter) -> Parameter:
+    """A parameter with more room than it was sought in, but for an end that was given."""
+    low, high = sought.low or 0.0, sought.high or 0.0
+    more = (WIDER - 1) * (high - low)
+    low, high = low / WIDER if low > 0 else low - more, WIDER * high if high > 0 else high + more
+    low = low if given.low is None else max(low, given.low)
+    high = high if given.high is None else min(high, given.high)
+    return dataclasses.replace(sought, low=low, high=high)
 
 
 def spread_values(target: Problem, names: Sequence[str], values: Tensor) -> Tensor:

@@ -7,10 +7,16 @@ from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.local import ENDS, is_window
 from torchcal.discovery.hypotheses.model import Model
 
-__all__ = ["UNPHYSICAL", "judge"]
+__all__ = ["UNPHYSICAL", "held_back", "judge"]
 
 #: Prior odds against an estimate on a physical bound that it wants to cross.
 UNPHYSICAL = math.log(1e-3)
+
+
+def held_back(model: Model, base: Fitted) -> list[str]:
+    """Names of the parameters that stay at a bound, and did not in the base's fit; ends of windows apart."""
+    before = base.stuck
+    return [name for name in model.found.stuck if name not in before and not is_window(name)]
 
 
 def judge(model: Model, base: Fitted) -> None:
@@ -23,8 +29,7 @@ def judge(model: Model, base: Fitted) -> None:
             low = float(found.values[i]) if names[i].endswith(ENDS["from"]) else low
             high = float(found.values[i]) if names[i].endswith(ENDS["to"]) else high
         model.window = dataclasses.replace(model.window, low=low, high=high)
-    before = base.stuck
-    new = [name for name in found.stuck if name not in before and not is_window(name)]
+    new = held_back(model, base)
     amplitude = {names[i] for i in candidate.amplitudes}
     off = set()
     for i, at in zip(found.free, found.at_bound.tolist(), strict=True):

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from torchcal.discovery.fits.candidates import Candidate, drivers_scale, prepare
+from torchcal.discovery.fits.candidates import Candidate, drivers_scale, prepare, widened
 from torchcal.discovery.fits.fitting import Fitted, fit, refit, weighed
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.refits import Refit, refit_all
@@ -17,7 +17,7 @@ from torchcal.discovery.fits.sharpen import SOLVER_SHARE, accurate, sharpen
 from torchcal.discovery.fits.stop import Stop
 from torchcal.discovery.hypotheses.base import calibrate_base
 from torchcal.discovery.hypotheses.beginnings import larger_effects, within_bounds
-from torchcal.discovery.hypotheses.judge import judge
+from torchcal.discovery.hypotheses.judge import held_back, judge
 from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.hypotheses.own_noise import suited
 from torchcal.discovery.hypotheses.screen import Screening, Window, screen, windows
@@ -262,6 +262,24 @@ class Search:
                 fitted = self._settled(fitted)
             model = Model(one.numbers, one.candidate, fitted, 0.0, one.prior, True, window=one.window)
             models.append(self._judge(model))
+        return self._with_room(models)
+
+    def _with_room(self, models: list[Model | None]) -> list[Model | None]:
+        """The models, those anew that only the range in which a shape was sought holds back; where more room is enough,
+        that is the model."""
+        models, jobs = list(models), {}
+        for k, model in enumerate(models):
+            if model is None or model.physical or self.gain(model.found.chi2) < WORTH:
+                continue
+            stays, given = held_back(model, self.base), [self.terms[i] for i in model.numbers]
+            roomy = widened(self.base.problem, model.candidate, stays, given) if stays else None
+            if roomy is not None:
+                jobs[k] = Hypothetical(model.numbers, roomy, model.found.values[None], model.log_prior, model.window)
+        for (k, one), fitted in zip(jobs.items(), self._fits(list(jobs.values())), strict=True):
+            if fitted is not None:
+                fitted = self._settled(fitted)
+                free = self._judge(Model(one.numbers, one.candidate, fitted, 0.0, one.prior, True, window=one.window))
+                models[k] = free if free.physical else models[k]
         return models
 
     def _fits(self, wanted: Sequence[Hypothetical]) -> list[Fitted | None]:
