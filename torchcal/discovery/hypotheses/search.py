@@ -39,7 +39,7 @@ ASTRAY = 1.0
 #: Log evidence by which something unknown must explain the base's residual better than any noise, to be there.
 CLEARLY = 5.0
 #: Share of the best log evidence below which a model is not fitted again when the noise estimate has changed, nor on to
-#: its end where it falls slowly.
+#: its end where it falls slowly, nor with shorter steps.
 HOPELESS = 0.5
 #: Log weight that a term's refit from another start must gain to take the place of the first.
 BETTER = 1.0
@@ -257,7 +257,7 @@ class Search:
             if fitted is None:
                 models.append(None)
                 continue
-            least = WORTH if len(one.numbers) == 1 else max(WORTH, best - NEAR)
+            least = max(WORTH, HOPELESS * best - NEAR if len(one.numbers) == 1 else best - NEAR)
             if one.window is None and self.gain(fitted.chi2) >= least:  # an edge within a step would only move
                 fitted = self._settled(fitted)
             model = Model(one.numbers, one.candidate, fitted, 0.0, one.prior, True, window=one.window)
