@@ -230,6 +230,7 @@ def test_options(options, error):
         pytest.param({"fixed": ["a"]}, id="fixed as a list"),
         pytest.param({"seed": 1.5}, id="seed as float"),
         pytest.param({"seed": -1}, id="negative seed"),
+        pytest.param({"seed": 2**31}, id="large seed"),
         pytest.param({"starts": "here"}, id="starts in words"),
         pytest.param({"device": "abacus"}, id="unknown device"),
         pytest.param({"num_samples": 2, "dtype": torch.int64}, id="integer dtype"),

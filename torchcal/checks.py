@@ -7,7 +7,10 @@ import torch
 
 from torchcal.errors import DomainError
 
-__all__ = ["by_default_on_cpu", "outside_inference_mode", "whole"]
+__all__ = ["as_seed", "by_default_on_cpu", "outside_inference_mode", "whole"]
+
+#: The largest seed: generators take 32 bits, and chains add to it.
+LARGEST = 2**31 - 1
 
 
 def by_default_on_cpu() -> None:
@@ -55,3 +58,15 @@ def whole(name: str, value: Any, minimum: int, *, also: str = "", advice: str = 
         tail = f" ({advice})" if advice else ""
         raise DomainError(f"Expected {name} to be {wanted}. Got {name}={value!r}{tail}.")
     return number
+
+
+def as_seed(value: Any) -> int:
+    """Return a seed as an ``int``: one that every generator takes, with what is added to it for each chain.
+
+    Raises:
+        DomainError: If ``value`` is not a whole number from 0 to 2**31 - 1.
+    """
+    seed = whole("seed", value, 0)
+    if seed > LARGEST:
+        raise DomainError(f"Expected seed to be a whole number from 0 to {LARGEST}. Got seed={seed} (choose a smaller one).")
+    return seed

@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 from tqdm.auto import tqdm
 
-from torchcal.checks import outside_inference_mode, whole
+from torchcal.checks import as_seed, outside_inference_mode, whole
 from torchcal.data import Recording
 from torchcal.discovery.conclude import Asked, conclude
 from torchcal.discovery.findings.result import Diagnosis
@@ -94,7 +94,7 @@ def diagnose(
     begun = time.perf_counter()
     given = _check(simulator, recording, candidates, confidence)
     max_terms, num_starts = whole("max_terms", max_terms, 1), whole("num_starts", num_starts, 1)
-    seed = whole("seed", seed, 0)
+    seed = as_seed(seed)
     check_executor(executor, diagnose)
     asked = Asked(simulator, recording, given, confidence, seed, begun)
     terms = [term for term in given if not _contains(simulator, term)]

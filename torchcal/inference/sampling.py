@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcal import models
-from torchcal.checks import whole
+from torchcal.checks import as_seed, whole
 from torchcal.errors import ConvergenceWarning, DomainError, ImproperPosteriorError, warn
 from torchcal.inference.batched import MOST_ELEMENTS, run_batched
 from torchcal.inference.by_hand import by_hand
@@ -62,9 +62,10 @@ class Plan:
     def __post_init__(self) -> None:
         if self.sampler not in ("nuts", "hmc", "pyro"):
             raise DomainError(f"Expected sampler 'nuts', 'hmc' or 'pyro'. Got {self.sampler!r}.")
-        for name, least in (("num_samples", 0), ("num_chains", 1), ("num_warmup", 1), ("seed", 0)):
+        object.__setattr__(self, "seed", as_seed(self.seed))
+        for name, least in (("num_samples", 0), ("num_chains", 1), ("num_warmup", 1)):
             value = getattr(self, name)
-            if name == "seed" or value is not None:
+            if value is not None:
                 object.__setattr__(self, name, whole(name, value, least))  # an integer of NumPy's is one too
         if self.dtype not in (torch.float32, torch.float64):
             raise DomainError(f"Expected dtype torch.float64 or torch.float32. Got {self.dtype!r}.")

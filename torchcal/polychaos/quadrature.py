@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.quasirandom import SobolEngine
 
-from torchcal.checks import whole
+from torchcal.checks import as_seed, whole
 from torchcal.errors import DomainError, ShapeError
 from torchcal.polychaos._checks import limit_rows
 from torchcal.polychaos.basis import Basis
@@ -206,7 +206,7 @@ def qmc_rule(basis: Basis, dim: int, num: int, seed: int) -> Rule:
     """
     dim = whole("dim", dim, 0)
     num = whole("num", num, 1)
-    seed = whole("seed", seed, 0)
+    seed = as_seed(seed)
     if dim > SobolEngine.MAXDIM:
         raise DomainError(f"Expected dim <= {SobolEngine.MAXDIM} for Sobol points. Got {dim=} (embed fewer).")
     limit_rows("the quasi-Monte Carlo rule", num, advice="use fewer nodes")

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from torchcal import polychaos
-from torchcal.checks import by_default_on_cpu, whole
+from torchcal.checks import as_seed, by_default_on_cpu, whole
 from torchcal.data.conditions import checked
 from torchcal.embeddings import Embedding, Pattern
 from torchcal.errors import DomainError, EmbeddingError, ShapeError
@@ -269,7 +269,7 @@ class NISP(nn.Module):
 
     def draw_germ(self, num: int, *, seed: int) -> Tensor:
         """Independent draws of ξ, ``(num, germs)``."""
-        generator = torch.Generator().manual_seed(whole("seed", seed, 0))
+        generator = torch.Generator().manual_seed(as_seed(seed))
         draws = self.pattern.basis.sample((num, self.pattern.num_germs), generator=generator)
         return draws.to(self.nodes)
 

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchcal.checks import whole
+from torchcal.checks import as_seed, whole
 from torchcal.data import Recording
 from torchcal.embeddings import Embedding
 from torchcal.errors import DomainError
@@ -160,7 +160,7 @@ class Calibration(Result):
         return kind
 
     def _joint_draws(self, propagate: NISP, num: int, kind: str, seed: int) -> tuple[Tensor, Tensor]:
-        num, seed = whole("num", num, 0), whole("seed", seed, 0)
+        num, seed = whole("num", num, 0), as_seed(seed)
         like = propagate.nodes
         xi = propagate.draw_germ(num, seed=seed)
         draws = self.draws

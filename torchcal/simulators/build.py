@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchcal import polychaos
-from torchcal.checks import whole
+from torchcal.checks import as_seed, whole
 from torchcal.errors import DomainError, SimulatorError, SurrogateWarning, warn
 from torchcal.polychaos._checks import limit_rows
 from torchcal.simulators.design import Evaluations, evaluate_points
@@ -100,7 +100,7 @@ def build_surrogate(
     dim = len(bounds) + len(parameters)
     order = whole("order", order, 1)
     counts = _check_nodes(nodes, order, dim)
-    holdout, seed = whole("holdout", holdout, 10), whole("seed", seed, 0)
+    holdout, seed = whole("holdout", holdout, 10), as_seed(seed)
     if not (isinstance(threshold, int | float) and threshold > 0):
         raise DomainError(f"Expected threshold > 0. Got {threshold!r}.")
     external = not isinstance(simulator, Simulator) or isinstance(simulator, ExternalSimulator)
