@@ -68,5 +68,5 @@ def as_seed(value: Any) -> int:
     """
     seed = whole("seed", value, 0)
     if seed > LARGEST:
-        raise DomainError(f"Expected seed to be a whole number from 0 to {LARGEST}. Got seed={seed} (choose a smaller one).")
+        raise DomainError(f"Expected seed from 0 to {LARGEST}. Got seed={seed} (choose a smaller one).")
     return seed
