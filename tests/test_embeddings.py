@@ -99,13 +99,23 @@ def test_order_one_equals_gaussian():
         (Gaussian(parameters=("d",)), r"Got \['d'\]"),
         (Gaussian(parameters=("a", "a")), r"\['a'\] more than once"),
         (Gaussian(parameters=()), "at least one embedded parameter"),
-        (Gaussian(parameters="a"), "Write parameters="),
         (PolynomialChaos(parameters=("d",), order=0), r"Got \['d'\]"),
     ],
 )
 def test_embedding_of_what_is_not_there_is_refused(embedding, message):
     with pytest.raises(EmbeddingError, match=message):
         embedding.bind(NAMES)
+
+
+@pytest.mark.parametrize("kind", [Gaussian, PolynomialChaos])
+@pytest.mark.parametrize("given", ["a", 5])
+def test_parameters_that_are_no_sequence_are_refused_at_once(kind, given):
+    with pytest.raises(EmbeddingError, match="Write parameters="):
+        kind(parameters=given)
+
+
+def test_names_may_come_one_by_one():
+    assert Gaussian(parameters=(name for name in "ab")).bind(["a", "b", "c"]).embedded == ("a", "b")
 
 
 @pytest.mark.parametrize("bad", [{"order": -1}, {"order": 1.0}, {"order": True}, {"germ": "cauchy"}])

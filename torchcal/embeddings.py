@@ -134,6 +134,9 @@ class Embedding:
     Args:
         parameters: Names of the uncertain parameters; None for all free ones (in time: but initial states, and
             parameters that each run has one of). The other free parameters are inferred as plain unknowns.
+
+    Raises:
+        EmbeddingError: If ``parameters`` is no sequence of names.
     """
 
     parameters: Sequence[str] | None = None
@@ -141,6 +144,22 @@ class Embedding:
     order = 1
     germ = "hermite"
     triangular = True
+
+    def __post_init__(self) -> None:
+        if self.parameters is None:
+            return
+        if isinstance(self.parameters, str):
+            raise EmbeddingError(
+                f"Expected a sequence of parameter names. Got the string {self.parameters!r}. "
+                f"Write parameters=({self.parameters!r},)."
+            )
+        try:
+            object.__setattr__(self, "parameters", tuple(self.parameters))
+        except TypeError:
+            raise EmbeddingError(
+                f"Expected a sequence of parameter names. Got {self.parameters!r}. Write parameters=('k',), for a "
+                "parameter that is called k."
+            ) from None
 
     def sparing(self, names: Sequence[str], nuisance: Sequence[str]) -> "Embedding":
         """The same embedding; where it names no parameters, of ``names`` without those of ``nuisance``.
@@ -165,11 +184,6 @@ class Embedding:
             EmbeddingError: If an embedded parameter does not exist, is not free, or is named twice.
         """
         names = tuple(names)
-        if isinstance(self.parameters, str):
-            raise EmbeddingError(
-                f"Expected a sequence of parameter names. Got the string {self.parameters!r}. "
-                f"Write parameters=({self.parameters!r},)."
-            )
         embedded = names if self.parameters is None else tuple(self.parameters)
         unknown = [name for name in embedded if name not in names]
         if unknown:
@@ -254,5 +268,6 @@ class PolynomialChaos(Embedding):
     triangular: bool = True
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         object.__setattr__(self, "order", whole("order", self.order, 0))
         polychaos.get_basis(self.germ)
