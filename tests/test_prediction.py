@@ -227,6 +227,22 @@ def test_normal_embeddings_are_averaged_exactly(embedding):
     np.testing.assert_allclose(parameter_density(propagate, alpha, points).numpy(), expected, rtol=1e-9)
 
 
+@pytest.mark.parametrize("sd", [0.5, 3.0])
+@pytest.mark.parametrize("order", [1, 2])
+def test_the_density_of_a_parameter_on_a_logarithmic_scale_is_none_below_zero(order, sd):
+    propagate = NISP(
+        Simulator(lambda x, p: p["k"].log() + x, [Parameter("k", transform="log", initial=2.0)]),
+        PolynomialChaos(order=order), X,
+    )  # fmt: skip
+    alpha = torch.tensor([[0.3, sd, 0.0][: order + 1], [0.1, sd, 0.0][: order + 1]], dtype=torch.float64)
+    k = torch.tensor([[-1.0], [0.0], [2 * math.exp(-sd)], [2.0], [2 * math.exp(1.2 * sd)]], dtype=torch.float64)
+    expected = [stats.lognorm(sd, scale=2 * math.exp(m)).pdf(k[:, 0].numpy()) for m in (0.3, 0.1)]
+    # With the square, draws: 20000, bandwidth 0.15 of the sd.
+    tolerance = 1e-9 if order == 1 else 0.1
+    found = parameter_density(propagate, alpha, k).numpy()
+    np.testing.assert_allclose(found, np.mean(expected, axis=0), rtol=tolerance)
+
+
 @pytest.mark.parametrize(
     ("embedding", "parameters", "tolerance"),
     [

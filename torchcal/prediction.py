@@ -171,8 +171,9 @@ def parameter_density(propagate: NISP, alpha: Tensor, points: Tensor, *, seed: i
 
     .. math:: p(\lambda | D) = E_\alpha[\pi_\lambda(\lambda; \alpha)]
 
-    A first-order normal embedding of every free parameter is averaged exactly; otherwise, or where a density is
-    singular, a normal kernel density estimate of draws of λ is used.
+    A first-order normal embedding of every free parameter, or of its logarithm where it has ``transform="log"``, is
+    averaged exactly; otherwise, or where a density is singular, a normal kernel density estimate of draws of these is
+    used.
 
     Args:
         propagate: The propagation.
@@ -195,25 +196,41 @@ def parameter_density(propagate: NISP, alpha: Tensor, points: Tensor, *, seed: i
     pattern, scaling = propagate.pattern, propagate.scaling
     alpha = _result(alpha)
     points = points.to(torch.float64)
-    exact = pattern.basis.name == "hermite" and pattern.order == 1 and pattern.embedded == pattern.names
-    if exact and not bool(scaling.log.any()):
-        mean, covariance = propagate.parameter_moments(alpha.to(propagate.nodes))
-        mean, covariance = _result(mean), _result(covariance)
-        factor, failed = torch.linalg.cholesky_ex(covariance / scaling.scale.outer(scaling.scale))
-        if not bool(failed.any()) and bool((factor.diagonal(dim1=-2, dim2=-1) > 1e-7).all()):
-            total = torch.zeros(len(points), dtype=torch.float64)
-            constant = scaling.scale.log().sum() + 0.5 * len(scaling.scale) * math.log(2 * math.pi)
-            for m, f in zip(mean.split(256), factor.split(256), strict=True):
-                offset = ((points - m.unsqueeze(1)) / scaling.scale).transpose(-1, -2)
-                white = torch.linalg.solve_triangular(f, offset, upper=False)
-                log_det = f.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
-                total += (-0.5 * white.square().sum(-2) - log_det - constant).exp().sum(0)
-            return total / len(mean)
-    num = max(1, 20_000 // len(alpha))
-    xi = propagate.draw_germ(num * len(alpha), seed=seed).reshape(len(alpha), num, -1)
-    psi = polychaos.evaluate(pattern.basis, pattern.indices, _result(xi))
-    draws = scaling.physical(torch.einsum("adk,ask->asd", pattern.matrix(alpha), psi))
-    return kernel_density(draws.reshape(-1, draws.shape[-1]), points)
+    log = scaling.log
+    known = torch.where(log, points > 0, torch.ones_like(points, dtype=torch.bool)).all(-1)
+    where = points[known]
+    size = torch.where(log, where, torch.ones_like(where)).prod(-1)  # of a physical unit, in units of ln λ
+    coordinates = torch.where(log, where.log(), where)
+    density = torch.zeros(len(points), dtype=torch.float64)
+    found = _averaged_exactly(propagate, alpha, coordinates)
+    if found is None:
+        num = max(1, 20_000 // len(alpha))
+        xi = propagate.draw_germ(num * len(alpha), seed=seed).reshape(len(alpha), num, -1)
+        psi = polychaos.evaluate(pattern.basis, pattern.indices, _result(xi))
+        draws = scaling.center + scaling.scale * torch.einsum("adk,ask->asd", pattern.matrix(alpha), psi)
+        found = kernel_density(draws.reshape(-1, draws.shape[-1]), coordinates)
+    density[known] = found / size
+    return density
+
+
+def _averaged_exactly(propagate: NISP, alpha: Tensor, points: Tensor) -> Tensor | None:
+    """The average of normal densities at points ``(M, d)``, ln λ where a parameter is on a logarithmic scale; None
+    where they are not normal, or one is singular."""
+    pattern, scaling = propagate.pattern, propagate.scaling
+    if not (pattern.basis.name == "hermite" and pattern.order == 1 and pattern.embedded == pattern.names):
+        return None
+    matrix = pattern.matrix(alpha)
+    factor, failed = torch.linalg.cholesky_ex(matrix[..., 1:] @ matrix[..., 1:].transpose(-1, -2))
+    if bool(failed.any()) or not bool((factor.diagonal(dim1=-2, dim2=-1) > 1e-7).all()):
+        return None
+    total = torch.zeros(len(points), dtype=torch.float64)
+    constant = scaling.scale.log().sum() + 0.5 * len(scaling.scale) * math.log(2 * math.pi)
+    scaled = (points - scaling.center) / scaling.scale
+    for m, f in zip(matrix[..., 0].split(256), factor.split(256), strict=True):
+        white = torch.linalg.solve_triangular(f, (scaled - m.unsqueeze(1)).transpose(-1, -2), upper=False)
+        log_det = f.diagonal(dim1=-2, dim2=-1).log().sum(-1, keepdim=True)
+        total += (-0.5 * white.square().sum(-2) - log_det - constant).exp().sum(0)
+    return total / len(alpha)
 
 
 def kernel_density(draws: Tensor, points: Tensor) -> Tensor:
