@@ -32,6 +32,7 @@ from torchcal import (
     calibrate_many,
     embeddings,
     likelihoods,
+    priors,
 )
 from torchcal.errors import (
     ConvergenceWarning,
@@ -544,6 +545,37 @@ def test_results_of_other_inputs_are_refused(tmp_path):
     calibrate_many(linear(), records(), folder=tmp_path, **MAP_ALONE)
     (tmp_path / "w.nc").write_bytes(b"not netCDF")
     refused("Got another file")
+
+
+SCALE = 1.0
+
+
+def normal(scale):
+    return lambda propagate: priors.Normal(propagate, scale=scale)
+
+
+def test_results_of_another_prior_of_the_same_name_are_refused(tmp_path, monkeypatch):
+    """Functions in one file have one name if they are lambdas, and may take values from elsewhere."""
+    for number, (first, second) in enumerate([
+        (lambda propagate: priors.Normal(propagate, scale=1.0), lambda propagate: priors.Normal(propagate, scale=2.0)),
+        (normal(1.0), normal(2.0)),
+        (lambda q, s=1.0: priors.Normal(q, scale=s), lambda q, s=2.0: priors.Normal(q, scale=s)),
+        (functools.partial(priors.Normal, scale=1.0), functools.partial(priors.Normal, scale=2.0)),
+    ]):  # fmt: skip
+        folder = tmp_path / str(number)
+        one = {"u": records()["u"]}
+        found = calibrate_many(linear(), one, folder=folder, prior=first, **MAP_ALONE)
+        assert same(calibrate_many(linear(), one, folder=folder, prior=first, **MAP_ALONE)["u"], found["u"])
+        with pytest.raises(DomainError, match="another prior"):
+            calibrate_many(linear(), one, folder=folder, prior=second, **MAP_ALONE)
+
+    def of_the_file(propagate):
+        return priors.Normal(propagate, scale=SCALE)
+
+    calibrate_many(linear(), one, folder=tmp_path / "file", prior=of_the_file, **MAP_ALONE)
+    monkeypatch.setitem(globals(), "SCALE", 2.0)
+    with pytest.raises(DomainError, match="another prior"):
+        calibrate_many(linear(), one, folder=tmp_path / "file", prior=of_the_file, **MAP_ALONE)
 
 
 @pytest.mark.parametrize(

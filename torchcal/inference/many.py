@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor
 from pathlib import Path
+from types import CodeType
 from typing import Any, overload
 from urllib.parse import quote
 
@@ -336,7 +337,7 @@ class _Folder:
 
 
 def _text(value: Any) -> str:
-    """What a value is, the same in every process: functions by their names, arrays by their contents."""
+    """What a value is, the same in every process: arrays and functions by their contents, classes by their names."""
     if isinstance(value, Tensor):
         value = value.detach().cpu().numpy()
     if isinstance(value, np.ndarray):
@@ -347,10 +348,56 @@ def _text(value: Any) -> str:
         return "[" + ", ".join(_text(item) for item in value) + "]"
     if isinstance(value, functools.partial):
         return f"partial{_text([value.func, value.args, value.keywords])}"
+    if inspect.ismethod(value):
+        return f"method{_text([value.__func__, value.__self__])}"
     if hasattr(value, "__qualname__"):
-        return f"{value.__module__}.{value.__qualname__}"
+        return f"{value.__module__}.{value.__qualname__}" + _does(value)
     if dataclasses.is_dataclass(value):
         return type(value).__qualname__ + _text({f.name: getattr(value, f.name) for f in dataclasses.fields(value)})
     if repr(value) == object.__repr__(value):
         return type(value).__qualname__ + _text(getattr(value, "__dict__", {}))
     return repr(value)
+
+
+def _does(function: Any, within: tuple[CodeType, ...] = ()) -> str:
+    """What a function does that is not torchcal's: its code, and the values that this takes from elsewhere."""
+    code = getattr(function, "__code__", None)
+    if code is None or code in within or str(function.__module__).split(".")[0] == "torchcal":
+        return ""
+    inside, names = _code(code)
+    cells = [_cell(cell) for cell in function.__closure__ or ()]
+    known = [function.__globals__[name] for name in names if name in function.__globals__]
+    taken = [function.__defaults__, function.__kwdefaults__, *cells, *known]
+    told = repr([inside, [_taken(value, (*within, code)) for value in taken]])
+    return hashlib.sha256(told.encode()).hexdigest()
+
+
+def _taken(value: Any, within: tuple[CodeType, ...]) -> str:
+    """A value that a function takes from elsewhere; of what is no number, text or function its type alone."""
+    if inspect.isfunction(value):
+        return _does(value, within)
+    if isinstance(value, Mapping):
+        return "".join(f"{key}: {_taken(item, within)}, " for key, item in value.items())
+    if isinstance(value, list | tuple):
+        return "".join(f"{_taken(item, within)}, " for item in value)
+    plain = isinstance(value, Tensor | np.ndarray | np.generic | int | float | complex | str | bytes | None)
+    return _text(value) if plain else type(value).__qualname__
+
+
+def _code(code: CodeType) -> tuple[list[str], list[str]]:
+    """Instructions and constants of a function and those within it, and the names that they look up elsewhere."""
+    inside, names = [code.co_code.hex(), *code.co_names], list(code.co_names)
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            more = _code(constant)
+            inside, names = inside + more[0], names + more[1]
+        else:  # a set has another order in every process
+            inside.append(repr(sorted(map(repr, constant)) if isinstance(constant, frozenset) else constant))
+    return inside, names
+
+
+def _cell(cell: Any) -> Any:
+    try:
+        return cell.cell_contents
+    except ValueError:  # not filled yet
+        return None

@@ -48,10 +48,11 @@ def parameter_density(
 ) -> "Axes":
     r"""Contours of :math:`\pi_\lambda(\lambda; \alpha_{MAP})` and of its average over the posterior (Eq. 44).
 
-    A contour encloses the most likely region of a given probability. Grids follow the principal axes of each
-    density, so that a narrow sloping ridge is resolved. Normal densities are drawn as exact ellipses; a singular
-    one is the line, or point, that it is. The average over draws is exact where there are two normal parameters
-    (see `torchcal.prediction.parameter_density`), else a kernel estimate.
+    A contour encloses the most likely region of a given probability, by the density of ln λ where a parameter has
+    ``transform="log"``. Grids follow the principal axes of each density, so that a narrow sloping ridge is resolved.
+    Normal densities are drawn as exact ellipses; a singular one is the line, or point, that it is. The average over
+    draws is exact where there are two normal parameters (see `torchcal.prediction.parameter_density`), else a kernel
+    estimate.
 
     Args:
         propagate: The propagation that α belongs to.
@@ -163,6 +164,19 @@ def _samples(propagate: NISP, alpha: Tensor, pair: tuple[int, int], num_samples:
     return torch.cat(parts).cpu().double().numpy()
 
 
+def _density(
+    propagate: NISP, alpha: Tensor, pair: tuple[int, int], num_samples: int, seed: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """A kernel density of two parameters on a grid, per unit of ln λ where one is on a logarithmic scale."""
+    draws = _samples(propagate, alpha, pair, num_samples, seed)
+    log = propagate.scaling.log[list(pair)].tolist()
+    found = pair_density(np.stack([np.log(d) if on else d for d, on in zip(draws.T, log, strict=True)], -1))
+    if found is None:
+        return None
+    x, y = (np.exp(grid) if on else grid for grid, on in zip(found[:2], log, strict=True))
+    return x, y, found[2]
+
+
 def _flat(axes: np.ndarray, covariance: np.ndarray) -> bool:
     """Whether a density lies on a line, to the digits that a grid can carry."""
     scale = np.sqrt(np.diagonal(covariance).clip(0))
@@ -223,7 +237,7 @@ def _draw_one(
             outline = _level(*_ellipse(center, axes, level), shear)
             ax.plot(*outline, **look, zorder=5, label="MAP predictive" if i == 0 else "_MAP predictive")
         return np.stack(outline, -1)
-    found = pair_density(_samples(propagate, alpha[None], pair, num, seed))
+    found = _density(propagate, alpha[None], pair, num, seed)
     if found is None:
         return np.stack(middle, -1)
     x, y = _level(found[0], found[1], shear)
@@ -259,7 +273,7 @@ def _draw_average(
         # Under 1 % wider: hides the specks of single draws that are narrower than a cell.
         found = x, y, smooth(smooth(z, 1.5, 0), 1.5, 1)
     elif not flat:
-        found = pair_density(_samples(propagate, alpha, pair, num, seed))
+        found = _density(propagate, alpha, pair, num, seed)
     heights = [] if found is None else contour_heights(found[2], levels)
     if found is None or not heights:
         outline = _level(*_ellipse(center, axes, levels[-1]), shear)
