@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy import optimize, stats
 
-from torchcal import NISP, Parameter, Simulator
+from torchcal import NISP, Parameter, Recording, Simulator, calibrate
 from torchcal.embeddings import Gaussian
 from torchcal.errors import DegenerateLikelihoodError, DomainError, ShapeError
 from torchcal.likelihoods import (
@@ -41,7 +41,7 @@ NOISE = torch.tensor([0.3, 0.1, 0.5, 0.2, 1.5, 0.4], dtype=torch.float64)
 # --- moment likelihoods ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("gamma", [1.0, 0.5])
+@pytest.mark.parametrize("gamma", [1.0, 0.5, 200.0])
 @pytest.mark.parametrize("epsilon", [0.1, 2.0])
 @pytest.mark.parametrize("noise", [None, NOISE])
 def test_abc_is_equation_24(epsilon, gamma, noise):
@@ -49,7 +49,7 @@ def test_abc_is_equation_24(epsilon, gamma, noise):
     assert found.shape == (2, 3)
     r2 = (MEAN - Y).numpy() ** 2
     unexplained = r2 if noise is None else np.maximum(r2 - noise.numpy() ** 2, 0)
-    delta = SMOOTHING * epsilon
+    delta = 1e-3 * epsilon / max(1, gamma)
     wanted = gamma * np.sqrt(unexplained + delta**2)
     expected = -(r2 + (SD.numpy() - wanted) ** 2).sum(-1) / (2 * epsilon**2)
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-12)
@@ -65,6 +65,14 @@ def test_abc_without_smoothing_is_the_papers_formula():
     exact = -0.5 * (r**2 + (SD - r) ** 2).sum(-1) / epsilon**2
     bound = 0.5 * SMOOTHING**2 * ((SD - r).abs() / r).sum(-1) + SMOOTHING**4 * 6
     assert ((ABC(epsilon=epsilon).log_prob(Y, MEAN, SD) - exact).abs() <= bound + 1e-9).all()
+
+
+@pytest.mark.parametrize("gamma", [1.0, 1e4])
+def test_a_model_that_is_right_wants_no_spread_however_large_the_ratio(gamma):
+    line = Simulator(lambda x, p: p["a"] + p["b"] * x, [Parameter("a"), Parameter("b")])
+    x = torch.linspace(0, 1, 6, dtype=torch.float64)
+    found = calibrate(line, Recording(x=x, y=1 + x), likelihood=ABC(0.01, gamma), num_samples=0, progress=False)
+    assert float(found.predict().map.sd.max()) <= 1.1e-5  # a thousandth of the tolerance
 
 
 def test_abc_asks_the_sd_for_what_noise_does_not_explain():

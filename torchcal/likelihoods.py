@@ -11,7 +11,7 @@ Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -29,13 +29,14 @@ __all__ = [
     "Marginal",
     "abc_log_prob",
     "get",
+    "rounding",
 ]
 
 DEFAULT_TOLERANCE = 0.01
 """ε as a share of the sd of the data, where none is given: a visible but small part of what there is to fit."""
 
 SMOOTHING = 1e-3
-"""δ as a share of ε. It rounds the kink of |μ − y| at a width far below the tolerance."""
+"""δ as a share of ε. It rounds the kink of γ|μ − y| at a width far below the tolerance."""
 
 
 def _positive(value: float | Tensor, name: str) -> None:
@@ -77,6 +78,11 @@ def _per_output(number: float | Tensor, y: Tensor, name: str) -> Tensor:
     return value
 
 
+def rounding(epsilon: Any, gamma: Any) -> Any:
+    """δ of `abc_log_prob`, in the unit of the tolerance ε: neither it nor γδ is more than a thousandth of that."""
+    return SMOOTHING * epsilon / max(1.0, float(gamma))
+
+
 def abc_log_prob(
     y: Tensor,
     mean: Tensor,
@@ -90,7 +96,8 @@ def abc_log_prob(
 
     .. math:: -\frac{1}{2\varepsilon^2} \sum_i (\mu_i - y_i)^2 + (\sigma_i - \gamma |\mu_i - y_i|)^2
 
-    With a noise sd s the wanted spread is :math:`\gamma \sqrt{\max((\mu_i - y_i)^2 - s_i^2, 0) + \delta^2}`.
+    With a noise sd s the wanted spread is :math:`\gamma \sqrt{\max((\mu_i - y_i)^2 - s_i^2, 0) + \delta^2}`
+    with :math:`\delta = 10^{-3} \varepsilon / \max(1, \gamma)`.
 
     Args:
         y: Recorded outputs, shape ``(n,)``, in the recording's unit.
@@ -119,7 +126,7 @@ def abc_log_prob(
     epsilon = _per_output(epsilon, y, "epsilon")
     squared = (mean - y).square()
     unexplained = squared if noise is None else (squared - noise.square()).clamp_min(0)
-    wanted = gamma * (unexplained + (SMOOTHING * epsilon).square()).sqrt()
+    wanted = gamma * (unexplained + rounding(epsilon, gamma) ** 2).sqrt()
     return -0.5 * ((squared + (sd - wanted).square()) / epsilon.square()).sum(-1)
 
 

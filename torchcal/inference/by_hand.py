@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchcal import priors
 from torchcal.inference.coordinates import Slopes
-from torchcal.likelihoods import ABC, SMOOTHING
+from torchcal.likelihoods import ABC, rounding
 from torchcal.models import Problem
 from torchcal.priors import Bounds
 from torchcal.propagation.closed import QUIET, moment_slopes
@@ -63,7 +63,7 @@ class ByHand:
             torch.as_tensor(value, dtype=problem.y.dtype).detach().expand(self._y.shape).numpy()
             for value in (epsilon, gamma)
         )
-        self._smallest, self._precision, self._floor = (SMOOTHING * tolerance) ** 2, tolerance**-2.0, floor**2
+        self._smallest, self._precision, self._floor = rounding(tolerance, gamma) ** 2, tolerance**-2.0, floor**2
         self._coordinates = None if bounds.free else _Coordinates(bounds)
         self._prior = float(problem.prior.log_prob(bounds.bound(torch.zeros_like(bounds.low))))
 
