@@ -1,5 +1,6 @@
 """float32 within stated error of float64; and on a GPU, where there is one."""
 
+import contextlib
 import dataclasses
 import warnings
 
@@ -162,3 +163,15 @@ def test_a_tolerance_that_single_precision_cannot_resolve_is_refused_before_the_
         warnings.simplefilter("always")
         tc.calibrate(line, recording, likelihood=tc.likelihoods.ABC(epsilon=3e-4), **options)
     assert any("distorts the draws. Use dtype=torch.float64" in str(w.message) for w in told)
+
+
+@pytest.mark.parametrize("calibrate", [tc.calibrate, tc.calibrate_additive])
+def test_what_is_small_beside_an_offset_is_not_drawn_in_single_precision(calibrate):
+    x = torch.linspace(-1, 1, 21, dtype=torch.float64)
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    options = {"num_samples": 4, "num_warmup": 20, "num_chains": 2, "num_starts": 8, "dtype": torch.float32}
+    refused = pytest.raises(DomainError, match=r"torch\.float32.*data that are not small beside an offset")
+    for offset in (0.0, 1e6):
+        with warnings.catch_warnings(), (refused if offset else contextlib.nullcontext()):
+            warnings.simplefilter("ignore", tc.errors.TorchcalWarning)
+            calibrate(line, tc.Recording(x=x, y=offset + x + 0.3 * x**2), **options)

@@ -29,8 +29,15 @@ _FEWEST_CHAINS, _MOST_CHAINS, _DRAWS_EACH = 32, 400, 120
 MOST_DRAWS = 20_000
 """Draws of a chain at which a search for a wanted sample size gives up."""
 
-FELT, LOST = 0.05, 0.2
+FELT, LOST = 0.2, 0.5
 """Rounding of a log-density that distorts draws, and that hides differences of about 0.5, which a sampler goes by."""
+
+_ROUNDINGS = 4
+"""Of a sum of squares, in roundings of its value; measured on straight lines."""
+
+
+_TRIED, _FAR = 64, 20.0
+"""Points at which roundings are looked at, and log-density below the largest from which on a point plays no part."""
 
 
 @dataclass(frozen=True)
@@ -123,9 +130,11 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
             f"{', '.join(estimate.improper)}, under a flat prior. Hold a parameter with fixed=, use a Uniform prior, "
             "or num_samples=0 for the maximum alone."
         )
-    _check_rounding(estimate, plan.dtype)
+    _check_rounding(plan.dtype, _ROUNDINGS * abs(estimate.posterior_objective) * torch.finfo(plan.dtype).eps)
     modes = modes_of(problem, estimate)
     cast = problem.cast(plan.dtype)
+    if cast is not problem:  # outputs that are small beside an offset are known less well than their squares
+        _check_rounding(plan.dtype, _rounding(problem, cast, modes[0]))
     worth = [k for k, mode in enumerate(modes) if k == 0 or (mode.weight >= WORTH_CHAINS and plan.sampler != "pyro")]
     starts = [modes[k].to(plan.dtype) for k in worth]
     begun = {worth[k] for k in dealt_out([mode.weight for mode in starts], plan.chains(cast.cost))}
@@ -228,22 +237,37 @@ def _draw_with_pyro(problem: Problem, mode: Laplace, model: Any, plan: Plan) -> 
     )
 
 
-def _check_rounding(estimate: Estimate, dtype: torch.dtype) -> None:
-    """Differences of a log-density are known to its magnitude times the dtype's resolution.
+def _check_rounding(dtype: torch.dtype, error: float) -> None:
+    """Raise or warn for a log-density that is known to an error.
 
     Where that is `FELT`, draws are distorted; where it is `LOST`, no step is short enough, and the warm-up hardly ends.
     """
-    size = abs(estimate.posterior_objective)
-    error = size * torch.finfo(dtype).eps
-    instead = "a larger epsilon=" if dtype == torch.float64 else "dtype=torch.float64, or a larger epsilon="
+    instead = "a larger epsilon="
+    if dtype != torch.float64:
+        instead = "dtype=torch.float64, or data that are not small beside an offset, or a larger epsilon="
     if error > LOST:
         raise DomainError(
-            f"Expected a log-posterior whose differences of about 0.5 can be told in {dtype}. Got one of size "
-            f"{size:.3g} at the mode, known to {error:.2g} only. Use {instead}, or num_samples=0 for the maximum alone."
+            f"Expected a log-posterior whose differences of about 0.5 can be told in {dtype}. Got one that is known to "
+            f"{error:.2g} only near the mode. Use {instead}, or num_samples=0 for the maximum alone."
         )
     if error > FELT:
         warn(
-            f"In {dtype} the log-posterior, of size {size:.3g} at the mode, is known to {error:.2g} only, which "
-            f"distorts the draws. Use {instead}.",
+            f"In {dtype} the log-posterior is known to {error:.2g} only near the mode, which distorts the draws. Use "
+            f"{instead}.",
             ConvergenceWarning,
         )
+
+
+def _rounding(problem: Problem, cast: Problem, mode: Laplace) -> float:
+    """Sd of what a log-density in a coarser dtype errs by where the posterior is, but for a constant."""
+    random = torch.Generator().manual_seed(0)
+    z = torch.randn(_TRIED, len(mode.loc), generator=random, dtype=torch.float64).to(mode.loc)
+    u = mode.loc + z @ mode.scale_tril.T
+    with torch.no_grad():
+        exact, rounded = (
+            one.log_prob(one.prior.transform.bound(at)) + one.prior.transform.log_slope(at)
+            for one, at in ((problem, u), (cast, u.to(cast.y.dtype)))
+        )
+        error = (rounded.to(exact) - exact)[(exact > exact.max() - _FAR) & rounded.isfinite()]
+        away = (error - error.median()).abs()
+    return 1.4826 * float(away.median()) if len(away) else 0.0
