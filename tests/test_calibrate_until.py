@@ -3,6 +3,7 @@
 import math
 import warnings
 
+import numpy as np
 import pytest
 import torch
 
@@ -285,3 +286,10 @@ def test_modes_of_an_additive_calibration_survive_saving(tmp_path):
     result.save(tmp_path / "result.nc")
     assert AdditiveCalibration.load(tmp_path / "result.nc").diagnostics.modes == result.diagnostics.modes
     assert len(result.diagnostics.modes) == 1
+
+
+def test_numbers_of_numpys_are_numbers():
+    plan = sampling.Plan(5, 2, 3, "nuts", np.int64(4), torch.float64, np.float32(0.5), False, np.int64(400))
+    assert (plan.seed, plan.target_accept, plan.target_ess) == (4, 0.5, 400.0)
+    with pytest.raises(DomainError, match="target_accept between 0 and 1"):
+        sampling.Plan(5, 2, 3, "nuts", 0, torch.float64, "0.5", False)

@@ -612,3 +612,19 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
         build(smooth).save(path)
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == ["file.npz"]
+
+
+def test_a_posterior_that_leaves_the_box_is_told_though_the_maximum_does_not():
+    """The box is held against what predictions average over: the polynomial explodes where tanh does not."""
+    x = torch.linspace(0, 1, 4, dtype=torch.float64)
+    bent = Simulator(lambda x, p: torch.tanh(2 * p["a"]) * (1 + x), [Parameter("a", low=-1.0, high=1.0)])
+    surrogate = build_surrogate(bent, conditions=(0.0, 1.0), order=9, progress=False)
+    recording = Recording(x=x, y=0.1 * (1 + x))
+    options = {"num_starts": 8, "num_warmup": 60, "seed": 0, "progress": False}
+    for epsilon, told in ((0.1, False), (3.0, True)):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            found = calibrate(surrogate, recording, likelihood=ABC(epsilon=epsilon), num_samples=200, **options)
+        assert float((found.sample_parameters(2000, kind="map").abs() > 1).double().mean()) == 0
+        texts = [str(one.message) for one in caught if one.category is ExtrapolationWarning]
+        assert [("of the posterior of the parameters lies outside the box" in text) for text in texts] == [True] * told

@@ -147,7 +147,7 @@ def calibrate_additive(
     samples = None if draws is None else draws.alpha
     quality = diagnose(estimate, draws, samples, None, names, None)
     warn_of_chains(quality)
-    warn_of_box(simulator, propagate, estimate.alpha[:-1])
+    warn_of_box(simulator, propagate, estimate.alpha[:-1], None if samples is None else samples[..., :-1])
     warn_of_bounds(problem, estimate.alpha)
     mean = propagate.scaling.physical(estimate.alpha[:-1])
     result = AdditiveCalibration(

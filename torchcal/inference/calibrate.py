@@ -198,7 +198,7 @@ def calibrate(
     )
     if propagate.pattern.num_germs:
         warn_of_tolerance(quality, problem.likelihood, recording, prediction.map.sd)
-    warn_of_box(simulator, propagate, estimate.alpha)
+    warn_of_box(simulator, propagate, estimate.alpha, samples)
     warn_of_bounds(problem, estimate.alpha)
     warn_of_spike(problem, estimate.alpha)
     warn_of_chains(quality)

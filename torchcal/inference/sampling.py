@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import torch
@@ -77,13 +78,16 @@ class Plan:
         if self.dtype not in (torch.float32, torch.float64):
             raise DomainError(f"Expected dtype torch.float64 or torch.float32. Got {self.dtype!r}.")
         accept = self.target_accept
-        if accept is not None and not (isinstance(accept, float) and 0 < accept < 1):
-            raise DomainError(f"Expected target_accept between 0 and 1, or None. Got {accept!r}.")
+        if accept is not None:
+            if not (isinstance(accept, Real) and 0 < float(accept) < 1):
+                raise DomainError(f"Expected target_accept between 0 and 1, or None. Got {accept!r}.")
+            object.__setattr__(self, "target_accept", float(accept))
         if self.target_ess is not None:
             self._check_target(self.target_ess)
+            object.__setattr__(self, "target_ess", float(self.target_ess))
 
     def _check_target(self, target: Any) -> None:
-        if isinstance(target, bool) or not isinstance(target, int | float) or not 0 < target < math.inf:
+        if isinstance(target, bool) or not isinstance(target, Real) or not 0 < float(target) < math.inf:
             raise DomainError(f"Expected target_ess as a positive number or None. Got {target!r}.")
         if self.sampler == "pyro":
             raise DomainError(

@@ -44,6 +44,9 @@ __all__ = [
 AT_BOUND = 1e-4
 #: Share of what one parameter's spread gives at a datum below which all of them together have cancelled.
 SPIKE = 1e-2
+#: Points of a density that a surrogate's box is held against, and the share of them outside from which on it matters: a
+#: polynomial's error grows with a power of the distance.
+LOOKED_AT, OUTSIDE = 2000, 0.01
 
 
 def diagnose(
@@ -258,20 +261,28 @@ def warn_of_spike(problem: Problem, alpha: Tensor) -> None:
         )
 
 
-def warn_of_box(simulator: Simulator, propagate: NISP, alpha: Tensor) -> None:
-    """Warn where the calibrated density leaves the box that a surrogate was built on."""
+def warn_of_box(simulator: Simulator, propagate: NISP, alpha: Tensor, samples: Tensor | None) -> None:
+    """Warn where calibrated densities leave the box that a surrogate was built on: that at the maximum ``(P,)``, or
+    the average over draws ``(C, S, P)`` that predictions rest on."""
     leaves = getattr(simulator, "leaves_box", None)
     if leaves is None:
         return
-    num = 512
-    xi = propagate.draw_germ(num, seed=0)
+    xi = propagate.draw_germ(LOOKED_AT, seed=0)
+    rows = [alpha.expand(LOOKED_AT, -1)]
+    if samples is not None:
+        draws = samples.flatten(0, 1)
+        rows.append(draws[torch.linspace(0, len(draws) - 1, LOOKED_AT, device=draws.device).round().long()])
     with torch.no_grad():
-        values = propagate.with_held(propagate.parameters_at(alpha.to(propagate.nodes), xi))
-        share = float(leaves(values).to(torch.float64).mean())
-    if share > 0.05:
+        shares = [
+            float(leaves(propagate.with_held(propagate.parameters_at(row.to(propagate.nodes), xi, paired=True)))
+                  .to(torch.float64).mean())
+            for row in rows
+        ]  # fmt: skip
+    if max(shares) > OUTSIDE:
+        what = "calibrated density" if shares[0] == max(shares) else "posterior"
         warn(
-            f"{share:.0%} of the calibrated density of the parameters lies outside the box that the surrogate was "
-            "built on. Build it on a larger box.",
+            f"{max(shares):.1%} of the {what} of the parameters lies outside the box that the surrogate was built on, "
+            "where its error grows fast. Build it on a larger box.",
             ExtrapolationWarning,
         )
 
