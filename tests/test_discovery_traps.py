@@ -497,3 +497,57 @@ def test_outputs_with_noise_of_their_own_share_nothing():
     common = left + 2 * torch.as_tensor(rng.standard_normal(30)).repeat(2)
     assert _shared(problem, common, slopes) < 1e-4
     assert _shared(problem, common[:30].repeat(2), slopes[:, :0]) < 1e-4
+
+
+def remembering(n, rho, seed):
+    """Noise that follows from sample to sample, of unit sd."""
+    fresh = np.random.default_rng(seed).standard_normal(n)
+    found = fresh[:1].tolist()
+    for e in fresh[1:]:
+        found.append(rho * found[-1] + math.sqrt(1 - rho**2) * e)
+    return torch.tensor(found, dtype=F64)
+
+
+def test_what_is_left_in_the_order_of_rows_may_be_noise_or_physics():
+    """Rows of a grid in an order of its own say nothing of slow noise: what a term leaves was called unexplained."""
+    T = torch.linspace(-1, 1, 20, dtype=F64).repeat_interleave(4)
+    c = torch.tensor([1.0, 2.0, 4.0, 8.0], dtype=F64).repeat(20)
+    base = tc.Simulator(
+        lambda x, p: p["a"] + p["b"] * x["T"] + p["d"] * x["c"].log(),
+        [tc.Parameter("a"), tc.Parameter("b"), tc.Parameter("d")],
+    )
+    curved = tc.Term(
+        "curvature", outputs={"y": lambda x, p, y: y + p["q"] * x["T"] ** 2 * x["c"].log()},
+        parameters=[tc.Parameter("q")],
+    )  # fmt: skip
+    y = 1 + T + 0.3 * c.log() + 0.5 * T**2 * c.log()
+    for noise, tied in ((remembering(80, 0.8, 3), [["curvature"], list(NONE)]), (remembering(80, 0.0, 3), [])):
+        d = diagnose(base, tc.Recording(x={"T": T, "c": c}, y=y + 0.1 * noise), [curved])
+        assert (d.verdict, d.tied) == ("ambiguous" if tied else "named", tied)
+        assert ("the same conditions in another order would tell" in " ".join(str(d).split())) == bool(tied)
+
+
+@pytest.mark.parametrize(("gain", "rho"), [(0.3, 0.75), (0.3, 0.0), (0.0, 0.75)])
+def test_noise_of_two_colours_may_be_physics_where_the_evidence_comes_from_one_output(gain, rho):
+    t, k, m, source = torch.linspace(0, 10, 80, dtype=F64), 0.5, 0.25, 0.0 if gain else 0.05
+    decay, fade = torch.exp(-k * t), torch.exp(-m * t)
+    a = 2 * decay + source / k * (1 - decay)
+    b = 0.3 * fade + k * (2 - source / k) / (m - k) * (decay - fade) + source / m * (1 - fade)
+    chain = tc.ODESimulator(
+        lambda t, s, p, u: {"a": -p["k"] * s["a"], "b": p["k"] * s["a"] - p["m"] * s["b"]}, {"a": "1", "b": "1"},
+        [tc.Parameter("k", low=0.0, initial=0.4), tc.Parameter("m", low=0.0, initial=0.2)],
+    )  # fmt: skip
+    terms = [
+        tc.Term("source", equation="a", rate=lambda t, s, p, u: p["c"] + 0 * s["a"], parameters=[tc.Parameter("c")]),
+        tc.Term(
+            "gain of b", outputs={"b": lambda t, s, p, u, y: y * (1 + p["g"])}, parameters=[tc.Parameter("g")]
+        ),
+    ]
+    noise = {"a": remembering(80, 0.0, 4), "b": remembering(80, rho, 2)}
+    outputs = {"a": a + 0.02 * noise["a"], "b": (1 + gain) * b + 0.02 * noise["b"]}
+    d = diagnose(chain, tc.Recording(runs=[tc.Run(time=t, outputs=outputs)]), terms)
+    if gain and rho:
+        assert d.tied == [["gain of b"], list(NONE)]
+        assert "What it leaves of b is correlated from sample to sample" in " ".join(str(d).split())
+    else:
+        assert d.terms == ["gain of b" if gain else "source"]

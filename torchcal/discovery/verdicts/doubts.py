@@ -14,6 +14,8 @@ from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.own_noise import beside
 from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.misfit.likeliest import settled
+from torchcal.discovery.misfit.noise import GRID, LEAST, log_prior
 from torchcal.discovery.verdicts.explain import misfit_size, stated_sd
 from torchcal.discovery.verdicts.given import as_good
 from torchcal.discovery.verdicts.instruments import no_instrument, unnatural
@@ -22,7 +24,7 @@ from torchcal.errors import TorchcalError
 from torchcal.simulators import Trajectories
 from torchcal.terms import Term
 
-__all__ = ["by_hold", "distinct", "doubt", "in_common", "left_open", "unfit"]
+__all__ = ["by_hold", "distinct", "doubt", "in_common", "in_order", "left_open", "unfit"]
 
 #: Correlation from sample to sample from which on noise of unknown size may be physics that a term has left.
 SLOWEST = 0.85
@@ -35,6 +37,8 @@ ALONG = 3.3
 #: physics that acts on both, though noise of unknown size was taken to be as large; and data to spare of each, from
 #: which on that can be told.
 IN_COMMON, FEW = 0.01, 8
+#: Odds that the noise of two outputs has one correlation rather than two, below which it may be physics in one of them.
+ALIKE = 0.05
 #: Distance of a term's amplitudes from neutral, in their joint sd, up to which the data leave them open.
 OPEN = 0.1
 #: The same of a term that acts in a window, where most terms can do what a few data want, of one of several, which may
@@ -57,7 +61,9 @@ UNSEEN = 1e-7
 def doubt(search: Search, model: Model) -> str:
     """Why a model is no name, however probable, in a sentence; empty if it may be one."""
     found = _no_better(search, model) or unfit(search, model) or by_hold(search, model) or only_together(search, model)
-    return found or ("" if search.exact else _noise_or_physics(search, model) or in_common(search, model))
+    if found or search.exact:
+        return found
+    return _noise_or_physics(search, model) or in_common(search, model) or _of_two_colours(search, model)
 
 
 def unfit(search: Search, model: Model) -> str:
@@ -254,11 +260,8 @@ def _noise_or_physics(search: Search, model: Model) -> str:
     """
     noise, problem = beside(search, model), model.found.problem
     e = noise.whitening(problem).vector(model.found.residual)
-    if problem.sweeps is None and not bool(model.found.met.all()) and _along_rows(problem, e) > ALONG:
-        return (
-            "What it leaves is correlated in the order of the recording, as noise or as physics: the same conditions "
-            "in another order would tell."
-        )
+    if told := in_order(search, model):
+        return told
     for k, rho in enumerate(noise.correlation.tolist() if noise.open else ()):
         mine = e[problem.output_of == k]
         if bool(model.found.met[problem.output_of == k].all()):
@@ -269,6 +272,20 @@ def _noise_or_physics(search: Search, model: Model) -> str:
                 "noise sd, replicates or a repeated run would tell."
             )
     return ""
+
+
+def in_order(search: Search, model: Model) -> str:
+    """Whether what a model leaves goes on from row to row though rows are in no order, in a sentence; empty if not."""
+    problem = model.found.problem
+    if problem.sweeps is not None or bool(model.found.met.all()):
+        return ""
+    e = beside(search, model).whitening(problem).vector(model.found.residual)
+    if _along_rows(problem, e) <= ALONG:
+        return ""
+    return (
+        "What it leaves is correlated in the order of the recording, as noise or as physics: the same conditions in "
+        "another order would tell."
+    )
 
 
 def _evenness(e: Tensor) -> float:
@@ -320,6 +337,28 @@ def _shared(problem: Problem, e: Tensor, jacobian: Tensor) -> float:
         z = abs(product - mean) / math.sqrt(max(spread, 1.0))
         worst = min(worst, pairs * math.erfc(z / math.sqrt(2.0)))
     return worst
+
+
+def _of_two_colours(search: Search, model: Model) -> str:
+    """Whether noise of unknown size would have to be correlated in an output, from which most of the evidence for a
+    model comes, and not, or less, in another."""
+    noise, problem = settled(model.found, search.noise, search.tangents)[0], model.found.problem
+    counts = torch.bincount(problem.output_of, minlength=len(noise.correlation))
+    if not noise.open or problem.sweeps is None:
+        return ""
+    names, white = problem.recording.outputs, noise.whitening(problem)
+    gain = white.vector(search.base.residual).square() - white.vector(model.found.residual).square()
+    for a, b in itertools.permutations([k for k, n in enumerate(counts.tolist()) if n >= LEAST], 2):
+        prior = log_prior(GRID, 0.5 * (counts[a] + counts[b]).double()).softmax(0)
+        alike = float((noise.posterior[a] * noise.posterior[b] / prior).sum())
+        most = float(gain[problem.output_of == a].sum()) > 0.5 * float(gain.sum())
+        if most and noise.correlation[a] > noise.correlation[b] and alike < ALIKE:
+            return (
+                f"What it leaves of {names[a]} is correlated from sample to sample "
+                f"({float(noise.correlation[a]):.2f}), that of {names[b]} less ({float(noise.correlation[b]):.2f}): "
+                "noise may be so, or physics is left; a known noise sd, replicates or a repeated run would tell."
+            )
+    return ""
 
 
 def _along_rows(problem: Problem, e: Tensor) -> float:

@@ -14,7 +14,8 @@ from torchcal.discovery.misfit.places import Place
 from torchcal.discovery.misfit.structure import Structure
 from torchcal.discovery.verdicts.by_share import decide_exact, nearly
 from torchcal.discovery.verdicts.decision import Decision, certain, groups_of, other_names, tie_other_names, weigh
-from torchcal.discovery.verdicts.doubts import by_hold, doubt, in_common, unfit
+from torchcal.discovery.verdicts.doubts import by_hold, doubt, in_common, in_order, unfit
+from torchcal.discovery.verdicts.explain import removed
 from torchcal.discovery.verdicts.instruments import no_instrument, only_instruments
 from torchcal.discovery.verdicts.proof import prove
 from torchcal.discovery.verdicts.together import only_together
@@ -43,6 +44,8 @@ PLAINLY_WHITE, LINEAR = 0.05, 0.02
 #: χ² that a term in a window must remove for its shape to be as telling as that of one that acts everywhere; and the
 #: same along the only condition of a static recording, where nothing else of the term is seen than a piece of a curve.
 TELLING, TELLING_ALONE = 500.0, 3000.0
+#: Share of the misfit that a term removes beside which what is left may be noise all the same.
+NEARLY_ALL = 0.9
 #: By how much more than the sd that is given a named model of one term may miss the data, and one of several, which
 #: bend to more, beyond chance: such sd are seldom exact.
 LARGER, LARGER_TOGETHER, CHANCE = 1.15, 1.08, 2.0
@@ -144,6 +147,8 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     if not white or decision.none > (UNKNOWN if search.unnamed is None else UNNAMED):
         decision.verdict = "unexplained"
         nearly(search, ranked, mask, decision)
+        if decision.best is None:
+            _perhaps_noise(search, ranked, decision)
         return decision
     otherwise: set[str] = set()  # terms of what is as likely that could as well be called something else
     for best in white:
@@ -193,6 +198,17 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     if len(decision.tied) < 2 or likely or local or pliant or decision.doubt:
         decision.tied.append(list(NONE))
     return decision
+
+
+def _perhaps_noise(search: Search, ranked: Sequence[Model], decision: Decision) -> None:
+    """Tie what removes nearly all with something unknown beside it, where noise of unknown size may be all of that."""
+    lead = next((m for m in ranked if m.window is None and not m.note), None)
+    if not search.noise.open or lead is None or lead.names != decision.beside or removed(search, lead) < NEARLY_ALL:
+        return
+    told = in_order(search, lead)
+    if told:
+        decision.verdict, decision.doubt = "ambiguous", told
+        decision.tied, decision.tied_models = [list(lead.names), list(NONE)], [lead]
 
 
 def _dismiss(search: Search, ranked: list[Model]) -> None:
