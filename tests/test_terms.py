@@ -539,3 +539,14 @@ def test_nothing_is_no_list_of_parameters_or_states():
         tc.Term("drag", frees=None)
     with pytest.raises(DomainError, match="states as a dict"):
         tc.ODESimulator(lambda t, s, p, u: {}, None, [tc.Parameter("k")])
+
+
+def test_a_lag_of_an_output_that_is_no_state_says_what_to_give():
+    t = torch.linspace(0, 5, 30, dtype=torch.float64)
+    model = tc.ODESimulator(
+        lambda t, s, p, u: {"x": -p["k"] * s["x"]}, {"x": "m"}, [tc.Parameter("k", initial=1.0)],
+        observe={"L": lambda t, s, p, u: 2 * s["x"]},
+    )  # fmt: skip
+    recording = tc.Recording(runs=[tc.Run(time=t, outputs={"L": 2 * torch.exp(-t)}, initial={"x": 1.0})], noise=0.1)
+    with pytest.raises(DomainError, match=r"^Expected 'L' to be a state, for the lag.*Give outputs=\{'L'"):
+        tc.diagnose(model, recording, tc.terms.sensor("L"), seed=0, progress=False)

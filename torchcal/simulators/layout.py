@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchcal.data import Recording, Run
 from torchcal.display import raised
-from torchcal.errors import RecordingError, SimulatorError
+from torchcal.errors import RecordingError, SimulatorError, TorchcalError
 from torchcal.simulators.careful import careful, real
 from torchcal.simulators.parameter import Parameter, in_run
 
@@ -194,7 +194,7 @@ class Layout:
                     elif callable(value):
                         found = careful(self._seen, f"the initial value of {state!r}", value, s=entries, p=own)
                         entries[state] = real(found, values, one, f"the initial value of {state!r}")
-                except SimulatorError:
+                except TorchcalError:  # which says what to do
                     raise
                 except Exception as error:
                     raise SimulatorError(

@@ -175,6 +175,8 @@ def _dynamic(output: str, unit: str, time: str, given: Signal) -> list[Term]:
         like = next(iter(s.values()))
         try:
             found, later = (torch.as_tensor(signal(torch.full_like(like, t), s, p, {})) for t in (0.0, 1.0))
+        except DomainError:  # which says what to do
+            raise
         except Exception as error:
             raise DomainError(
                 f"Expected the output {output!r} from states and parameters alone, to begin its lag with. It fails "
