@@ -550,6 +550,34 @@ def test_results_of_other_inputs_are_refused(tmp_path):
 SCALE = 1.0
 
 
+class Scaled:
+    def __init__(self, scale):
+        self.scale = scale
+
+    def prior(self, propagate):
+        return priors.Normal(propagate, scale=self.scale)
+
+
+CALLS = 0
+TABLE = {}
+
+
+def counted(propagate):
+    global CALLS
+    CALLS += 1
+    return TABLE["itself"], priors.Flat(propagate)
+
+
+def test_what_functions_are_is_told_once_though_they_hold_each_other(monkeypatch):
+    TABLE["itself"] = TABLE
+    TABLE.update({k: (lambda q, k=k: TABLE[(k + 1) % 12](q)) for k in range(12)})
+    numbers = [torch.ones(2, dtype=torch.bfloat16), torch.eye(2).to_sparse()]
+    told = [many._text([counted, TABLE[3], numbers])]
+    monkeypatch.setitem(globals(), "CALLS", 7)
+    assert told == [many._text([counted, TABLE[3], numbers])]
+    assert many._text(TABLE[3]) != many._text(counted)
+
+
 def normal(scale):
     return lambda propagate: priors.Normal(propagate, scale=scale)
 
@@ -568,6 +596,18 @@ def test_results_of_another_prior_of_the_same_name_are_refused(tmp_path, monkeyp
         assert same(calibrate_many(linear(), one, folder=folder, prior=first, **MAP_ALONE)["u"], found["u"])
         with pytest.raises(DomainError, match="another prior"):
             calibrate_many(linear(), one, folder=folder, prior=second, **MAP_ALONE)
+
+    def chosen(kind):
+        return lambda propagate: kind(propagate)
+
+    for first, second in [
+        (priors.Flat, priors.Normal),
+        (functools.partial(priors.Normal, scale=1.0), functools.partial(priors.Normal, scale=2.0)),
+        (normal(1.0), normal(2.0)),
+        (Scaled(1.0).prior, Scaled(2.0).prior),
+    ]:
+        assert many._text(chosen(first)) != many._text(chosen(second))
+        assert many._text(chosen(first)) == many._text(chosen(first))
 
     def of_the_file(propagate):
         return priors.Normal(propagate, scale=SCALE)

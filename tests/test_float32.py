@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import math
 import warnings
 
 import pytest
@@ -175,3 +176,16 @@ def test_what_is_small_beside_an_offset_is_not_drawn_in_single_precision(calibra
         with warnings.catch_warnings(), (refused if offset else contextlib.nullcontext()):
             warnings.simplefilter("ignore", tc.errors.TorchcalWarning)
             calibrate(line, tc.Recording(x=x, y=offset + x + 0.3 * x**2), **options)
+
+
+@pytest.mark.filterwarnings("ignore::torchcal.errors.TorchcalWarning")
+def test_single_precision_is_held_against_double_where_there_are_numbers():
+    x = torch.linspace(-1, 1, 21, dtype=torch.float64)
+
+    def line(x, p):
+        return p["a"] + torch.where(p["b"] > 1.15, math.nan, p["b"]) * x
+
+    model = tc.Simulator(line, [tc.Parameter("a"), tc.Parameter("b")])
+    options = {"num_samples": 4, "num_warmup": 20, "num_chains": 2, "num_starts": 8, "dtype": torch.float32}
+    with pytest.raises(DomainError, match="data that are not small beside an offset"):
+        tc.calibrate_additive(model, tc.Recording(x=x, y=1e6 + x + 0.3 * x**2), **options)

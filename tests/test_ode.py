@@ -719,3 +719,15 @@ def test_plain_numbers_are_taken_with_all_their_digits(tenth) -> None:
     torch.testing.assert_close(
         bound.at(bound.x)(tensor(1.0)), torch.cat([0.1 * t, torch.full((7,), 0.1, dtype=F64)]), rtol=1e-14, atol=1e-15
     )
+
+
+def test_a_parameter_may_be_called_as_an_initial_state_is() -> None:
+    t = torch.linspace(0, 2, 20, dtype=torch.float64)
+    model = tc.ODESimulator(lambda t, s, p, u: {"x": -p["x(0)"] * s["x"]}, ["x"], [tc.Parameter("x(0)", initial=0.7)])
+    recording = tc.Recording(runs=[tc.Run(time=t, outputs={"x": a * torch.exp(-0.7 * t)}) for a in (2.0, 3.0)])
+    bound, values = model.bind(recording), torch.tensor([[0.7, 2.0, 3.0]], dtype=torch.float64)
+    slopes = bound.linearise(recording.x, values, recording.outputs, [0, 1, 2]).jacobian[0]
+    expected = torch.zeros(2, 20, 3, dtype=torch.float64)
+    for run, begin in enumerate((2.0, 3.0)):
+        expected[run, :, 0], expected[run, :, run + 1] = -begin * t * torch.exp(-0.7 * t), torch.exp(-0.7 * t)
+    torch.testing.assert_close(slopes, expected.flatten(0, 1), rtol=1e-6, atol=1e-8)

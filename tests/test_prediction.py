@@ -380,3 +380,11 @@ def test_masked_data_count_nowhere():
     masked = np.ma.array([1.0, 999.0, 3.0], mask=[False, True, False])
     assert scores(masked, moments).rmse == pytest.approx(5**0.5)
     assert scores(np.array([1.0, 2.0, 3.0], dtype=">f8"), moments).rmse == pytest.approx((14 / 3) ** 0.5)
+
+
+def test_a_parameter_without_a_density_is_told_as_it_is():
+    parameter = Parameter("k", transform="log", initial=100.0)
+    propagate = NISP(Simulator(lambda x, p: p["k"] * x, [parameter]), Gaussian(), X)
+    alpha = torch.tensor([[0.0, 0.0]], dtype=torch.float64)
+    with pytest.raises(DomainError, match="Got the value 100 alone in column 0"):
+        parameter_density(propagate, alpha, torch.ones(1, 1, dtype=torch.float64))

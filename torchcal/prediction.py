@@ -208,7 +208,9 @@ def parameter_density(propagate: NISP, alpha: Tensor, points: Tensor, *, seed: i
         xi = propagate.draw_germ(num * len(alpha), seed=seed).reshape(len(alpha), num, -1)
         psi = polychaos.evaluate(pattern.basis, pattern.indices, _result(xi))
         draws = scaling.center + scaling.scale * torch.einsum("adk,ask->asd", pattern.matrix(alpha), psi)
-        found = kernel_density(draws.reshape(-1, draws.shape[-1]), coordinates)
+        draws = draws.reshape(-1, draws.shape[-1])
+        _check_varies(torch.where(log, draws.exp(), draws))
+        found = kernel_density(draws, coordinates)
     density[known] = found / size
     return density
 
@@ -247,13 +249,8 @@ def kernel_density(draws: Tensor, points: Tensor) -> Tensor:
         DomainError: If a column is constant.
     """
     count, size = draws.shape
+    _check_varies(draws)
     center, scale = draws.mean(0), draws.std(0)
-    still = scale <= 1e-12 * center.abs()  # equal numbers, but for the rounding of their mean
-    if bool(still.any()):
-        raise DomainError(
-            f"Expected draws that vary in every column. Got the value {float(center[still][0]):.6g} alone in column "
-            f"{int(still.nonzero()[0])}: a parameter without spread has no density."
-        )
     z = (draws - center) / scale
     covariance = z.T @ z / (count - 1) + 1e-10 * torch.eye(size, dtype=draws.dtype)
     factor = torch.linalg.cholesky(covariance) * (4 / (count * (size + 2))) ** (1 / (size + 4))
@@ -262,6 +259,16 @@ def kernel_density(draws: Tensor, points: Tensor) -> Tensor:
     log_norm = factor.diagonal().log().sum() + scale.log().sum() + 0.5 * size * math.log(2 * math.pi)
     parts = [(-0.5 * torch.cdist(part, white).square()).exp().mean(1) for part in target.split(256)]
     return torch.cat(parts) * torch.exp(-log_norm)
+
+
+def _check_varies(draws: Tensor) -> None:
+    center = draws.mean(0)
+    still = draws.std(0) <= 1e-12 * center.abs()  # equal numbers, but for the rounding of their mean
+    if bool(still.any()):
+        raise DomainError(
+            f"Expected draws that vary in every column. Got the value {float(center[still][0]):.6g} alone in column "
+            f"{int(still.nonzero()[0])}: a parameter without spread has no density."
+        )
 
 
 @dataclass(frozen=True)

@@ -272,6 +272,7 @@ def _rounding(problem: Problem, cast: Problem, mode: Laplace) -> float:
             one.log_prob(one.prior.transform.bound(at)) + one.prior.transform.log_slope(at)
             for one, at in ((problem, u), (cast, u.to(cast.y.dtype)))
         )
-        error = (rounded.to(exact) - exact)[(exact > exact.max() - _FAR) & rounded.isfinite()]
-        away = (error - error.median()).abs()
-    return 1.4826 * float(away.median()) if len(away) else 0.0
+        known = exact.isfinite()
+        largest = exact[known].max() if bool(known.any()) else exact.new_zeros(())
+        error = (rounded.to(exact) - exact)[known & (exact > largest - _FAR) & rounded.isfinite()]
+    return 1.4826 * float((error - error.median()).abs().median()) if len(error) else math.inf

@@ -269,9 +269,9 @@ def warn_of_box(simulator: Simulator, propagate: NISP, alpha: Tensor, samples: T
         return
     xi = propagate.draw_germ(LOOKED_AT, seed=0)
     rows = [alpha.expand(LOOKED_AT, -1)]
-    if samples is not None:
+    if samples is not None and samples.numel():
         draws = samples.flatten(0, 1)
-        rows.append(draws[torch.linspace(0, len(draws) - 1, LOOKED_AT, device=draws.device).round().long()])
+        rows.append(draws[torch.linspace(0, len(draws) - 1, LOOKED_AT, dtype=torch.float64).long().to(draws.device)])
     with torch.no_grad():
         shares = [
             float(leaves(propagate.with_held(propagate.parameters_at(row.to(propagate.nodes), xi, paired=True)))

@@ -88,6 +88,7 @@ class Layout:
             else:
                 self._places[parameter.name] = [place]
                 parameters.append(parameter)
+        self._own = len(parameters)  # the columns after these are initial states
         self._initial: list[dict[str, Any]] = []
         self.initial_names: list[str] = []
         for r, run in enumerate(runs):
@@ -166,8 +167,8 @@ class Layout:
             own = dict(zip(names, grads[1:], strict=True))
             rows = []
             for column in columns:
-                name, run = self.origins[column]  # initial states act on no rate
-                grad = own.get(name)
+                name, run = self.origins[column]
+                grad = own.get(name) if column < self._own else None  # initial states act on no rate
                 if grad is None:
                     rows.append(torch.zeros_like(part))
                 else:
