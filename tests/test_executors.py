@@ -45,6 +45,7 @@ from torchcal.errors import (
     warn,
 )
 from torchcal.inference import many
+from torchcal.inference.fingerprint import fingerprint
 from torchcal.results import Calibration
 from torchcal.simulators import executor as executors
 from torchcal.simulators.cluster import submit
@@ -572,10 +573,10 @@ def test_what_functions_are_is_told_once_though_they_hold_each_other(monkeypatch
     TABLE["itself"] = TABLE
     TABLE.update({k: (lambda q, k=k: TABLE[(k + 1) % 12](q)) for k in range(12)})
     numbers = [torch.ones(2, dtype=torch.bfloat16), torch.eye(2).to_sparse()]
-    told = [many._text([counted, TABLE[3], numbers])]
+    told = [fingerprint([counted, TABLE[3], numbers])]
     monkeypatch.setitem(globals(), "CALLS", 7)
-    assert told == [many._text([counted, TABLE[3], numbers])]
-    assert many._text(TABLE[3]) != many._text(counted)
+    assert told == [fingerprint([counted, TABLE[3], numbers])]
+    assert fingerprint(TABLE[3]) != fingerprint(counted)
 
 
 def normal(scale):
@@ -606,8 +607,8 @@ def test_results_of_another_prior_of_the_same_name_are_refused(tmp_path, monkeyp
         (normal(1.0), normal(2.0)),
         (Scaled(1.0).prior, Scaled(2.0).prior),
     ]:
-        assert many._text(chosen(first)) != many._text(chosen(second))
-        assert many._text(chosen(first)) == many._text(chosen(first))
+        assert fingerprint(chosen(first)) != fingerprint(chosen(second))
+        assert fingerprint(chosen(first)) == fingerprint(chosen(first))
 
     def of_the_file(propagate):
         return priors.Normal(propagate, scale=SCALE)
