@@ -171,7 +171,7 @@ def test_a_lag_of_an_output_that_depends_on_time_is_refused():
 
     base = still({"y": signal}, [tc.Parameter("k", initial=1.0)], initial={"x": 0.0})
     recording = tc.Recording(runs=[tc.Run(time=T + 100, outputs={"y": torch.ones(11)})])
-    with pytest.raises(SimulatorError, match="from states and parameters alone"):
+    with pytest.raises(DomainError, match="from states and parameters alone"):
         extend(base, [sensor("lag of y", signal)]).bind(recording).at(recording.x)(tensor(0.01, 1.0, 2.0))
 
 
