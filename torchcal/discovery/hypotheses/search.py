@@ -260,8 +260,7 @@ class Search:
             least = max(WORTH, HOPELESS * best - NEAR if len(one.numbers) == 1 else best - NEAR)
             if one.window is None and self.gain(fitted.chi2) >= least:  # an edge within a step would only move
                 fitted = self._settled(fitted)
-            model = Model(one.numbers, one.candidate, fitted, 0.0, one.prior, True, window=one.window)
-            models.append(self._judge(model))
+            models.append(self._model(one, fitted))
         return self._with_room(models)
 
     def _with_room(self, models: list[Model | None]) -> list[Model | None]:
@@ -277,8 +276,7 @@ class Search:
                 jobs[k] = Hypothetical(model.numbers, roomy, model.found.values[None], model.log_prior, model.window)
         for (k, one), fitted in zip(jobs.items(), self._fits(list(jobs.values())), strict=True):
             if fitted is not None:
-                fitted = self._settled(fitted)
-                free = self._judge(Model(one.numbers, one.candidate, fitted, 0.0, one.prior, True, window=one.window))
+                free = self._model(one, self._settled(fitted))
                 models[k] = free if free.physical else models[k]
         return models
 
@@ -318,6 +316,10 @@ class Search:
             return sharpen(found, lambda now: SOLVER_SHARE * sd, rounds=ROUNDS, patient=False)[0]
         except (SimulatorError, DomainError):  # with steps so short, or with too many of them
             return found
+
+    def _model(self, one: Hypothetical, fitted: Fitted) -> Model:
+        """A hypothesis with its fit, judged."""
+        return self._judge(Model(one.numbers, one.candidate, fitted, 0.0, one.prior, True, window=one.window))
 
     def _judge(self, model: Model) -> Model:
         """The model with its evidence and what speaks against it."""

@@ -258,10 +258,10 @@ def _noise_or_physics(search: Search, model: Model) -> str:
     Noise of unknown size that is slow is what a wrong shape leaves, too; where most of it is small, and some of it
     large, it is no noise of one size. Where rows do not follow one another no correlated noise is estimated.
     """
-    noise, problem = beside(search, model), model.found.problem
-    e = noise.whitening(problem).vector(model.found.residual)
     if told := in_order(search, model):
         return told
+    noise, problem = beside(search, model), model.found.problem
+    e = noise.whitening(problem).vector(model.found.residual)
     for k, rho in enumerate(noise.correlation.tolist() if noise.open else ()):
         mine = e[problem.output_of == k]
         if bool(model.found.met[problem.output_of == k].all()):
@@ -342,11 +342,12 @@ def _shared(problem: Problem, e: Tensor, jacobian: Tensor) -> float:
 def _of_two_colours(search: Search, model: Model) -> str:
     """Whether noise of unknown size would have to be correlated in an output, from which most of the evidence for a
     model comes, and not, or less, in another."""
-    noise, problem = settled(model.found, search.noise, search.tangents)[0], model.found.problem
-    counts = torch.bincount(problem.output_of, minlength=len(noise.correlation))
-    if not noise.open or problem.sweeps is None:
+    problem, names = model.found.problem, model.found.problem.recording.outputs
+    counts = torch.bincount(problem.output_of, minlength=len(names))
+    if not search.noise.open or problem.sweeps is None or int((counts >= LEAST).sum()) < 2:
         return ""
-    names, white = problem.recording.outputs, noise.whitening(problem)
+    noise = settled(model.found, search.noise, search.tangents)[0]
+    white = noise.whitening(problem)
     gain = white.vector(search.base.residual).square() - white.vector(model.found.residual).square()
     for a, b in itertools.permutations([k for k, n in enumerate(counts.tolist()) if n >= LEAST], 2):
         prior = log_prior(GRID, 0.5 * (counts[a] + counts[b]).double()).softmax(0)
