@@ -130,6 +130,51 @@ def test_replicates_measure_the_noise_whatever_the_misfit():
     assert float(noise.sd[0]) == pytest.approx(0.1, rel=5 * 0.0913)
 
 
+def in_sweeps(how, count, sweeps):
+    x = torch.linspace(0, 1, count, dtype=F64)
+    return x.repeat_interleave(sweeps) if how == "side by side" else x.repeat(sweeps)
+
+
+@pytest.mark.parametrize(("how", "sweeps"), [("side by side", 5), ("sweep by sweep", 2)])
+@pytest.mark.parametrize("phi", [0.0, 0.6])
+def test_replicates_tell_noise_with_memory(how, sweeps, phi):
+    # The misfit differs from condition to condition as no smooth curve does.
+    x, found, size = in_sweeps(how, 40, sweeps), [], []
+    for seed in range(20):
+        rough = draw(40, 3.0, 1000 + seed)
+        misfit = rough.repeat_interleave(sweeps) if how == "side by side" else rough.repeat(sweeps)
+        noise = noise_of(x, misfit + draw(len(x), 0.1, seed, phi))
+        assert noise.source == "replicates"
+        found.append(float(noise.correlation[0]))
+        size.append(float(noise.sd[0]) / 0.1)
+    # Least favourable are two sweeps: half of 80 data tell, so that an estimate is off by √((1 − φ²)/40), 0.13 at 0.6,
+    # of which it is taken at a quantile of 0.6; and a white one is taken for correlated in 5 %.
+    if phi:
+        assert sum(value > 0 for value in found) >= 15
+        assert np.mean(found) == pytest.approx(phi, abs=0.15)
+    else:
+        assert sum(value > 0 for value in found) <= most(20, 0.06)
+    assert np.mean(size) == pytest.approx(1.0, abs=0.12)
+
+
+def test_replicates_sorted_by_what_was_read_have_no_memory():
+    x = in_sweeps("side by side", 30, 3)
+    y = x + draw(90, 0.1, 2).reshape(30, 3).sort(dim=1).values.flatten()
+    noise = noise_of(x, y)
+    assert float(noise.correlation[0]) == 0
+    assert float(noise.sd[0]) == pytest.approx(0.1, rel=5 * 0.0913)
+
+
+def test_unequal_numbers_of_replicates_count_by_what_they_tell():
+    # Pairs and tens: what is pooled has the variance of the noise and as many degrees of freedom as are stated.
+    x = torch.cat([torch.arange(10.0, dtype=F64).repeat_interleave(2), torch.tensor([20.0] * 10, dtype=F64)])
+    squares = [float(noise_of(x, x + draw(30, 0.1, seed)).sd[0]) ** 2 / 0.01 for seed in range(200)]
+    assert noise_of(x, x + draw(30, 0.1, 0)).freedom == 19
+    assert np.mean(squares) == pytest.approx(1.0, abs=5 * math.sqrt(2 / 19 / 200))
+    # The variance of a sample variance of 200 has a relative sd of √(2/199) and more by its skewness.
+    assert np.var(squares) == pytest.approx(2 / 19, rel=0.6)
+
+
 def test_outputs_have_noise_of_their_own():
     x = torch.linspace(0, 1, 300, dtype=F64)
     y = {"u": x + draw(300, 0.1, 1), "w": 5 * x + draw(300, 2.0, 2, 0.7)}

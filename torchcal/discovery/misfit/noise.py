@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchcal.discovery.fits.problem import Problem, Whitening, remembered
 from torchcal.discovery.misfit.curves import beyond
+from torchcal.discovery.misfit.replicates import replicates
 from torchcal.discovery.records import NoiseModel
 from torchcal.errors import DomainError
 
@@ -20,16 +21,15 @@ __all__ = [
     "GRID", "LEAST", "Noise", "decorrelated", "estimate", "growth", "least", "log_prior", "mine", "quantisation"
 ]  # fmt: skip
 
-#: Difference of replicates, in the size of the data, up to which they agree.
-ROUNDING = 1e-12
 #: AR(1) coefficients that are tried.
 GRID = torch.linspace(0.0, 0.95, 39, dtype=torch.float64)
 #: Weights against correlation, in log prior density: of φ, and of the share of a recording that it lasts.
 SHRINK, SLOW = 1.0, 20.0
 #: Fewest data of an output whose noise may be correlated.
 LEAST = 40
-#: Quantile of its posterior at which a clear correlation is taken.
-CAUTION = 0.6
+#: Posterior probability of the two smallest coefficients below which a correlation is clear, and the quantile of the
+#: posterior at which it is taken then.
+CLEAR, CAUTION = 0.05, 0.6
 #: Smallest noise sd that is estimated, in the output's spread.
 FLOOR = 1e-7
 #: Fewest data of an output whose noise may grow with it; the log-likelihood that this must gain; the sd at zero that
@@ -136,7 +136,7 @@ def estimate(
         return Noise(sd, correlation, math.inf, posterior, "none", table, unit=torch.ones_like(sd))
     unit = torch.ones_like(recording.y) if unit is None else unit
     known = given if isinstance(given, Tensor) else unit
-    replicated = _replicates(problem) if given is None else None
+    replicated = replicates(problem) if given is None else None
     sd = known.clone()
     freedom, doubted, log_density = math.inf, 1.0, 0.0
     for output in range(outputs):
@@ -177,17 +177,22 @@ def estimate(
         weight = (likelihood - likelihood.max()).exp()
         posterior[output, : len(weight)] = weight / weight.sum()
         best = int(likelihood.argmax())
-        tail = posterior[output].cumsum(0)
-        if float(tail[1]) < 0.05:  # clearly correlated: too little of it would pass noise off as physics
-            best = int((tail < CAUTION).sum())
+        if float(posterior[output, :2].sum()) < CLEAR:  # too little of it would pass noise off as physics
+            best = _cautious(posterior[output])
         correlation[output] = GRID[best]
         scale = math.sqrt(sizes[best])
         mask = mine(problem, output)
         table[output, : len(sizes)] = torch.tensor(sizes, dtype=torch.float64).sqrt()
         if given is None:
             if replicated is not None:
-                sd[mask] = replicated[output].sd(problem, unit) * unit[mask]
-                freedom = min(freedom, replicated[output].freedom)
+                own = replicated[output]
+                size = own.sd(problem, unit)
+                if n >= LEAST and problem.sweeps is not None and (told := own.memory(problem, unit, GRID)) is not None:
+                    weight = (told[0] + log_prior(GRID, n)).softmax(0)
+                    if float(weight[:2].sum()) < CLEAR:  # else they are taken to be independent
+                        best = _cautious(weight)
+                        correlation[output], posterior[output], size = GRID[best], weight, float(told[1][best])
+                sd[mask], freedom = size * unit[mask], min(freedom, own.freedom)
             else:
                 sd[mask], freedom = scale * unit[mask], min(freedom, usable)
         elif scale > EXCESS * (1 + 2 / math.sqrt(2 * usable)):
@@ -197,6 +202,11 @@ def estimate(
         sd = torch.maximum(sd, least(problem, step))
     source = "given" if isinstance(given, Tensor) else "replicates" if replicated is not None else "estimated"
     return Noise(sd, correlation, freedom, posterior, source, table, doubted, step, unit, log_density)
+
+
+def _cautious(posterior: Tensor) -> int:
+    """Place in `GRID` at which a clear correlation is taken, by its posterior ``(grid,)``."""
+    return int((posterior.cumsum(0) < CAUTION).sum())
 
 
 def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor, before: Tensor) -> Tensor:
@@ -209,14 +219,14 @@ def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor, before
     those of all data, used or not, ``(n_total,)``; ``before`` is what was found before, by which data are weighed.
     """
     unit = torch.ones_like(problem.recording.y)
-    f, replicated = f.abs(), _replicates(problem)
+    f, replicated = f.abs(), replicates(problem)
     for output in range(len(problem.recording.outputs)):
         parts = [places for places in problem.recorded if int(problem.output_of[places[0]]) == output]
         if not parts:
             continue
         used = f[problem.index[torch.cat(parts)]]
         if replicated is not None:
-            e, told = replicated[output].off.abs(), float(replicated[output].freedom)
+            e, told = replicated[output].even.abs(), float(replicated[output].freedom)
             size_of = f[problem.index[replicated[output].places]] / used.max()
         else:
             left, size = [], []
@@ -284,47 +294,6 @@ def decorrelated(values: Tensor, rho: Tensor) -> Tensor:
     one column of either goes with all of the other."""
     rest = (values[1:] - rho * values[:-1]) / (1 - rho.square()).sqrt()
     return torch.cat([values[:1].expand(1, rest.shape[1]), rest])
-
-
-@dataclass(frozen=True)
-class _Replicates:
-    """What data of one output at identical conditions tell of its noise.
-
-    Attributes:
-        places: Of the used data that are not alone at their conditions.
-        off: How far each is from the mean of its conditions, in what makes its variance that of the noise.
-        freedom: Degrees of freedom.
-    """
-
-    places: Tensor
-    off: Tensor
-    freedom: int
-
-    def sd(self, problem: Problem, unit: Tensor) -> float:
-        """Noise sd in a unit ``(n_total,)``, which is the same at identical conditions."""
-        off, count = self.off / unit[problem.index[self.places]], len(self.places)
-        return math.sqrt(float(off.square().mean())) if count else 0.0
-
-
-def _replicates(problem: Problem) -> list[_Replicates] | None:
-    """Replicates of every output; None without any, or with too few of one."""
-    if problem.in_time:
-        return None
-    levels, group = problem.levels
-    if len(levels) == len(group):
-        return None
-    found = []
-    for output in range(len(problem.recording.outputs)):
-        places = (problem.output_of == output).nonzero()[:, 0]
-        y, g = problem.y[places], group[problem.condition_of[places]]
-        count = torch.zeros(len(levels), dtype=torch.float64).index_add_(0, g, torch.ones_like(y))
-        total = torch.zeros_like(count).index_add_(0, g, y)
-        many = count[g] > 1
-        off = (y - total[g] / count[g]) * (count[g] / (count[g] - 1).clamp_min(1)).sqrt()
-        found.append(_Replicates(places[many], off[many], int((count - 1).clamp_min(0).sum())))
-    if not any(bool((one.off.abs() > ROUNDING * problem.recording.y.nan_to_num().abs().max()).any()) for one in found):
-        return None  # what always agrees, as coarse readings do, tells nothing of the noise
-    return found if min(one.freedom for one in found) >= 3 else None
 
 
 def quantisation(problem: Problem) -> dict[str, float]:

@@ -1,0 +1,107 @@
+"""What data at identical conditions tell of the noise, whatever the misfit."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.fits.problem import Problem, remembered
+
+__all__ = ["Replicates", "replicates"]
+
+#: Difference of replicates, in the size of the data, up to which they agree.
+ROUNDING = 1e-12
+#: Degrees of freedom of every output at least; and how many conditions noise with memory is told beside at most.
+FEWEST, MOST = 3, 1024
+
+
+@dataclass(frozen=True)
+class Replicates:
+    """Data of one output that are not alone at their conditions.
+
+    Attributes:
+        places: Of these, among the used data.
+        group: Number of the conditions of each, from 0 on.
+        off: How far each is from the mean of its conditions.
+        share: Variance of that, in the variance of independent noise.
+    """
+
+    places: Tensor
+    group: Tensor
+    off: Tensor
+    share: Tensor
+
+    @classmethod
+    def of(cls, problem: Problem, places: Tensor) -> "Replicates":
+        """Those among the used data of an output at ``places``."""
+        level = problem.levels[1][problem.condition_of[places]]
+        places = places[torch.bincount(level)[level] > 1]
+        _, group = problem.levels[1][problem.condition_of[places]].unique(return_inverse=True)
+        count = torch.bincount(group).double()
+        mean = torch.zeros_like(count).index_add_(0, group, problem.y[places]) / count
+        return cls(places, group, problem.y[places] - mean[group], (1 - 1 / count)[group])
+
+    @property
+    def means(self) -> int:
+        """Number of conditions."""
+        return int(self.group.max()) + 1 if len(self.group) else 0
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom."""
+        return len(self.places) - self.means
+
+    @property
+    def even(self) -> Tensor:
+        """How far each is from its mean, in what has the variance of independent noise."""
+        return self.off / self.share.sqrt()
+
+    def sd(self, problem: Problem, unit: Tensor) -> float:
+        """Sd of independent noise, in a unit ``(n_total,)`` that is the same at identical conditions."""
+        e = self.off / unit[problem.index[self.places]]
+        return math.sqrt(float(e.square().sum()) / max(self.freedom, 1))
+
+    def memory(self, problem: Problem, unit: Tensor, grid: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Restricted log-likelihood of AR(1) coefficients, up to a constant, and the noise sd in the unit with each,
+        ``(grid,)`` both; None beside more conditions than `MOST`, and where replicates are sorted by what was read.
+
+        Noise goes on from row to row; the mean of all conditions is free. Replicates side by side are less unlike than
+        such noise is large.
+        """
+        after, before = self.group[1:], self.group[:-1]
+        steps = self.off.diff()[after == before]
+        if self.means > MOST or (len(steps) and bool((steps >= 0).all() | (steps <= 0).all())):
+            return None
+        e, same = self.off / unit[problem.index[self.places]], self.group * (self.means + 1)
+        logs, sizes = [], []
+        for r in remembered(grid, problem.gaps(self.places)).unbind(-1):
+            new, old = (1 - r.square()).rsqrt(), r * (1 - r.square()).rsqrt()  # of a datum, and of the one before it
+            first, rest = e[:1], new * e[1:] - old * e[:-1]
+            # Whitened indicators of the conditions, multiplied with one another and with the data.
+            gram = torch.zeros(self.means**2, dtype=torch.float64)
+            gram.index_add_(0, same, torch.cat([torch.ones(1, dtype=torch.float64), new.square()]))
+            gram.index_add_(0, same[:-1], old.square())
+            gram.index_add_(0, after * self.means + before, -new * old)
+            gram.index_add_(0, before * self.means + after, -new * old)
+            shown = torch.zeros(self.means, dtype=torch.float64)
+            shown.index_add_(0, self.group, torch.cat([first, new * rest])).index_add_(0, before, -old * rest)
+            factor = torch.linalg.cholesky(gram.reshape(self.means, self.means))
+            taken = torch.linalg.solve_triangular(factor, shown[:, None], upper=False).square().sum()
+            square = (first.square().sum() + rest.square().sum() - taken).clamp_min(1e-300)
+            log_det = 0.5 * torch.log1p(-r.square()).sum() + factor.diagonal().log().sum()
+            logs.append(-0.5 * self.freedom * square.log() - log_det)
+            sizes.append((square / self.freedom).sqrt())
+        return torch.stack(logs), torch.stack(sizes)
+
+
+def replicates(problem: Problem) -> list[Replicates] | None:
+    """Replicates of every output; None without any, or with too few of one."""
+    levels, group = problem.levels
+    if problem.in_time or len(levels) == len(group):
+        return None
+    outputs = range(len(problem.recording.outputs))
+    found = [Replicates.of(problem, (problem.output_of == output).nonzero()[:, 0]) for output in outputs]
+    if not any(bool((one.off.abs() > ROUNDING * problem.recording.y.nan_to_num().abs().max()).any()) for one in found):
+        return None  # what always agrees, as coarse readings do, tells nothing of the noise
+    return found if min(one.freedom for one in found) >= FEWEST else None
