@@ -19,7 +19,6 @@ from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.own_noise import beside
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.embedded import embed_each, model_error_sd
-from torchcal.discovery.misfit.likeliest import settled
 from torchcal.discovery.misfit.noise import Noise
 from torchcal.discovery.records import Scores, Table
 from torchcal.discovery.verdicts import explain
@@ -178,7 +177,7 @@ def conclude(
 def _told_noise(search: Search, decision: Decision, alpha: float) -> Noise:
     """The noise that the verdict rests on."""
     if decision.verdict == "consistent" and search.noise.open and search.p_detect < alpha:
-        return settled(search.base, search.noise, search.tangents)[0]
+        return search.settled(search.base)[0]
     return search.noise
 
 

@@ -12,7 +12,7 @@ from torchcal.discovery.fits.fitting import Fitted, refit
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.base import growing
 from torchcal.discovery.hypotheses.model import PRIOR, Model
-from torchcal.discovery.misfit.likeliest import alone, log_likelihood, log_normal, settled
+from torchcal.discovery.misfit.likeliest import alone, log_likelihood, log_normal
 from torchcal.discovery.misfit.noise import Noise, mine
 from torchcal.discovery.misfit.outliers import lone, spikes
 
@@ -64,7 +64,7 @@ def suited(search: "Search", models: Sequence[Model]) -> Noise:
     clearly likelier."""
     own = {id(m): alone(m.found, search.noise, search.tangents) for m in models}
     best = max(models, key=lambda m: own[id(m)][1] + m.prior)
-    noise, value = settled(best.found, search.noise, search.tangents)
+    noise, value = search.settled(best.found)
     value += best.prior + LIKELIER
     for found, prior in ((search.base, 0.0), (best.found, best.prior)):
         other, evidence = search.with_unknown(found)
@@ -77,7 +77,7 @@ def beside(search: "Search", model: Model) -> Noise:
     """The noise beside a model: its own where the search has one of a worse model, much larger, from before."""
     if not search.noise.open:
         return search.noise
-    own = settled(model.found, search.noise, search.tangents)[0]
+    own = search.settled(model.found)[0]
     return own if float((own.sd / search.noise.sd).median()) < OUTDATED else search.noise
 
 
@@ -88,7 +88,7 @@ def weigh_alone(search: "Search") -> tuple[float, Model | None, float]:
         Log evidence of something unknown, the model beside which that is (None for the base), and that of the base as
         it stands here, against the base with its own.
     """
-    base = settled(search.base, search.noise, search.tangents)[1]
+    base = search.settled(search.base)[1]
     here = log_likelihood(search.base, search.noise, search.tangents) - base
     every = [*search.models, *search.nameless]
     own = {id(m): alone(m.found, search.noise, search.tangents)[1] - base for m in every}
@@ -98,7 +98,7 @@ def weigh_alone(search: "Search") -> tuple[float, Model | None, float]:
     for model in every:
         found = own[id(model)]
         if model in leading and found + model.prior > near:  # fitted again with its noise, as the base is
-            found = settled(model.found, search.noise, search.tangents)[1] - base
+            found = search.settled(model.found)[1] - base
         model.in_use = search.gain(model.found.chi2) + here + model.price
         model.log_evidence = max(found + model.price, model.in_use)
     best = search.leader
@@ -123,8 +123,8 @@ def odds_alone(search: "Search") -> float:
     best = likeliest_alone(search) if search.noise.open else None
     if best is None:
         return -math.inf
-    base = settled(search.base, search.noise, search.tangents)[1] + math.log(PRIOR["base"])
-    return settled(best.found, search.noise, search.tangents)[1] + best.prior - base
+    base = search.settled(search.base)[1] + math.log(PRIOR["base"])
+    return search.settled(best.found)[1] + best.prior - base
 
 
 def fits_by_chance(search: "Search") -> float:
@@ -285,7 +285,7 @@ def outliers_alone(fewer: "Search", search: "Search", detected: bool, *, short: 
 
 def _unknown(search: "Search", found: Fitted) -> float:
     """Log odds of something unknown beside a fit."""
-    return search.with_unknown(found)[1] - settled(found, search.noise, search.tangents)[1]
+    return search.with_unknown(found)[1] - search.settled(found)[1]
 
 
 def _density(search: "Search", found: Fitted) -> float:

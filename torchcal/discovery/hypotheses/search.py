@@ -90,6 +90,7 @@ class Search:
     least: Tensor = field(init=False)
     otherwise: dict[int, tuple[Fitted, Fitted | None]] = field(init=False, default_factory=dict)
     _unknown: dict[int, tuple[Fitted, tuple[Noise, float]]] = field(init=False, default_factory=dict)
+    _own: dict[tuple[int, int], tuple[Fitted, Noise, tuple[Noise, float]]] = field(init=False, default_factory=dict)
     _held_out: dict[tuple[int, bytes], tuple[Fitted, HeldOut | None]] = field(init=False, default_factory=dict)
     _from_guesses: dict[int, tuple[Fitted, Fitted | None]] = field(init=False, default_factory=dict)
 
@@ -114,7 +115,7 @@ class Search:
             self.tangents = Tangents.of(self.base, self.noise)
         if self.noise.open:
             noise, evidence = self.with_unknown(self.base)
-            if evidence - settled(self.base, self.noise, self.tangents)[1] > CLEARLY:
+            if evidence - self.settled(self.base)[1] > CLEARLY:
                 self.noise, self.base = noise, refit(self.base, noise.whitening(self.problem))
 
     def screen_all(self) -> None:
@@ -259,7 +260,7 @@ class Search:
                 continue
             least = max(WORTH, HOPELESS * best - NEAR if len(one.numbers) == 1 else best - NEAR)
             if one.window is None and self.gain(fitted.chi2) >= least:  # an edge within a step would only move
-                fitted = self._settled(fitted)
+                fitted = self._in_short_steps(fitted)
             models.append(self._model(one, fitted))
         return self._with_room(models)
 
@@ -276,7 +277,7 @@ class Search:
                 jobs[k] = Hypothetical(model.numbers, roomy, model.found.values[None], model.log_prior, model.window)
         for (k, one), fitted in zip(jobs.items(), self._fits(list(jobs.values())), strict=True):
             if fitted is not None:
-                free = self._model(one, self._settled(fitted))
+                free = self._model(one, self._in_short_steps(fitted))
                 models[k] = free if free.physical else models[k]
         return models
 
@@ -307,7 +308,7 @@ class Search:
         best = max((model.log_evidence for model in self.models if model.physical), default=0.0)
         return math.inf if self.exact or best <= 0 else self.base.chi2 - 2 * (HOPELESS * best - NEAR)
 
-    def _settled(self, found: Fitted) -> Fitted:
+    def _in_short_steps(self, found: Fitted) -> Fitted:
         """A fit with time steps that are short enough for it: what a term brings may be faster than the base."""
         sd = self.noise.sd[found.problem.index]
         if self.exact or accurate(found, sd):
@@ -383,6 +384,13 @@ class Search:
             seen = with_unknown(found, self.problem.recording.noise, self.tangents, self.noise.unit)
             self._unknown[id(found)] = found, seen
         return self._unknown[id(found)][1]
+
+    def settled(self, found: Fitted) -> tuple[Noise, float]:
+        """The likeliest noise of a model alone, fitted again under it, and the log-likelihood; computed once."""
+        key = id(found), id(self.noise)
+        if key not in self._own:
+            self._own[key] = found, self.noise, settled(found, self.noise, self.tangents)
+        return self._own[key][2]
 
     def examine(self, model: Model) -> Structure:
         """What is left after a model."""

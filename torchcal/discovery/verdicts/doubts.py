@@ -14,7 +14,6 @@ from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.own_noise import beside
 from torchcal.discovery.hypotheses.search import Search
-from torchcal.discovery.misfit.likeliest import settled
 from torchcal.discovery.misfit.noise import GRID, LEAST, log_prior
 from torchcal.discovery.verdicts.explain import misfit_size, stated_sd
 from torchcal.discovery.verdicts.given import as_good
@@ -346,7 +345,7 @@ def _of_two_colours(search: Search, model: Model) -> str:
     counts = torch.bincount(problem.output_of, minlength=len(names))
     if not search.noise.open or problem.sweeps is None or int((counts >= LEAST).sum()) < 2:
         return ""
-    noise = settled(model.found, search.noise, search.tangents)[0]
+    noise = search.settled(model.found)[0]
     white = noise.whitening(problem)
     gain = white.vector(search.base.residual).square() - white.vector(model.found.residual).square()
     for a, b in itertools.permutations([k for k, n in enumerate(counts.tolist()) if n >= LEAST], 2):

@@ -12,7 +12,6 @@ from torchcal.data import Recording, Run
 from torchcal.discovery.fits.fitting import Fitted, fit
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.search import Search
-from torchcal.discovery.misfit.likeliest import settled
 from torchcal.discovery.misfit.noise import Noise
 from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.misfit.structure import analyse
@@ -70,7 +69,7 @@ def unbounded(search: Search) -> list[str]:
     try:
         found = fit(base.problem.with_simulator(twin), base.whitening, base.values[None], base.free)
         if found is not None and noise.open:
-            noise = settled(found, noise, search.tangents)[0]
+            noise = search.settled(found)[0]
     except (SimulatorError, DomainError):
         return []
     if found is None or not _noise_alone(search, found, noise, HARDLY):
@@ -197,7 +196,7 @@ def held_otherwise(search: Search) -> list[str]:
 
 def evidence(search: Search, found: Fitted) -> float:
     """Log evidence of a fit, up to a constant and without its price; with its own noise where that is unknown."""
-    return settled(found, search.noise, search.tangents)[1] if search.noise.open else search.gain(found.chi2)
+    return search.settled(found)[1] if search.noise.open else search.gain(found.chi2)
 
 
 def _far_runs(search: Search) -> list[bool]:
