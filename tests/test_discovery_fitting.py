@@ -348,7 +348,8 @@ def noise_model(n, phi=0.0, freedom=math.inf):
     posterior = torch.zeros(1, len(GRID), dtype=F64)
     posterior[0, int((GRID - phi).abs().argmin())] = 1.0
     sizes = torch.ones_like(posterior)
-    return Noise(torch.ones(n, dtype=F64), torch.tensor([phi], dtype=F64), freedom, posterior, "estimated", sizes)
+    told = torch.tensor([freedom], dtype=F64)
+    return Noise(torch.ones(n, dtype=F64), torch.tensor([phi], dtype=F64), told, posterior, "estimated", sizes)
 
 
 def test_simulated_noise_is_white_where_noise_is():

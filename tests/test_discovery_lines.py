@@ -103,9 +103,9 @@ def test_rounding_makes_lines_that_are_none(noise):
 
 def test_windows_end_between_values_and_not_inside_ties():
     levels = torch.tensor([1.0] * 8 + [2.0] * 8 + [3.0] * 8, dtype=F64)
-    assert _cuts(levels, Span.of(levels)) == [0, 8, 16, 24]
+    assert _cuts(levels, Span.of(levels, time=False)) == [0, 8, 16, 24]
     rests = torch.cat([torch.linspace(0, 1, 20, dtype=F64), 1 + 1e-6 * torch.arange(200, dtype=F64)])
-    cuts = _cuts(rests, Span.of(rests))
+    cuts = _cuts(rests, Span.of(rests, time=False))
     assert sum(cut < 20 for cut in cuts) >= 6  # half of them where it moves
 
 

@@ -66,7 +66,7 @@ def test_size_and_correlation_of_the_noise(phi, tolerance, misfit):
     assert abs(size.mean() - 1) < tolerance + 5 * size.std() / math.sqrt(seeds)
     assert abs(coefficient.mean() - phi) < 0.05 + 5 * coefficient.std() / math.sqrt(seeds)
     assert found[0].source == "estimated"
-    assert math.isfinite(found[0].freedom)
+    assert bool(found[0].freedom.isfinite().all())
 
 
 @pytest.mark.parametrize("n", [40, 44])
@@ -103,7 +103,7 @@ def test_given_noise_is_taken():
     x = torch.linspace(0, 1, 60, dtype=F64)
     noise = noise_of(x, x + draw(60, 0.1, 1), 0.1)
     assert noise.source == "given"
-    assert noise.freedom == math.inf
+    assert noise.freedom.tolist() == [math.inf]
     assert noise.doubted == 1.0
     torch.testing.assert_close(noise.sd, torch.full((60,), 0.1, dtype=F64))
 
@@ -126,7 +126,7 @@ def test_replicates_measure_the_noise_whatever_the_misfit():
     x = torch.linspace(0, 1, 30, dtype=F64).repeat_interleave(3)
     noise = noise_of(x, torch.sin(12 * x) + draw(90, 0.1, 3))
     assert noise.source == "replicates"
-    assert noise.freedom == 60
+    assert noise.freedom.tolist() == [60]
     assert float(noise.sd[0]) == pytest.approx(0.1, rel=5 * 0.0913)
 
 
@@ -169,7 +169,7 @@ def test_unequal_numbers_of_replicates_count_by_what_they_tell():
     # Pairs and tens: what is pooled has the variance of the noise and as many degrees of freedom as are stated.
     x = torch.cat([torch.arange(10.0, dtype=F64).repeat_interleave(2), torch.tensor([20.0] * 10, dtype=F64)])
     squares = [float(noise_of(x, x + draw(30, 0.1, seed)).sd[0]) ** 2 / 0.01 for seed in range(200)]
-    assert noise_of(x, x + draw(30, 0.1, 0)).freedom == 19
+    assert noise_of(x, x + draw(30, 0.1, 0)).freedom.tolist() == [19]
     assert np.mean(squares) == pytest.approx(1.0, abs=5 * math.sqrt(2 / 19 / 200))
     # The variance of a sample variance of 200 has a relative sd of √(2/199) and more by its skewness.
     assert np.var(squares) == pytest.approx(2 / 19, rel=0.6)

@@ -4,6 +4,7 @@ import dataclasses
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
+from numbers import Real
 from typing import Any
 
 from torch import Tensor
@@ -200,7 +201,7 @@ def _check(simulator: Any, recording: Any, candidates: Any, confidence: float) -
     candidates = [] if candidates is None else candidates
     if not isinstance(candidates, Sequence) or isinstance(candidates, str):
         raise DomainError(f"Expected candidates as a sequence of terms. Got {type(candidates).__name__}.")
-    if isinstance(confidence, bool) or not isinstance(confidence, int | float):
+    if isinstance(confidence, bool) or not isinstance(confidence, Real):
         raise DomainError(f"Expected confidence as a number. Got {confidence!r}.")
     by_name: dict[str, Term] = {}
     for term in candidates:

@@ -234,7 +234,7 @@ def _wanted(
         return [], math.inf
     driver = search.drivers()[w.driver]
     inside = driver[(driver >= w.low) & (driver <= w.high)]
-    span = w.span or Span.of(driver)
+    span = w.span or search.spans()[w.driver]
     moves = [k * span.size * span.share(w.low, w.high) for k in MOVES]
     moved = [(span.moved(w.low, a), span.moved(w.high, b)) for a, b in itertools.product(moves, moves)]
     ends = [list(dict.fromkeys(moved))]
@@ -278,8 +278,7 @@ def _anywhere(search: Search, model: Model) -> Hypothetical | None:
     w, term = model.window, search.candidates[model.numbers[0]].terms[0]
     if w is None or len(model.candidate.amplitudes) != 1:
         return None
-    driver = search.drivers()[w.driver]
-    span = Span.of(driver)
+    span = search.spans()[w.driver]
     cuts = [span.moved(span.low, k / (CUTS - 1) * span.size) for k in range(CUTS)]
     local = localised(term, w.driver, cuts[0], cuts[-1], span, static=not search.problem.in_time, edge=True)
     try:

@@ -26,6 +26,7 @@ from torchcal.discovery.hypotheses.own_noise import (
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.hypotheses.singles import refit_singles
 from torchcal.discovery.misfit.likeliest import log_normal
+from torchcal.discovery.misfit.noise import Noise
 from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.several import refit_several, scores_beside
 from torchcal.discovery.verdicts.verdict import WHITE, base_alone
@@ -40,6 +41,8 @@ FEW_DATA = 0.1
 #: Times the level up to which a misfit that noise alone gives counts as more than that where the base, beside the
 #: refitted candidates, is as improbable as the level: a statistic for all kinds of misfit sees each kind less well.
 OFTEN = 5.0
+#: Degrees of freedom of replicates below which neither counts: such odds take the noise for known.
+WELL_TOLD = 20.0
 #: Log odds by which outliers may fall short of models, with those of all data, for a search without them to begin.
 SHORT = 20.0
 #: Probability of the base beside the refitted candidates below which there is more than noise, whatever is left looks
@@ -197,6 +200,11 @@ def _may_explain(search: Search, best: Model, observed: Problem) -> bool:
     return max((0.5 * score**2 for score, _ in scores), default=0.0) > short
 
 
+def _well_told(noise: Noise) -> bool:
+    """Whether the size of noise is known well enough for odds that take it for known."""
+    return noise.source != "replicates" or float(noise.freedom.min()) >= WELL_TOLD
+
+
 def _refit(search: Search, confidence: float) -> bool:
     """Screen and refit single terms, and local ones where there is more than noise, which is returned."""
     search.models = []
@@ -210,6 +218,7 @@ def _refit(search: Search, confidence: float) -> bool:
         elif not detected:
             alone = base_alone(search)
             detected = alone < HOPELESS or (search.p_detect < OFTEN * level and alone < level)
+            detected = detected and _well_told(search.noise)
             detected = detected or (not search.few and odds_alone(search) > -math.log(level))
         if not detected and search.few and (p := pairs_by_chance(search)) < FEW_DATA * level:
             detected, search.paired, search.p_detect = True, True, min(p, search.p_detect)

@@ -38,8 +38,8 @@ ROUNDS = 2
 CLOSE = 10.0
 #: Share of a window within another one along the same driver from which on they are one start.
 ALIKE = 0.7
-#: Log odds up to which the two sides of an edge are as good.
-AS_GOOD = 0.5
+#: Log odds up to which the two sides of an edge are as good, and by which a window that holds no datum must be better.
+AS_GOOD, AS_WELL = 0.5, 3.0
 #: Relative difference of χ² up to which two windows of one term and driver are one.
 SAME = 1e-4
 #: How far ends are moved for other starts, as a share of the driver's range: where they are sought, and sharpened.
@@ -50,6 +50,8 @@ WITHIN = 0.4
 LEAST = 30
 #: Gaps between data, around an edge that was found, where it is tried as a step; and fits from there.
 NEIGHBOURS, STEPPED = 12, 6
+#: Factors by which a size may change then.
+RESIZED = (0.02, 50.0)
 
 
 def refit_local(search: Search) -> None:
@@ -66,7 +68,7 @@ def refit_local(search: Search) -> None:
         if w.candidate not in same and w.z > LEAST_SCORE and w.z**2 > enough:
             promising.setdefault(w.candidate, []).append(w)
     prior = math.log(PRIOR["local"] / max(len(search.candidates), 1))
-    spans = {name: Span.of(driver) for name, driver in search.drivers().items()} if promising else {}
+    spans = search.spans() if promising else {}
     chosen = sorted((w for each in promising.values() for w in _different(each, spans)), key=lambda w: -w.z)
     _keep_all(search, [_begun(search, w, prior) for w in chosen[:MOST]])
     search.reweigh()
@@ -177,13 +179,13 @@ def _refine_edges(search: Search, prior: float) -> None:
         if model.window is None or model.log_evidence < least:
             continue
         w = dataclasses.replace(model.window, amplitude=_amplitude(search, model)[2])
-        span = Span.of(search.drivers()[w.driver])
+        span = search.spans()[w.driver]
         scales = [span, dataclasses.replace(span, log=False)] if span.log else [span]
         found = _refit(search, [_begun(search, w, prior, model, edge=True, span=scale) for scale in scales])
         other = max((one for one in found if one is not None), key=lambda one: one.weight, default=None)
         if other is not None:
             other = stepped(search, other, w.driver)
-        if other is not None and other.weight > model.weight:
+        if other is not None and _better(search, other, model, w.driver):
             search.models.remove(model)
             _keep(search, other)
 
@@ -207,10 +209,27 @@ def stepped(search: Search, model: Model, driver: str) -> Model:
         else:
             choices.append(torch.tensor([value], dtype=torch.float64))
     begin = torch.cartesian_prod(*choices)
-    misfit = search.noise.whitening(problem).vector(problem.y - problem.evaluate(begin, [])[0]).square().sum(-1)
+    # Each with the size that suits it, to first order: that of soft edges beside a datum may be any.
+    w, sizes = search.noise.whitening(problem), model.candidate.amplitudes
+    neutral = values.clone()
+    neutral[sizes] = model.candidate.neutral[[model.candidate.own.index(i) for i in sizes]]
+    without = problem.evaluate(neutral[None], [])[0]
+    left, effect = w.vector(problem.y - without), w.vector(problem.evaluate(begin, [])[0] - without)
+    factor = (effect @ left[0]) / effect.square().sum(-1)
+    misfit = (left - factor[:, None] * effect).square().sum(-1)
+    begin[:, sizes] = neutral[sizes] + factor.clamp(*RESIZED)[:, None] * (begin[:, sizes] - neutral[sizes])
     begin = begin[misfit.nan_to_num(nan=torch.inf).argsort()[:STEPPED]]
     again = Hypothetical(model.numbers, model.candidate, begin, model.log_prior, model.window)
-    return max(filter(None, (model, *_refit(search, [again]))), key=lambda one: one.weight)
+    (other,) = _refit(search, [again])
+    return other if other is not None and _better(search, other, model, driver) else model
+
+
+def _better(search: Search, other: Model, model: Model, driver: str) -> bool:
+    """Whether another local model is better. By its soft edges a window acts on data beside it as well as a step that
+    holds them does."""
+    along, lead = search.drivers()[driver], other.weight - model.weight
+    holds = [w is None or bool(((along >= w.low) & (along <= w.high)).any()) for w in (other.window, model.window)]
+    return lead + AS_WELL * (holds[0] - holds[1]) > 0
 
 
 def _keep(search: Search, model: Model | None) -> None:
@@ -294,7 +313,7 @@ def _begun(
 ) -> Hypothetical | None:
     """Base and one local term, begun at the window that the screening found, from the base or near a model of it."""
     plain = search.candidates[w.candidate]
-    span = span or Span.of(search.drivers()[w.driver])
+    span = span or search.spans()[w.driver]
     term = plain.terms[0]
     if term.frees or not span.high > span.low or (span.log and w.high <= 0):
         return None

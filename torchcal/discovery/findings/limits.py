@@ -55,8 +55,8 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
         # Seen is not enough: the evidence for the term must outweigh that for the base too.
         wanted = max(critical, math.sqrt(max(2 * odds + len(candidate.own) * math.log(search.problem.n), 0.0)))
         doubt = 1.0
-        if math.isfinite(search.noise.freedom):  # the noise's estimate wavers, and the score with it
-            doubt = math.sqrt(1 + wanted**2 / (2 * search.noise.freedom))
+        if bool(search.noise.freedom.isfinite().any()):  # the noise's estimate wavers, and the score with it
+            doubt = math.sqrt(1 + 0.5 * wanted**2 * _wavers(search, screening.columns[:, column]))
         effects[i] = _Effect(column, wanted + doubt * from_power, float(screening.norm[column]))
     sizes = {i: effect.distance / effect.norm for i, effect in effects.items()}
     hidden: dict[int, _Hidden] = {}
@@ -90,6 +90,12 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
 def _spare(search: Search, candidate: Candidate) -> int:
     """Data to spare for the noise, beside the parameters of the base and of a candidate."""
     return search.problem.n - len(search.base.free) - len(candidate.own)
+
+
+def _wavers(search: Search, column: Tensor) -> float:
+    """Mean of 1 / (degrees of freedom of the noise) over the outputs in which a whitened effect ``(n,)`` shows."""
+    share = torch.zeros_like(search.noise.freedom).index_add_(0, search.problem.output_of, column.square())
+    return float(((share / share.sum().clamp_min(1e-300)).square() / search.noise.freedom).sum())
 
 
 def _typical(search: Search, i: int) -> int:

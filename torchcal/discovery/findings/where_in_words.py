@@ -107,7 +107,9 @@ def _span(d: Any, place: Any) -> Span | None:
     own = place.driver.removesuffix(" itself")
     if values is None and own in d.recording.outputs:
         values = d.recording.split(d.base.prediction)[own]
-    return None if values is None or not bool(values.isfinite().all()) else Span.of(values)
+    if values is None or not bool(values.isfinite().all()):
+        return None
+    return Span.of(values, time=d.recording.runs is not None and place.driver == "t")
 
 
 def _elsewhere(d: Any) -> str:

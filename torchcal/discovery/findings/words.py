@@ -101,5 +101,5 @@ def _varying(noise: Any, name: str) -> str:
     if name not in noise.range:
         return ""
     low, high = noise.range[name]
-    told = "growing with it" if noise.source == "estimated" else "this being the median"
+    told = "this being the median" if noise.source == "given" else "growing with it, or from run to run"
     return f" ({low:.3g} to {high:.3g}, {told})"

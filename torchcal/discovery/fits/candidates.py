@@ -24,6 +24,10 @@ __all__ = ["Candidate", "base_columns", "drivers_scale", "prepare", "spread_valu
 GRID_POINTS = (1, 9, 5, 4)
 #: Of a shape measured on a driver's scale, how many more lie at the driver's own values: thresholds do.
 DRIVER_POINTS = (0, 7, 3, 2)
+#: Of a shape that may lie anywhere, as nobody said where, how many more lie at the values of all drivers.
+ANYWHERE_POINTS = (0, 6, 4, 2)
+#: Points of the grid at most, and the fraction whose multiples spread them over all.
+MOST_POINTS, GOLDEN = 256, 0.5 * (math.sqrt(5.0) - 1.0)
 #: Range of a shape parameter measured on a driver's scale; on that of time it begins at a share of the usual gap
 #: between samples where that is less: lags and delays may be as fast as these show, however long the recording.
 SCALE_RANGE, OF_A_GAP = (0.02, 1.0), 0.1
@@ -94,6 +98,15 @@ class Candidate:
         inside = torch.where((high - low).isfinite(), A_LITTLE * (high - low), torch.zeros_like(low))
         values[self.own] = values[self.own].clamp(low[self.own] + inside[self.own], high[self.own] - inside[self.own])
         return values
+
+    @property
+    def anywhere(self) -> dict[str, tuple[float, float]]:
+        """Names of its shapes of which nobody says where they lie, and from where to where they are tried."""
+        found = {}
+        for i, tried in zip(self.own, self.shapes.T, strict=True):
+            if i not in self.amplitudes and _anywhere(q := self.problem.parameters[i]):
+                found[q.name] = float(tried.min()), float(tried.max())
+        return found
 
     @property
     def blind(self) -> bool:
@@ -246,6 +259,8 @@ def spread_values(target: Problem, names: Sequence[str], values: Tensor) -> Tens
 def _shape_points(parameter: Parameter, count: int) -> list[float]:
     low, high = parameter.low, parameter.high
     if low is None or high is None:
+        if low is None and high is None and parameter.initial == 0 and count > 1:
+            return torch.linspace(-2, 2, count).tolist()
         middle = parameter.initial or parameter.neutral or 1.0
         end = low if low is not None else high if high is not None else 0.0
         away = middle - end
@@ -323,7 +338,7 @@ def prepare(
     if not amplitudes:  # a product of parameters, or a threshold: try each with the others away from neutral
         amplitudes = _hidden_amplitudes(problem, own, certain, begin, linear)
     shape = [place for place in own if place not in amplitudes]
-    grid = _grid(problem, shape, _driver_values(base, found, terms))
+    grid = _grid(problem, shape, _driver_values(base, found, terms, [problem.parameters[i] for i in shape]))
     rows = begin.expand(len(grid), -1).clone()
     if shape:
         rows[:, shape] = grid
@@ -361,32 +376,65 @@ def _hidden_amplitudes(
     return [own[0]]
 
 
-def _driver_values(base: Problem, found: Fitted, terms: Sequence[Term]) -> dict[str, Tensor]:
-    """Sorted magnitudes on the calibrated trajectory of the driver that each shape is measured on, by its name."""
-    if not any(term.scales for term in terms):
+def _anywhere(q: Parameter) -> bool:
+    """Whether nobody says where a shape lies."""
+    return q.transform is None and all(value is None for value in (q.low, q.high, q.initial, q.neutral))
+
+
+def _driver_values(
+    base: Problem, found: Fitted, terms: Sequence[Term], shape: Sequence[Parameter]
+) -> dict[str, list[Tensor]]:
+    """Sorted magnitudes on the calibrated trajectory of the driver that each shape is measured on, by its name; of one
+    that may lie anywhere the values of all drivers."""
+    anywhere = [q.name for q in shape if _anywhere(q)]
+    if not anywhere and not any(term.scales for term in terms):
         return {}
     drivers = base.drivers(found.values[None], found.warm)
+    every = [each.flatten().sort().values for each in drivers.values() if bool(each.isfinite().all())]
     for number, name in enumerate(base.recording.outputs):
         drivers.setdefault(name, found.y[base.output_of == number])
-    return {
-        term.full(own): drivers[driver].abs().flatten().sort().values
+    return dict.fromkeys(anywhere, every) | {
+        term.full(own): [drivers[driver].abs().flatten().sort().values]
         for term in terms for own, driver in term.scales.items()
         if driver in drivers and not base.is_time(driver)
     }  # fmt: skip
 
 
-def _grid(problem: Problem, shape: list[int], drivers: Mapping[str, Tensor]) -> Tensor:
+def _grid(problem: Problem, shape: list[int], drivers: Mapping[str, Sequence[Tensor]]) -> Tensor:
     level = min(len(shape), len(GRID_POINTS) - 1)
     count, more = GRID_POINTS[level], DRIVER_POINTS[level]
     points = []
     for place in shape:
         q = problem.parameters[place]
-        values = drivers.get(q.name)
-        if values is None or not len(values):
+        values = [each for each in drivers.get(q.name, ()) if len(each)]
+        if not values:
             points.append(_shape_points(q, count))
-            continue
-        at = ((torch.arange(more) + 0.5) / more * (len(values) - 1)).round().long()
-        low, high = q.low or 0.0, q.high if q.high is not None else math.inf
-        points.append(_shape_points(q, count - more // 2) + [min(max(v, low), high) for v in values[at].tolist()])
-    rows = list(itertools.product(*points))[:256]
+        elif _anywhere(q):
+            each = max(ANYWHERE_POINTS[level] // len(values), 2)
+            there = list(dict.fromkeys(v for one in values for v in _spaced(one, each)))
+            points.append(there[::2] + _shape_points(q, count) + there[1::2])  # what is tried first is in the middle
+        else:
+            low, high = q.low or 0.0, q.high if q.high is not None else math.inf
+            there = [min(max(v, low), high) for v in _spaced(values[0], more)]
+            points.append(_shape_points(q, count - more // 2) + there)
+    number = math.prod(len(each) for each in points)
+    if number <= MOST_POINTS:
+        rows = list(itertools.product(*points))
+    else:  # some of all, none of them alike in most
+        rows = [_combination(points, int(number * (k * GOLDEN % 1.0))) for k in range(MOST_POINTS)]
     return torch.tensor(rows, dtype=torch.float64).reshape(len(rows), len(shape))
+
+
+def _spaced(values: Tensor, count: int) -> list[float]:
+    """So many of sorted values ``(n,)``, evenly spaced in rank."""
+    at = ((torch.arange(count) + 0.5) / count * (len(values) - 1)).round().long()
+    return [float(v) for v in values[at]]
+
+
+def _combination(points: Sequence[Sequence[float]], number: int) -> tuple[float, ...]:
+    """One of the combinations of a point of each, by its number."""
+    found = []
+    for each in points:
+        number, place = divmod(number, len(each))
+        found.append(each[place])
+    return tuple(found)

@@ -50,10 +50,11 @@ class Span:
     edge: float = EDGE
 
     @classmethod
-    def of(cls, driver: Tensor) -> "Span":
-        """The range of values, on a logarithmic scale where they are positive and span decades."""
+    def of(cls, driver: Tensor, *, time: bool) -> "Span":
+        """The range of values, on a logarithmic scale where they are positive and span decades; ``time`` has none, as a
+        clock may begin anywhere."""
         low, high = float(driver.min()), float(driver.max())
-        return cls(low, high, low > 0 and high > DECADES * low)
+        return cls(low, high, not time and low > 0 and high > DECADES * low)
 
     @property
     def size(self) -> float:

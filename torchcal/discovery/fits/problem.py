@@ -169,20 +169,33 @@ class Problem:
         return [places.sort().values for places in self.sequences] if not self.in_time else self.sequences
 
     def gaps(self, places: Tensor) -> Tensor:
-        """Distances of successive data of one of the `recorded` sequences in sampling intervals, ``(m - 1,)``.
+        """Distances of successive data of one of the `recorded` sequences in sampling intervals, ``(m - 1,)``: the
+        usual one of their output in all runs.
 
         Noise forgets over them: they are infinite between sweeps.
         """
-        number = self.condition_of[places].double()  # what is not used was recorded all the same
-        at = self.order[self.condition_of[places]] if self.in_time and not self.by_sample else number  # type: ignore[index]
-        found = at.diff()
+        found = self.condition_of[places].diff().double()  # what is not used was recorded all the same
         if not len(found):
             return found
-        usual = found.median().clamp_min(1e-300) if at is not number else 1.0
-        found = (found / usual).clamp(SHORTEST, LONGEST)
+        if self.in_time and not self.by_sample:
+            found = self.steps(places) / self.usual[int(self.output_of[places[0]])]
+        found = found.clamp(SHORTEST, LONGEST)
         if self.sweeps is None:
             return torch.full_like(found, math.inf)
         return torch.where(self.sweeps[self.condition_of[places]].diff() == 0, found, math.inf)
+
+    def steps(self, places: Tensor) -> Tensor:
+        """Times between successive data of one of the `recorded` sequences, ``(m - 1,)``."""
+        return self.order[self.condition_of[places]].diff()  # type: ignore[index]
+
+    @cached_property
+    def usual(self) -> list[float]:
+        """Usual time between successive data of a run, by output; 1 where none follow each other."""
+        each: list[list[Tensor]] = [[] for _ in self.recording.outputs]
+        for places in self.recorded:
+            each[int(self.output_of[places[0]])].append(self.steps(places))
+        every = [torch.cat(steps) if steps else torch.ones(0) for steps in each]
+        return [max(float(steps.median()), 1e-300) if len(steps) else 1.0 for steps in every]
 
     @cached_property
     def uneven(self) -> bool:

@@ -239,7 +239,7 @@ def windows_of(
         order = driver.argsort(stable=True)
         if not float(driver[order[-1]]) > float(driver[order[0]]):
             continue
-        ordered, span = driver[order], Span.of(driver)
+        ordered, span = driver[order], Span.of(driver, time=residual.found.problem.is_time(name))
         cuts = _cuts(ordered, span)
         pieces = residual.tangent(_pieces(response, order, cuts))
         running = torch.cat([pieces.new_zeros(len(pieces), 1), pieces.cumsum(1)], dim=1)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchcal.discovery.fits.candidates import Candidate, drivers_scale, prepare, widened
 from torchcal.discovery.fits.fitting import Fitted, fit, refit, weighed
+from torchcal.discovery.fits.local import Span
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.refits import Refit, refit_all
 from torchcal.discovery.fits.sharpen import SOLVER_SHARE, accurate, sharpen
@@ -238,6 +239,10 @@ class Search:
     def drivers(self) -> dict[str, Tensor]:
         """What effects may depend on, at every datum of the calibrated base."""
         return self.base.problem.drivers(self.base.values[None], self.base.warm)
+
+    def spans(self) -> dict[str, Span]:
+        """Their ranges."""
+        return {name: Span.of(each, time=self.problem.is_time(name)) for name, each in self.drivers().items()}
 
     def refit_together(self, wanted: Sequence[Hypothetical]) -> list[Model | None]:
         """Refit several hypotheses, on the executor where there is one; None where no start gives a fit.

@@ -43,6 +43,8 @@ def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None
     if holdout is False:
         return None
     share = SHARE
+    if isinstance(holdout, np.floating):
+        holdout = float(holdout)
     if holdout is not None and not isinstance(holdout, float):
         try:
             mask = holdout if isinstance(holdout, Tensor) else torch.as_tensor(np.asarray(holdout))

@@ -144,7 +144,7 @@ def alone(found: Fitted, noise: Noise, tangents: Tangents) -> tuple[Noise, float
                 sd[here] = sizes[k, best[k]].sqrt() * unit[here]
     if noise.open:
         sd = torch.maximum(sd, least(problem, noise.step))
-        noise = dataclasses.replace(noise, freedom=float(freedom[count > 0].min()))
+        noise = dataclasses.replace(noise, freedom=torch.where(count > 0, freedom, math.inf))
     fresh = dataclasses.replace(noise, sd=sd, correlation=correlation, posterior=posterior)
     return fresh, log_likelihood(found, fresh, tangents)
 

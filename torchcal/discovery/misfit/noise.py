@@ -18,7 +18,7 @@ from torchcal.discovery.records import NoiseModel
 from torchcal.errors import DomainError
 
 __all__ = [
-    "GRID", "LEAST", "Noise", "decorrelated", "estimate", "growth", "least", "log_prior", "mine", "quantisation"
+    "GRID", "LEAST", "Noise", "decorrelated", "estimate", "least", "log_prior", "mine", "quantisation"
 ]  # fmt: skip
 
 #: AR(1) coefficients that are tried.
@@ -32,15 +32,6 @@ LEAST = 40
 CLEAR, CAUTION = 0.05, 0.6
 #: Smallest noise sd that is estimated, in the output's spread.
 FLOOR = 1e-7
-#: Fewest data of an output whose noise may grow with it; the log-likelihood that this must gain; the sd at zero that
-#: are tried, in those at the largest output; the ratio of the largest sd to the smallest below which nothing is gained;
-#: and as how many independent data differences of neighbours count.
-FEWEST, GROWS, LITTLE, INDEPENDENT = 20, 3.0, 4.0, 0.6
-OFFSETS = (1e-5, 3e-5, 1e-4, 3e-4, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3)
-#: So many data with outputs that small say how noise is there; below them it is no smaller.
-SAY = 3
-#: Least share of a datum's own noise that smooth curves leave of it.
-LEVERAGE = 0.1
 #: Ratio of the largest to the smallest sd of an output from which on both are told.
 VARIES = 1.05
 #: How much larger the noise found may be than the noise given before the given one is doubted.
@@ -54,7 +45,8 @@ class Noise:
     Attributes:
         sd: ``(n_total,)``.
         correlation: AR(1) coefficient by output, ``(outputs,)``.
-        freedom: Degrees of freedom that the size was estimated with; infinite where it is known.
+        freedom: Degrees of freedom that the size was estimated with, by output, ``(outputs,)``; infinite where it is
+            known.
         posterior: Probability of each coefficient in `GRID`, by output, ``(outputs, grid)``.
         source: As in `NoiseModel`.
         sizes: Noise sd at each coefficient in `GRID`, by output, ``(outputs, grid)``; of a known noise, in its sd; of
@@ -67,7 +59,7 @@ class Noise:
 
     sd: Tensor
     correlation: Tensor
-    freedom: float
+    freedom: Tensor
     posterior: Tensor
     source: str
     sizes: Tensor
@@ -131,14 +123,15 @@ def estimate(
     posterior = torch.zeros(outputs, len(GRID), dtype=torch.float64)
     posterior[:, 0] = 1.0
     table = torch.ones(outputs, len(GRID), dtype=torch.float64)
+    freedom = torch.full((outputs,), math.inf, dtype=torch.float64)
     if isinstance(given, str):  # a detailed simulation: what counts is the misfit in units of the spread
         sd = recording.spread * 1e-3
-        return Noise(sd, correlation, math.inf, posterior, "none", table, unit=torch.ones_like(sd))
+        return Noise(sd, correlation, freedom, posterior, "none", table, unit=torch.ones_like(sd))
     unit = torch.ones_like(recording.y) if unit is None else unit
     known = given if isinstance(given, Tensor) else unit
     replicated = replicates(problem) if given is None else None
     sd = known.clone()
-    freedom, doubted, log_density = math.inf, 1.0, 0.0
+    doubted, log_density = 1.0, 0.0
     for output in range(outputs):
         parts = [places for places in problem.recorded if int(problem.output_of[places[0]]) == output]
         n = sum(len(places) for places in parts)
@@ -192,9 +185,9 @@ def estimate(
                     if float(weight[:2].sum()) < CLEAR:  # else they are taken to be independent
                         best = _cautious(weight)
                         correlation[output], posterior[output], size = GRID[best], weight, float(told[1][best])
-                sd[mask], freedom = size * unit[mask], min(freedom, own.freedom)
+                sd[mask], freedom[output] = size * unit[mask], own.freedom
             else:
-                sd[mask], freedom = scale * unit[mask], min(freedom, usable)
+                sd[mask], freedom[output] = scale * unit[mask], usable
         elif scale > EXCESS * (1 + 2 / math.sqrt(2 * usable)):
             doubted = max(doubted, scale)
     step = quantisation(problem) if given is None else {}
@@ -207,72 +200,6 @@ def estimate(
 def _cautious(posterior: Tensor) -> int:
     """Place in `GRID` at which a clear correlation is taken, by its posterior ``(grid,)``."""
     return int((posterior.cumsum(0) < CAUTION).sum())
-
-
-def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor, before: Tensor) -> Tensor:
-    """Noise sd in units of its median, ``(n_total,)``: 1, or growing with the model's output where the scatter does.
-
-    An sd of a + |f| / max |f| is taken for the best of a few a where it makes the fastest part of the residual much
-    likelier (by `GROWS`; Laplace's distribution, whose scale a few outliers move little), and no smaller than where
-    `SAY` data were looked at: of a blank nothing is known but by them. Where there are replicates, how far they are off
-    their means takes the place of the residual. It is for noise of unknown size. Outputs ``f`` are
-    those of all data, used or not, ``(n_total,)``; ``before`` is what was found before, by which data are weighed.
-    """
-    unit = torch.ones_like(problem.recording.y)
-    f, replicated = f.abs(), replicates(problem)
-    for output in range(len(problem.recording.outputs)):
-        parts = [places for places in problem.recorded if int(problem.output_of[places[0]]) == output]
-        if not parts:
-            continue
-        used = f[problem.index[torch.cat(parts)]]
-        if replicated is not None:
-            e, told = replicated[output].even.abs(), float(replicated[output].freedom)
-            size_of = f[problem.index[replicated[output].places]] / used.max()
-        else:
-            left, size = [], []
-            for places in parts:
-                kept, inside = _fastest(problem, places, residual, design, before)
-                left.append(kept)
-                size.append(f[problem.index[places]][inside] / used.max())
-            e, size_of = torch.cat(left).abs(), torch.cat(size)
-            told = (INDEPENDENT if problem.order is not None else 1.0) * len(e)
-        seen = e > 0  # what is exact, a blank set to zero, is no measure of noise
-        e, size_of, told = e[seen], size_of[seen], told * float(seen.double().mean())
-        if len(e) < FEWEST or not float(used.max()) > 0 or not float(e.sum()) > 0:
-            continue
-        best, smallest = GROWS - told * math.log(float(e.sum())), float(size_of.sort().values[SAY - 1])
-        for offset in OFFSETS:
-            shape = offset + size_of
-            if float(shape.max()) < LITTLE * float(shape.min()):
-                continue
-            like = -told * (math.log(float((e / shape).sum())) + float(shape.log().mean()))
-            if like > best:
-                best, here = like, mine(problem, output)
-                grown = offset + (f[here] / used.max()).clamp_min(smallest)
-                unit[here] = grown / (offset + float(used.median() / used.max()))
-    return torch.where(torch.isfinite(unit), unit, 1.0)
-
-
-def _fastest(
-    problem: Problem, places: Tensor, residual: Tensor, design: Tensor, unit: Tensor
-) -> tuple[Tensor, slice]:
-    """What a sequence has that no smooth curve has, and at which of its data.
-
-    In an order by how much data are off the line between their neighbours, which hardly any misfit moves; elsewhere
-    what is left beyond smooth curves, weighed by a unit of the noise ``(n_total,)``.
-    """
-    r = residual[places]
-    if len(r) < 3:
-        return r[:0], slice(0, 0)
-    if problem.order is None:
-        basis, size = beyond(problem, places, design, unit), unit[problem.index[places]]
-        left = (1 - basis.square().sum(1)).clamp_min(LEVERAGE).sqrt()  # what the curves leave of the noise of a datum
-        return (r - size * (basis @ (basis.T @ (r / size)))) / left, slice(None)
-    at = problem.order[problem.condition_of[places]]
-    at = at if bool((at.diff() > 0).all()) else torch.arange(len(r), dtype=torch.float64)
-    share = (at[1:-1] - at[:-2]) / (at[2:] - at[:-2])
-    off = r[1:-1] - (1 - share) * r[:-2] - share * r[2:]
-    return off / (1 + share.square() + (1 - share).square()).sqrt(), slice(1, -1)
 
 
 def mine(problem: Problem, output: int) -> Tensor:
@@ -297,14 +224,14 @@ def decorrelated(values: Tensor, rho: Tensor) -> Tensor:
 
 
 def quantisation(problem: Problem) -> dict[str, float]:
-    """Step of each output whose values are few multiples of one number."""
+    """Step of each output whose values are few multiples of one number apart."""
     found = {}
     for name, values in problem.recording.split(problem.recording.y).items():
         seen = values[torch.isfinite(values)].unique()
         if len(seen) < 3 or len(seen) > 0.8 * int(torch.isfinite(values).sum()) or len(values) < 20:
             continue
-        step = float(seen.diff().min())
-        size = float(seen.abs().max())
-        if step > 1e-6 * size and float(((seen / step) - (seen / step).round()).abs().max()) < 1e-3:
+        step, size = float(seen.diff().min()), float(seen.abs().max())
+        count = (seen - seen[0]) / step  # 0 °C is no multiple of half a kelvin
+        if step > 1e-6 * size and float((count - count.round()).abs().max()) < 1e-3:
             found[name] = step
     return found

@@ -79,8 +79,11 @@ def _noise_draws(found: Fitted, noise: Noise, draws: int, seed: int) -> Tensor:
                 e[places] = walk
         unit = w.sd.clone()
         e = w(e * unit[:, None])
-    if math.isfinite(noise.freedom):
-        half = torch.full((draws,), 0.5 * noise.freedom, dtype=torch.float64)
+    for output, freedom in enumerate(noise.freedom.tolist()):
+        if not math.isfinite(freedom):
+            continue
+        mine = problem.output_of == output
+        half = torch.full((draws,), 0.5 * freedom, dtype=torch.float64)
         chi2 = 2 * torch._standard_gamma(half, generator=generator)
-        e = e * (noise.freedom / chi2).sqrt()
+        e[mine] = e[mine] * (freedom / chi2).sqrt()
     return e

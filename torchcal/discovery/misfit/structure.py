@@ -89,7 +89,7 @@ def responses_of(problem: Problem, available: Sequence[Channel]) -> list[_Look]:
             if distinct < 2:
                 continue
             counts = dict.fromkeys(min(count, distinct) for count in _counts(problem, data, name))
-            scales = [driver, driver.log()] if not problem.is_time(name) and Span.of(driver).log else [driver]
+            scales = [driver, driver.log()] if Span.of(driver, time=problem.is_time(name)).log else [driver]
             parts = [_features(scale, count) for scale in scales for count in counts]
             found.append(_Look(channel, name, parts, channel.response(torch.cat(parts, dim=1))))
     return found

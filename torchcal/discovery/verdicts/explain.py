@@ -167,6 +167,8 @@ def identifiability(search: Search, best: Model | None) -> list[str]:
             own = best is not None and best.window is not None and i in best.numbers
             everywhere = ", where it acts everywhere," if own else ""
             rows.append(f"{candidate.name}{everywhere} cannot be told from the parameters of the base")
+        for name, (low, high) in () if best is not None and i in best.numbers else candidate.anywhere.items():
+            rows.append(f"{name} has no bounds, and was sought from {low:.4g} to {high:.4g}")
     return [*([] if best is None else one_law(best)), *rows, *_nearly_the_same(search)][:12]
 
 

@@ -142,20 +142,22 @@ def _bends(reading: Reading, true: Tensor) -> bool:
 
 
 def _straight(reading: Reading, true: Tensor, sd: Tensor) -> bool:
-    """Whether a reading follows a straight line at the recorded values, but for a few, as far as noise shows."""
+    """Whether a reading follows a straight line at the recorded values, but for a few, as far as noise shows: one as
+    steep on either side of zero where these are of both signs, as what saturates is beyond all of them."""
     kept, shown = torch.ones_like(true, dtype=torch.bool), reading(true)
     if not bool(shown.isfinite().all()):
         return False
     for _ in range(FEW):
         off = torch.zeros_like(true)
-        off[kept] = (_off_line(true[kept], shown[kept]) / sd[kept]).abs()
+        off[kept] = (_off_line(true[kept], shown[kept], sides=True) / sd[kept]).abs()
         kept &= true != true[off.argmax()]
-    return float((_off_line(true[kept], shown[kept]) / sd[kept]).norm()) < SEEN
+    return float((_off_line(true[kept], shown[kept], sides=True) / sd[kept]).norm()) < SEEN
 
 
-def _off_line(y: Tensor, shown: Tensor) -> Tensor:
-    """What a straight line through readings of true values leaves, ``(m,)``."""
-    line = torch.stack([torch.ones_like(y), y], dim=-1)
+def _off_line(y: Tensor, shown: Tensor, *, sides: bool = False) -> Tensor:
+    """What a straight line through readings of true values leaves, ``(m,)``; or one on either side of zero, both as
+    steep."""
+    line = torch.stack([torch.ones_like(y), y] + ([y.sign()] if sides else []), dim=-1)
     return shown - line @ torch.linalg.lstsq(line, shown[:, None], driver="gelsd").solution[:, 0]
 
 

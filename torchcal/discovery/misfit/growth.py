@@ -1,0 +1,145 @@
+"""How the sd of unknown noise differs from datum to datum: with what was read, and from run to run."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.misfit.curves import beyond
+from torchcal.discovery.misfit.noise import mine
+from torchcal.discovery.misfit.replicates import replicates
+
+__all__ = ["growth"]
+
+#: Fewest data of an output whose noise may grow with it; the log-likelihood that this must gain; the sd at zero that
+#: are tried, in those at the largest output; the ratio of the largest sd to the smallest below which nothing is gained;
+#: and as how many independent data differences of neighbours count.
+FEWEST, GROWS, LITTLE, INDEPENDENT = 20, 3.0, 4.0, 0.6
+OFFSETS = (1e-5, 3e-5, 1e-4, 3e-4, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3)
+#: How much larger the fastest part of one run's residual must be than that of another's, and how much longer the usual
+#: time between its samples may be, for runs to have noise of unlike size.
+UNLIKE, AS_FAST = 1.5, 1.5
+#: So many data with outputs that small say how noise is there; below them it is no smaller.
+SAY = 3
+#: Least share of a datum's own noise that smooth curves leave of it.
+LEVERAGE = 0.1
+
+
+def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor, before: Tensor) -> Tensor:
+    """Noise sd in units of its median, ``(n_total,)``: 1, or growing with the model's output where the scatter does, or
+    unlike in runs that scatter otherwise. It is for noise of unknown size.
+
+    Where there are replicates, how far they are off their means takes the place of the residual. Outputs ``f`` are
+    those of all data, used or not, ``(n_total,)``; ``before`` is what was found before, by which data are weighed.
+    """
+    unit = torch.ones_like(problem.recording.y)
+    for output in range(len(problem.recording.outputs)):
+        parts = [places for places in problem.recorded if int(problem.output_of[places[0]]) == output]
+        if not parts:
+            continue
+        here = mine(problem, output)
+        grown, gain = _growing(problem, residual, design, f.abs(), before, output, parts)
+        if problem.in_time:
+            unlike, more = _in_runs(problem, residual, design, torch.ones_like(unit), parts)
+            if more > gain:
+                grown = unlike
+            elif gain > 0:
+                grown = grown * _in_runs(problem, residual, design, grown, parts)[0]
+        unit[here] = grown[here]
+    return torch.where(torch.isfinite(unit), unit, 1.0)
+
+
+def _growing(
+    problem: Problem,
+    residual: Tensor,
+    design: Tensor,
+    f: Tensor,
+    before: Tensor,
+    output: int,
+    parts: list[Tensor],
+) -> tuple[Tensor, float]:
+    """An output's noise as it grows with what was read, ``(n_total,)``, and by how much that is likelier; 1 and 0 where
+    it is not.
+
+    An sd of a + |f| / max |f| is taken for the best of a few a where it makes the fastest part of the residual much
+    likelier (by `GROWS`; Laplace's distribution, whose scale a few outliers move little), and no smaller than where
+    `SAY` data were looked at: of a blank nothing is known but by them.
+    """
+    unit, replicated = torch.ones_like(problem.recording.y), replicates(problem)
+    used = f[problem.index[torch.cat(parts)]]
+    if replicated is not None:
+        e, told = replicated[output].even.abs(), float(replicated[output].freedom)
+        size_of = f[problem.index[replicated[output].places]] / used.max()
+    else:
+        left, size = [], []
+        for places in parts:
+            kept, inside = _fastest(problem, places, residual, design, before)
+            left.append(kept)
+            size.append(f[problem.index[places]][inside] / used.max())
+        e, size_of = torch.cat(left).abs(), torch.cat(size)
+        told = (INDEPENDENT if problem.order is not None else 1.0) * len(e)
+    seen = e > 0  # what is exact, a blank set to zero, is no measure of noise
+    e, size_of, told = e[seen], size_of[seen], told * float(seen.double().mean())
+    if len(e) < FEWEST or not float(used.max()) > 0 or not float(e.sum()) > 0:
+        return unit, 0.0
+    least = best = GROWS - told * math.log(float(e.sum()))
+    smallest = float(size_of.sort().values[SAY - 1])
+    for offset in OFFSETS:
+        shape = offset + size_of
+        if float(shape.max()) < LITTLE * float(shape.min()):
+            continue
+        like = -told * (math.log(float((e / shape).sum())) + float(shape.log().mean()))
+        if like > best:
+            best = like
+            unit = (offset + (f / used.max()).clamp_min(smallest)) / (offset + float(used.median() / used.max()))
+    return unit, best - least
+
+
+def _in_runs(
+    problem: Problem, residual: Tensor, design: Tensor, unit: Tensor, parts: list[Tensor]
+) -> tuple[Tensor, float]:
+    """An output's noise, in a unit ``(n_total,)``, as it differs from run to run, ``(n_total,)``, and by how much that
+    is likelier; 1 and 0 where the fastest part of the residual is not clearly larger in one run than in another that is
+    sampled as fast."""
+    factor, run_of = torch.ones_like(unit), problem.recording.x["run"].repeat(len(problem.recording.outputs))  # type: ignore[index]
+    sizes, told, runs, steps = [], [], [], []
+    for places in parts:
+        left, inside = _fastest(problem, places, residual, design, unit)
+        e = (left / unit[problem.index[places]][inside]).abs()
+        if len(e) >= FEWEST and float(e.sum()) > 0:
+            sizes.append(float(e.mean()))
+            told.append(INDEPENDENT * len(e))
+            runs.append(float(run_of[problem.index[places[0]]]))
+            steps.append(float(problem.steps(places).median()))
+    if len(sizes) < 2 or max(steps) > AS_FAST * min(steps) or max(sizes) < UNLIKE * min(sizes):
+        return factor, 0.0
+    pooled = sum(n * size for n, size in zip(told, sizes, strict=True)) / sum(told)
+    gain = sum(n * math.log(pooled / size) for n, size in zip(told, sizes, strict=True)) - GROWS * len(sizes)
+    if gain <= 0:
+        return factor, 0.0
+    for run, size in zip(runs, sizes, strict=True):
+        factor[run_of == run] = size / pooled
+    return factor / factor[problem.index[torch.cat(parts)]].median(), gain
+
+
+def _fastest(
+    problem: Problem, places: Tensor, residual: Tensor, design: Tensor, unit: Tensor
+) -> tuple[Tensor, slice]:
+    """What a sequence has that no smooth curve has, and at which of its data.
+
+    In an order by how much data are off the line between their neighbours, which hardly any misfit moves; elsewhere
+    what is left beyond smooth curves, weighed by a unit of the noise ``(n_total,)``.
+    """
+    r = residual[places]
+    if len(r) < 3:
+        return r[:0], slice(0, 0)
+    if problem.order is None:
+        basis, size = beyond(problem, places, design, unit), unit[problem.index[places]]
+        left = (1 - basis.square().sum(1)).clamp_min(LEVERAGE).sqrt()  # what the curves leave of the noise of a datum
+        return (r - size * (basis @ (basis.T @ (r / size)))) / left, slice(None)
+    at = problem.order[problem.condition_of[places]]
+    at = at if bool((at.diff() > 0).all()) else torch.arange(len(r), dtype=torch.float64)
+    share = (at[1:-1] - at[:-2]) / (at[2:] - at[:-2])
+    off = r[1:-1] - (1 - share) * r[:-2] - share * r[2:]
+    return off / (1 + share.square() + (1 - share).square()).sqrt(), slice(1, -1)
