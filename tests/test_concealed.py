@@ -37,6 +37,7 @@ SUITE = Path(generate.__file__).parent
 STILL = ("dose response", "solar cell", "spring")
 FRESH = ("infusion", "rolling ship", "heat exchanger")
 UNSEEN = ("battery cell", "car on a road", "soil moisture", "epidemic", "adsorption")
+BLIND = ("quarter car", "enzyme reactor", "leaf", "power grid swing", "catchment")
 
 
 def decay(**changes):
@@ -142,12 +143,13 @@ def test_plan_of_the_published_run():
 
 
 def test_families_of_development_and_test():
-    seeds = (999, 1000, 2000, 3000, 4000)
-    development, test, newest, fresh, unseen = (set(generate.families_of(seed)) for seed in seeds)
+    seeds = (999, 1000, 2000, 3000, 4000, 5000)
+    development, test, newest, fresh, unseen, blind = (set(generate.families_of(seed)) for seed in seeds)
     assert test == set(generate.families_of(1999))
     assert newest == set(generate.families_of(2999))
     assert fresh == set(generate.families_of(3999)) == set(FRESH)
-    assert unseen == set(UNSEEN)
+    assert unseen == set(generate.families_of(4999)) == set(UNSEEN)
+    assert blind == set(BLIND)
     assert len(development) >= 10
     assert development < test
     assert len(test - development) >= 3
@@ -155,7 +157,8 @@ def test_families_of_development_and_test():
     assert not newest & test
     assert not fresh & (newest | test)
     assert not unseen & (fresh | newest | test)
-    assert unseen | fresh | newest | test == set(FAMILIES)
+    assert not blind & (unseen | fresh | newest | test)
+    assert blind | unseen | fresh | newest | test == set(FAMILIES)
 
 
 @pytest.mark.parametrize("family", FAMILIES.values(), ids=list(FAMILIES))
@@ -174,13 +177,13 @@ def test_families_are_well_formed(family):
 
 
 @pytest.mark.parametrize(
-    "name", ["pendulum", "solar cell", "spring", "thermistor", "cooling body", *FRESH, *UNSEEN]
+    "name", ["pendulum", "solar cell", "spring", "thermistor", "cooling body", *FRESH, *UNSEEN, *BLIND]
 )
 def test_every_family_has_a_near_tie(name):
     assert np.median([tied_correlation(FAMILIES[name], seed) for seed in range(3)]) > 0.9
 
 
-@pytest.mark.parametrize("name", [*FRESH, *UNSEEN])
+@pytest.mark.parametrize("name", [*FRESH, *UNSEEN, *BLIND])
 def test_the_tool_is_given_the_same_physics(name):
     """Base and candidates are written twice: both say the same, with everything known. The saturation has a shape."""
     family, rng = FAMILIES[name], np.random.default_rng(1)

@@ -16,7 +16,7 @@ def main() -> None:
         "--seed", type=int, default=generate.FIRST_TEST_SEED,
         help=f"below {generate.FIRST_TEST_SEED}: development, without the late families; from "
         f"{generate.NEWEST_SEED} on the newest families alone, from {generate.FRESH_SEED} on the fresh ones, from "
-        f"{generate.UNSEEN_SEED} on the unseen ones",
+        f"{generate.UNSEEN_SEED} on the unseen ones, from {generate.BLIND_SEED} on the blind ones",
     )  # fmt: skip
     parser.add_argument("--out", type=Path, default=Path("outputs/concealed"))
     parser.add_argument("--small", action="store_true", help=f"{SMALL} cases, without peers and follow-ups")

@@ -65,6 +65,9 @@ FRESH_SEED = 3000
 UNSEEN_SEED = 4000
 """Seeds from here on hold the unseen families alone."""
 
+BLIND_SEED = 5000
+"""Seeds from here on hold the blind families alone."""
+
 
 @dataclass(frozen=True)
 class Draft:
@@ -595,7 +598,7 @@ def write_case(
 def families_of(seed: int) -> list[str]:
     """Names of the families that a set of this seed holds."""
     if seed >= NEWEST_SEED:
-        late = 2 + (seed >= FRESH_SEED) + (seed >= UNSEEN_SEED)
+        late = 2 + (seed >= FRESH_SEED) + (seed >= UNSEEN_SEED) + (seed >= BLIND_SEED)
         return [name for name, family in FAMILIES.items() if family.late == late]
     return [name for name, family in FAMILIES.items() if family.late <= int(seed >= FIRST_TEST_SEED)]
 
@@ -607,7 +610,8 @@ def generate(out: Path, cases: int, seed: int, *, progress: bool = True) -> Path
         out: Folder, made if need be.
         cases: Number of cases.
         seed: Below `FIRST_TEST_SEED` for development; from `NEWEST_SEED` on for the newest families alone, from
-            `FRESH_SEED` on for the fresh ones, from `UNSEEN_SEED` on for the unseen ones.
+            `FRESH_SEED` on for the fresh ones, from `UNSEEN_SEED` on for the unseen ones, from `BLIND_SEED` on for the
+            blind ones.
         progress: Whether to say how far it is.
     """
     families = families_of(seed)

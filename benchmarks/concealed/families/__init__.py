@@ -1,6 +1,7 @@
 """The families of cases, by name."""
 
 from benchmarks.concealed.families import (
+    blind,
     chemical,
     electrical,
     fresh,
@@ -17,7 +18,9 @@ from benchmarks.concealed.families.base import Family
 
 FAMILIES: dict[str, Family] = {
     family.name: family
-    for module in (mechanical, thermal, hydraulic, chemical, electrical, orbital, still, late, newest, fresh, unseen)
+    for module in (
+        mechanical, thermal, hydraulic, chemical, electrical, orbital, still, late, newest, fresh, unseen, blind
+    )
     for family in module.FAMILIES
 }
 

@@ -136,7 +136,7 @@ class Family:
         effects: Every effect, in the library and not.
         tied: A pair of candidates that such data can hardly tell apart.
         late: 0: in every set; 1: in test sets alone; 2: alone in sets from the newest seed on; 3: from the
-            fresh seed on.
+            fresh seed on; 4: from the unseen one on; 5: from the blind one on.
         positive: States that must stay positive on the truth's trajectory.
         scales: Typical sizes of the states, for the integrator's absolute tolerance.
     """

@@ -14,6 +14,7 @@ import torch
 
 import torchcal as tc
 from benchmarks.concealed.models import (
+    blind,
     chemical,
     electrical,
     fresh,
@@ -31,7 +32,9 @@ from torchcal.terms import Term
 
 BUILDERS: dict[str, Builder] = {
     family: builder
-    for module in (mechanical, thermal, hydraulic, chemical, electrical, orbital, still, late, newest, fresh, unseen)
+    for module in (
+        mechanical, thermal, hydraulic, chemical, electrical, orbital, still, late, newest, fresh, unseen, blind
+    )
     for family, builder in module.BUILDERS.items()
 }
 
