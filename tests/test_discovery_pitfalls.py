@@ -672,13 +672,20 @@ def test_a_hopeless_base_is_a_misfit_whatever_is_left_looks_like(monkeypatch):
     """Noise that grows with the value took up a lag of 300 log units, and the verdict was that nothing is missing."""
     search = types.SimpleNamespace(
         models=[], exact=False, p_detect=0.6, terms=["lag"], few=False, screen_all=lambda: None,
-        stop=threading.Event(), left=set(),
+        stop=threading.Event(), left=set(), noise=types.SimpleNamespace(source="estimated"),
     )  # fmt: skip
     for alone, odds, detected in ((1e-9, 0.0, True), (0.04, 2.0, False), (0.04, 8.0, True)):
         monkeypatch.setattr(rounds, "base_alone", lambda search, alone=alone: alone)
         monkeypatch.setattr(rounds, "odds_alone", lambda search, odds=odds: odds)
         monkeypatch.setattr(rounds, "refit_singles", lambda search, detected=True: None)
         monkeypatch.setattr(rounds, "refit_local", lambda search: None)
+        assert rounds._refit(search, 0.95) is detected
+    # Of few replicates the odds are none: they take for known what these hardly tell.
+    monkeypatch.setattr(rounds, "base_alone", lambda search: 1e-9)
+    monkeypatch.setattr(rounds, "odds_alone", lambda search: 0.0)
+    for freedom, detected in ((3.0, False), (30.0, True)):
+        search.p_detect = 0.6
+        search.noise = types.SimpleNamespace(source="replicates", freedom=torch.tensor([freedom], dtype=F64))
         assert rounds._refit(search, 0.95) is detected
 
 

@@ -661,7 +661,8 @@ def projected(n, *, seed=0, draws=20):
         return values - basis @ (basis.T @ values)
 
     noise = tangent(torch.randn(n, 1 + draws, generator=generator, dtype=F64))
-    return types.SimpleNamespace(e=noise[:, 0], null=noise[:, 1:], tangent=tangent)
+    found = types.SimpleNamespace(problem=types.SimpleNamespace(is_time=lambda driver: False))
+    return types.SimpleNamespace(e=noise[:, 0], null=noise[:, 1:], tangent=tangent, found=found)
 
 
 @pytest.mark.parametrize("sign", [-1, 0, 1])

@@ -216,8 +216,9 @@ def stepped(search: Search, model: Model, driver: str) -> Model:
     without = problem.evaluate(neutral[None], [])[0]
     left, effect = w.vector(problem.y - without), w.vector(problem.evaluate(begin, [])[0] - without)
     factor = (effect @ left[0]) / effect.square().sum(-1)
+    factor = factor.nan_to_num(nan=1.0).clamp(*RESIZED)  # a step may hold no datum
     misfit = (left - factor[:, None] * effect).square().sum(-1)
-    begin[:, sizes] = neutral[sizes] + factor.clamp(*RESIZED)[:, None] * (begin[:, sizes] - neutral[sizes])
+    begin[:, sizes] = neutral[sizes] + factor[:, None] * (begin[:, sizes] - neutral[sizes])
     begin = begin[misfit.nan_to_num(nan=torch.inf).argsort()[:STEPPED]]
     again = Hypothetical(model.numbers, model.candidate, begin, model.log_prior, model.window)
     (other,) = _refit(search, [again])

@@ -93,7 +93,8 @@ def _spare(search: Search, candidate: Candidate) -> int:
 
 
 def _wavers(search: Search, column: Tensor) -> float:
-    """Mean of 1 / (degrees of freedom of the noise) over the outputs in which a whitened effect ``(n,)`` shows."""
+    """Variance of the noise's log variance, as a whitened effect ``(n,)`` sees it, halved: Σ share² / (degrees of
+    freedom) over the outputs that it shows in."""
     share = torch.zeros_like(search.noise.freedom).index_add_(0, search.problem.output_of, column.square())
     return float(((share / share.sum().clamp_min(1e-300)).square() / search.noise.freedom).sum())
 

@@ -60,7 +60,7 @@ def _headline(d: Any) -> str:
 
 def _detected(d: Any) -> str:
     noise = d.noise
-    sd = ", ".join(f"{name} {value:.3g}{_varying(noise, name)}" for name, value in noise.sd.items())
+    sd = ", ".join(f"{name} {value:.3g}{_varying(d, name)}" for name, value in noise.sd.items())
     if noise.source == "none":
         rmse = d.before.fitted.rmse
         unit = rmse_unit(d)
@@ -96,10 +96,11 @@ def _set_aside(d: Any) -> str:
     )
 
 
-def _varying(noise: Any, name: str) -> str:
+def _varying(d: Any, name: str) -> str:
     """The range of an sd that is not the same for all data."""
-    if name not in noise.range:
+    if name not in d.noise.range:
         return ""
-    low, high = noise.range[name]
-    told = "this being the median" if noise.source == "given" else "growing with it, or from run to run"
+    low, high = d.noise.range[name]
+    several = " or differing from run to run" if d.recording.runs is not None and len(d.recording.runs) > 1 else ""
+    told = "this being the median" if d.noise.source == "given" else f"growing with it{several}"
     return f" ({low:.3g} to {high:.3g}, {told})"

@@ -421,7 +421,8 @@ def _grid(problem: Problem, shape: list[int], drivers: Mapping[str, Sequence[Ten
     if number <= MOST_POINTS:
         rows = list(itertools.product(*points))
     else:  # some of all, none of them alike in most
-        rows = [_combination(points, int(number * (k * GOLDEN % 1.0))) for k in range(MOST_POINTS)]
+        numbers = dict.fromkeys(int(number * (k * GOLDEN % 1.0)) for k in range(2 * MOST_POINTS))
+        rows = [_combination(points, k) for k in list(numbers)[:MOST_POINTS]]
     return torch.tensor(rows, dtype=torch.float64).reshape(len(rows), len(shape))
 
 

@@ -17,9 +17,14 @@ __all__ = ["growth"]
 #: and as how many independent data differences of neighbours count.
 FEWEST, GROWS, LITTLE, INDEPENDENT = 20, 3.0, 4.0, 0.6
 OFFSETS = (1e-5, 3e-5, 1e-4, 3e-4, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3)
-#: How much larger the fastest part of one run's residual must be than that of another's, and how much longer the usual
-#: time between its samples may be, for runs to have noise of unlike size.
-UNLIKE, AS_FAST = 1.5, 1.5
+#: How much larger the fastest part of one run's residual must be than that of another's, and may be at most (more is
+#: rounding); how much longer the usual time between its samples may be; and by how much their ratio may differ beside
+#: neighbours that are so many samples away, for runs to have noise of unlike size.
+UNLIKE, MOST_UNLIKE, AS_FAST, AGREE, FAR = 1.5, 1000.0, 1.5, 1.4, (4, 6, 8)
+#: Share of the differences, the largest, that count for nothing then: outliers and jumps.
+TRIMMED = 0.05
+#: Log-likelihood by which noise that grows, and differs from run to run beside that, must be better than the latter.
+BOTH = 10.0
 #: So many data with outputs that small say how noise is there; below them it is no smaller.
 SAY = 3
 #: Least share of a datum's own noise that smooth curves leave of it.
@@ -41,11 +46,9 @@ def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor, before
         here = mine(problem, output)
         grown, gain = _growing(problem, residual, design, f.abs(), before, output, parts)
         if problem.in_time:
-            unlike, more = _in_runs(problem, residual, design, torch.ones_like(unit), parts)
-            if more > gain:
-                grown = unlike
-            elif gain > 0:
-                grown = grown * _in_runs(problem, residual, design, grown, parts)[0]
+            alone, without = _in_runs(problem, residual, torch.ones_like(unit), parts)
+            beside, more = _in_runs(problem, residual, grown, parts)
+            grown = alone if without > 0 and without > gain + more - BOTH else grown * beside
         unit[here] = grown[here]
     return torch.where(torch.isfinite(unit), unit, 1.0)
 
@@ -96,23 +99,30 @@ def _growing(
     return unit, best - least
 
 
-def _in_runs(
-    problem: Problem, residual: Tensor, design: Tensor, unit: Tensor, parts: list[Tensor]
-) -> tuple[Tensor, float]:
+def _in_runs(problem: Problem, residual: Tensor, unit: Tensor, parts: list[Tensor]) -> tuple[Tensor, float]:
     """An output's noise, in a unit ``(n_total,)``, as it differs from run to run, ``(n_total,)``, and by how much that
-    is likelier; 1 and 0 where the fastest part of the residual is not clearly larger in one run than in another that is
-    sampled as fast."""
+    is likelier; 1 and 0 where all runs may be alike.
+
+    All must be sampled as fast, and be unlike in the same way beside near and beside far neighbours: noise that goes on
+    from sample to sample otherwise in one run, or physics that one run alone shows, is no noise of another size.
+    """
     factor, run_of = torch.ones_like(unit), problem.recording.x["run"].repeat(len(problem.recording.outputs))  # type: ignore[index]
-    sizes, told, runs, steps = [], [], [], []
+    sizes, far, told, runs, steps = [], [], [], [], []
     for places in parts:
-        left, inside = _fastest(problem, places, residual, design, unit)
-        e = (left / unit[problem.index[places]][inside]).abs()
-        if len(e) >= FEWEST and float(e.sum()) > 0:
-            sizes.append(float(e.mean()))
-            told.append(INDEPENDENT * len(e))
-            runs.append(float(run_of[problem.index[places[0]]]))
-            steps.append(float(problem.steps(places).median()))
-    if len(sizes) < 2 or max(steps) > AS_FAST * min(steps) or max(sizes) < UNLIKE * min(sizes):
+        r = residual[places] / unit[problem.index[places]]
+        if len(r) < FEWEST:
+            continue
+        sizes.append(_off_neighbours(r, 1))
+        far.append(sum(_off_neighbours(r, apart) for apart in FAR) / len(FAR))
+        told.append(INDEPENDENT * len(r))
+        runs.append(float(run_of[problem.index[places[0]]]))
+        steps.append(float(problem.steps(places).median()))
+    if len(sizes) < 2 or max(steps) > AS_FAST * min(steps):
+        return factor, 0.0
+    if not UNLIKE * min(sizes) < max(sizes) < MOST_UNLIKE * min(sizes):
+        return factor, 0.0
+    ratios = [one / other for one, other in zip(far, sizes, strict=True)]
+    if max(ratios) > AGREE * min(ratios):
         return factor, 0.0
     pooled = sum(n * size for n, size in zip(told, sizes, strict=True)) / sum(told)
     gain = sum(n * math.log(pooled / size) for n, size in zip(told, sizes, strict=True)) - GROWS * len(sizes)
@@ -121,6 +131,12 @@ def _in_runs(
     for run, size in zip(runs, sizes, strict=True):
         factor[run_of == run] = size / pooled
     return factor / factor[problem.index[torch.cat(parts)]].median(), gain
+
+
+def _off_neighbours(r: Tensor, apart: int) -> float:
+    """How far data ``(n,)`` are off the middle between those some places before and behind, on average of most."""
+    off = (r[apart:-apart] - 0.5 * (r[: -2 * apart] + r[2 * apart :])).abs().sort().values
+    return float(off[: math.ceil((1 - TRIMMED) * len(off))].mean())
 
 
 def _fastest(

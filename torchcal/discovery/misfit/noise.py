@@ -232,6 +232,13 @@ def quantisation(problem: Problem) -> dict[str, float]:
             continue
         step, size = float(seen.diff().min()), float(seen.abs().max())
         count = (seen - seen[0]) / step  # 0 °C is no multiple of half a kelvin
-        if step > 1e-6 * size and float((count - count.round()).abs().max()) < 1e-3:
+        counted = float((count - count.round()).abs().max()) < 1e-3
+        from_zero = float((seen / step - (seen / step).round()).abs().max()) < 1e-3
+        if step > 1e-6 * size and counted and (from_zero or _round(step)):
             found[name] = step
     return found
+
+
+def _round(step: float) -> bool:
+    """Whether a step has two digits at most, as those of readings have, and of an even row of values hardly any."""
+    return abs(step - float(f"{step:.1e}")) < 1e-6 * step

@@ -33,6 +33,8 @@ SEEN, FEW = 2.0, 2
 #: Times the recorded range in which it is looked for bends, and the share of that up to which what a straight line
 #: leaves is rounding.
 FAR, STRAIGHT = 3.0, 1e-9
+#: Share of the smallest value read at which a reading is looked at near zero.
+NEAR = 0.01
 #: Joint sd of an estimate and of what it is in nature, from which on it is not that.
 APART = 2.0
 
@@ -120,8 +122,8 @@ def no_instrument(search: Search, model: Model) -> str:
             shaped = curve and any(term.brings(names[i]) and not is_window(names[i]) for i in shapes)
             if shaped and _bends(reading, true[here]) and _straight(reading, true[here], sd[here]):
                 return (
-                    f"By it the reading of {name} is a straight line at the recorded values, as with an offset and a "
-                    "gain error: where it bends there are hardly any data."
+                    f"By it the reading of {name} is a straight line at the recorded values, or one on either side of "
+                    "zero, as with an offset, a gain error or a jump: where it bends there are hardly any data."
                 )
             true[here] = shown
     return ""
@@ -147,11 +149,22 @@ def _straight(reading: Reading, true: Tensor, sd: Tensor) -> bool:
     kept, shown = torch.ones_like(true, dtype=torch.bool), reading(true)
     if not bool(shown.isfinite().all()):
         return False
+    sides = _steepest_at_zero(reading, true)
     for _ in range(FEW):
         off = torch.zeros_like(true)
-        off[kept] = (_off_line(true[kept], shown[kept], sides=True) / sd[kept]).abs()
+        off[kept] = (_off_line(true[kept], shown[kept], sides=sides) / sd[kept]).abs()
         kept &= true != true[off.argmax()]
-    return float((_off_line(true[kept], shown[kept], sides=True) / sd[kept]).norm()) < SEEN
+    return float((_off_line(true[kept], shown[kept], sides=sides) / sd[kept]).norm()) < SEEN
+
+
+def _steepest_at_zero(reading: Reading, true: Tensor) -> bool:
+    """Whether values of both signs are read, and a reading rises faster near zero than from one to the other end of
+    those of a sign, as that of what saturates does."""
+    if not (bool((true > 0).any()) and bool((true < 0).any())):
+        return False
+    near, far = (NEAR * true.abs()[true != 0].min()).expand_as(true), true.max().expand_as(true)
+    rise = ((reading(near) - reading(-near)) / (2 * near)).median()
+    return bool(rise > ((reading(far) - reading(near)) / (far - near)).median())
 
 
 def _off_line(y: Tensor, shown: Tensor, *, sides: bool = False) -> Tensor:
