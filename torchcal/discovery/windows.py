@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from torchcal.discovery.fits.candidates import prepare
 from torchcal.discovery.fits.local import EDGE, ENDS, SHORT, WIDTH_OF_EDGE, WIDTHS, Span, beyond, is_window, localised
@@ -175,17 +176,18 @@ def _refine_edges(search: Search, prior: float) -> None:
     if not ranked:
         return
     least = ranked[0].log_evidence - max(CLOSE, 0.02 * ranked[0].log_evidence)
+    drivers, spans = search.drivers(), search.spans()
     for model in ranked[:MOST]:
         if model.window is None or model.log_evidence < least:
             continue
         w = dataclasses.replace(model.window, amplitude=_amplitude(search, model)[2])
-        span = search.spans()[w.driver]
+        span = spans[w.driver]
         scales = [span, dataclasses.replace(span, log=False)] if span.log else [span]
         found = _refit(search, [_begun(search, w, prior, model, edge=True, span=scale) for scale in scales])
         other = max((one for one in found if one is not None), key=lambda one: one.weight, default=None)
         if other is not None:
             other = stepped(search, other, w.driver)
-        if other is not None and _better(search, other, model, w.driver):
+        if other is not None and _better(other, model, drivers[w.driver]):
             search.models.remove(model)
             _keep(search, other)
 
@@ -222,13 +224,13 @@ def stepped(search: Search, model: Model, driver: str) -> Model:
     begin = begin[misfit.nan_to_num(nan=torch.inf).argsort()[:STEPPED]]
     again = Hypothetical(model.numbers, model.candidate, begin, model.log_prior, model.window)
     (other,) = _refit(search, [again])
-    return other if other is not None and _better(search, other, model, driver) else model
+    return other if other is not None and _better(other, model, along) else model
 
 
-def _better(search: Search, other: Model, model: Model, driver: str) -> bool:
-    """Whether another local model is better. By its soft edges a window acts on data beside it as well as a step that
-    holds them does."""
-    along, lead = search.drivers()[driver], other.weight - model.weight
+def _better(other: Model, model: Model, along: Tensor) -> bool:
+    """Whether another local model is better, by the values of their windows' driver at the data ``(m,)``. By its soft
+    edges a window acts on data beside it as well as a step that holds them does."""
+    lead = other.weight - model.weight
     holds = [w is None or bool(((along >= w.low) & (along <= w.high)).any()) for w in (other.window, model.window)]
     return lead + AS_WELL * (holds[0] - holds[1]) > 0
 

@@ -54,9 +54,8 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
         column = _typical(search, i)
         # Seen is not enough: the evidence for the term must outweigh that for the base too.
         wanted = max(critical, math.sqrt(max(2 * odds + len(candidate.own) * math.log(search.problem.n), 0.0)))
-        doubt = 1.0
-        if bool(search.noise.freedom.isfinite().any()):  # the noise's estimate wavers, and the score with it
-            doubt = math.sqrt(1 + 0.5 * wanted**2 * _wavers(search, screening.columns[:, column]))
+        # The noise's estimate wavers, and the score with it.
+        doubt = math.sqrt(1 + 0.5 * wanted**2 * _wavers(search, screening.columns[:, column]))
         effects[i] = _Effect(column, wanted + doubt * from_power, float(screening.norm[column]))
     sizes = {i: effect.distance / effect.norm for i, effect in effects.items()}
     hidden: dict[int, _Hidden] = {}

@@ -113,7 +113,7 @@ def unlike(search: Search, found: Fitted) -> list[str]:
     if not search.noise.open:
         return rows
     for number, name in enumerate(problem.recording.outputs):
-        recorded = [places for places in problem.recorded if int(problem.output_of[places[0]]) == number]
+        recorded = problem.recorded_of(number)
         parts = [part for places in recorded for part in _sweeps(problem, places)]
         told = [part for part in parts if len(part) >= COMPARED]
         if len(told) < 2:

@@ -168,6 +168,10 @@ class Problem:
         """The same in the order in which they were recorded, in which noise is correlated."""
         return [places.sort().values for places in self.sequences] if not self.in_time else self.sequences
 
+    def recorded_of(self, output: int) -> list[Tensor]:
+        """Those of one output, by its number."""
+        return [places for places in self.recorded if int(self.output_of[places[0]]) == output]
+
     def gaps(self, places: Tensor) -> Tensor:
         """Distances of successive data of one of the `recorded` sequences in sampling intervals, ``(m - 1,)``: the
         usual one of their output in all runs.
@@ -191,11 +195,12 @@ class Problem:
     @cached_property
     def usual(self) -> list[float]:
         """Usual time between successive data of a run, by output; 1 where none follow each other."""
-        each: list[list[Tensor]] = [[] for _ in self.recording.outputs]
-        for places in self.recorded:
-            each[int(self.output_of[places[0]])].append(self.steps(places))
-        every = [torch.cat(steps) if steps else torch.ones(0) for steps in each]
-        return [max(float(steps.median()), 1e-300) if len(steps) else 1.0 for steps in every]
+        found = []
+        for output in range(len(self.recording.outputs)):
+            each = [self.steps(places) for places in self.recorded_of(output)]
+            every = torch.cat(each) if each else torch.zeros(0)
+            found.append(max(float(every.median()), 1e-300) if len(every) else 1.0)
+        return found
 
     @cached_property
     def uneven(self) -> bool:

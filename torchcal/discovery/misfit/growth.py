@@ -8,7 +8,7 @@ from torch import Tensor
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.misfit.curves import beyond
 from torchcal.discovery.misfit.noise import mine
-from torchcal.discovery.misfit.replicates import replicates
+from torchcal.discovery.misfit.replicates import Replicates, replicates
 
 __all__ = ["growth"]
 
@@ -38,16 +38,17 @@ def growth(problem: Problem, residual: Tensor, design: Tensor, f: Tensor, before
     Where there are replicates, how far they are off their means takes the place of the residual. Outputs ``f`` are
     those of all data, used or not, ``(n_total,)``; ``before`` is what was found before, by which data are weighed.
     """
-    unit = torch.ones_like(problem.recording.y)
+    unit, replicated = torch.ones_like(problem.recording.y), replicates(problem)
     for output in range(len(problem.recording.outputs)):
-        parts = [places for places in problem.recorded if int(problem.output_of[places[0]]) == output]
+        parts = problem.recorded_of(output)
         if not parts:
             continue
         here = mine(problem, output)
-        grown, gain = _growing(problem, residual, design, f.abs(), before, output, parts)
+        own = None if replicated is None else replicated[output]
+        grown, gain = _growing(problem, residual, design, f.abs(), before, own, parts)
         if problem.in_time:
             alone, without = _in_runs(problem, residual, torch.ones_like(unit), parts)
-            beside, more = _in_runs(problem, residual, grown, parts)
+            beside, more = _in_runs(problem, residual, grown, parts) if gain > 0 else (alone, without)
             grown = alone if without > 0 and without > gain + more - BOTH else grown * beside
         unit[here] = grown[here]
     return torch.where(torch.isfinite(unit), unit, 1.0)
@@ -59,7 +60,7 @@ def _growing(
     design: Tensor,
     f: Tensor,
     before: Tensor,
-    output: int,
+    replicated: Replicates | None,
     parts: list[Tensor],
 ) -> tuple[Tensor, float]:
     """An output's noise as it grows with what was read, ``(n_total,)``, and by how much that is likelier; 1 and 0 where
@@ -69,11 +70,11 @@ def _growing(
     likelier (by `GROWS`; Laplace's distribution, whose scale a few outliers move little), and no smaller than where
     `SAY` data were looked at: of a blank nothing is known but by them.
     """
-    unit, replicated = torch.ones_like(problem.recording.y), replicates(problem)
+    unit = torch.ones_like(problem.recording.y)
     used = f[problem.index[torch.cat(parts)]]
     if replicated is not None:
-        e, told = replicated[output].even.abs(), float(replicated[output].freedom)
-        size_of = f[problem.index[replicated[output].places]] / used.max()
+        e, told = replicated.even.abs(), float(replicated.freedom)
+        size_of = f[problem.index[replicated.places]] / used.max()
     else:
         left, size = [], []
         for places in parts:

@@ -133,7 +133,7 @@ def estimate(
     sd = known.clone()
     doubted, log_density = 1.0, 0.0
     for output in range(outputs):
-        parts = [places for places in problem.recorded if int(problem.output_of[places[0]]) == output]
+        parts = problem.recorded_of(output)
         n = sum(len(places) for places in parts)
         if n == 0:
             continue
@@ -231,12 +231,16 @@ def quantisation(problem: Problem) -> dict[str, float]:
         if len(seen) < 3 or len(seen) > 0.8 * int(torch.isfinite(values).sum()) or len(values) < 20:
             continue
         step, size = float(seen.diff().min()), float(seen.abs().max())
-        count = (seen - seen[0]) / step  # 0 °C is no multiple of half a kelvin
-        counted = float((count - count.round()).abs().max()) < 1e-3
-        from_zero = float((seen / step - (seen / step).round()).abs().max()) < 1e-3
-        if step > 1e-6 * size and counted and (from_zero or _round(step)):
+        # 0 °C is no multiple of half a kelvin.
+        even = _whole((seen - seen[0]) / step) and (_whole(seen / step) or _round(step))
+        if step > 1e-6 * size and even:
             found[name] = step
     return found
+
+
+def _whole(values: Tensor) -> bool:
+    """Whether all are whole numbers, up to rounding."""
+    return float((values - values.round()).abs().max()) < 1e-3
 
 
 def _round(step: float) -> bool:

@@ -69,9 +69,7 @@ def _noise_draws(found: Fitted, noise: Noise, draws: int, seed: int) -> Tensor:
         each = math.ceil(draws / groups)
         for output in range(len(noise.posterior)):
             chosen = torch.multinomial(noise.posterior[output], groups, replacement=True, generator=generator)
-            for places in problem.recorded:
-                if int(problem.output_of[places[0]]) != output:
-                    continue
+            for places in problem.recorded_of(output):
                 phi = GRID[chosen].repeat_interleave(each)[:draws]
                 walk = e[places]
                 for k, rho in enumerate(remembered(phi, problem.gaps(places)), start=1):
