@@ -158,6 +158,18 @@ def test_a_small_share_of_short_runs_is_held_out():
     assert int(verify.choose(recording, 0.2, 1).sum()) == 6
 
 
+@pytest.mark.parametrize("each", [1, 3, 4])
+def test_replicates_are_held_out_together(each):
+    x = torch.linspace(0, 1, 14, dtype=F64).repeat(each)
+    recording = tc.Recording(x=x, y=noise(len(x), 0))
+    for mask in (verify.choose(recording, None, 2), verify.within(recording)):
+        shares = mask.reshape(each, 14).double().mean(0)
+        assert set(shares.tolist()) == {0.0, 1.0}
+        assert 2 <= int(shares.sum()) <= 4
+    x = torch.tensor([0.0, 1.0], dtype=F64).repeat_interleave(10)  # of two conditions neither can go
+    assert int(verify.choose(tc.Recording(x=x, y=noise(20, 0)), None, 2).sum()) == 5
+
+
 @pytest.mark.parametrize("size", [0.0, 1e-9])
 def test_what_leaves_rounding_alone_is_named_though_nobody_said_that_there_is_no_noise(size):
     x = torch.arange(40, dtype=F64)

@@ -632,6 +632,8 @@ def test_a_distant_third_body_is_a_tide():
         (lambda: kinetics(temperature=300.0), "temperature"),
         (lambda: electrical(voltage=""), "voltage"),
         (lambda: electrical(inductance="L"), "current"),
+        (lambda: electrical(volt=""), "volt"),
+        (lambda: electrical(ampere=1.0), "ampere"),
         (lambda: orbital(positions=()), "positions"),
         (lambda: orbital(positions=("x", "y")), "velocities"),
         (lambda: orbital(positions="xyz"), "positions"),
@@ -660,6 +662,20 @@ def test_what_a_term_does_not_find_it_asks_for():
     with pytest.raises(DomainError, match="dynamic=False"):
         lag.rates["lag of q: shown"](0.0, {"x": tensor(1.0)}, {"t90": tensor(1.0)}, {})
     assert len(sensor(("q",), dynamic=False)) == len(sensor(("q",))) - 2
+
+
+def test_a_circuit_in_millivolts_reports_millivolts():
+    options = {"capacitance": "C", "resistance": "R", "inductance": "L", "time": "ms"}
+    volts, others = (
+        [q.unit for term in electrical("v", "i", **options, **units) for q in term.parameters]
+        for units in ({}, {"volt": "mV", "ampere": "uA"})
+    )
+    assert others == [unit.replace("V", "mV").replace("A", "uA") for unit in volts]
+    hidden = term_of(electrical("v", volt="mV"), "Warburg element").states
+    assert set(hidden.values()) == {"mV"}
+    assert term_of(electrical("v", "i", resistance="R", ampere="uA"), "self-heating").states == {
+        "self-heating: warmth": "uA^2"
+    }
 
 
 def test_labels_tell_two_bodies_apart():

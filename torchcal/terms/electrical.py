@@ -28,6 +28,8 @@ def electrical(
     resistance: str | None = None,
     inductance: str | None = None,
     label: str | None = None,
+    volt: str = "V",
+    ampere: str = "A",
     time: str = "s",
 ) -> list[Term]:
     r"""Terms in the equation of a capacitor's voltage, of the measured voltage, and of the circuit's parameters.
@@ -46,10 +48,12 @@ def electrical(
             the current (by the voltage where no current is given).
         inductance: Parameter that is the inductance: adds its saturation by the current.
         label: Added to the names of the terms, where several nodes need them.
+        volt: Unit of the voltage, for reports.
+        ampere: Unit of the current, for reports.
         time: Unit of time, for reports.
 
     Returns:
-        The terms; voltages in V, currents in A.
+        The terms.
 
     Raises:
         DomainError: If a name is empty, or the inductance is given without the current.
@@ -61,23 +65,24 @@ def electrical(
     ['shunt', 'leakage current', 'diode conduction', 'non-linear conductance']
     """
     v, time = check_name(voltage, "voltage"), check_name(time, "time")
+    volt, ampere = check_name(volt, "volt"), check_name(ampere, "ampere")
     terms = [
         Term(titled("shunt", label), equation=v, rate=lambda t, s, p, u: -p["g"] * s[v],
              parameters=[amplitude("g", f"1/{time}", low=0.0)], formula=f"d{v}/dt ∋ -g {v}",
              description="Ohmic path in parallel, which discharges in proportion to the voltage."),
         Term(titled("leakage current", label), equation=v, rate=lambda t, s, p, u: -p["i"],
-             parameters=[amplitude("i", f"V/{time}")], formula=f"d{v}/dt ∋ -i",
+             parameters=[amplitude("i", f"{volt}/{time}")], formula=f"d{v}/dt ∋ -i",
              description="Constant leakage or bias current, whatever the voltage."),
         Term(titled("diode conduction", label), equation=v,
              rate=lambda t, s, p, u: -p["i"] * torch.expm1((s[v] / p["vt"]).clamp_max(STEEPEST)),
-             parameters=[amplitude("i", f"V/{time}", low=0.0), shape("vt", "V")], scales={"vt": v},
+             parameters=[amplitude("i", f"{volt}/{time}", low=0.0), shape("vt", volt)], scales={"vt": v},
              formula=f"d{v}/dt ∋ -i (exp({v}/vt) - 1)",
              description="A junction in parallel, conducting exponentially in the forward direction."),
         Term(titled("non-linear conductance", label), equation=v, rate=lambda t, s, p, u: -p["g"] * s[v] ** 3,
-             parameters=[amplitude("g", f"1/({time} V^2)")], formula=f"d{v}/dt ∋ -g {v}³",
+             parameters=[amplitude("g", f"1/({time} {volt}^2)")], formula=f"d{v}/dt ∋ -g {v}³",
              description="A path in parallel that conducts better (g > 0) or worse (g < 0) at high voltage."),
-        _absorption(v, label, time),
-        _warburg(v, label, time),
+        _absorption(v, label, volt, time),
+        _warburg(v, label, volt, time),
     ]  # fmt: skip
     if current is not None:
         amperes = quantity(check_name(current, "current"), "the current")
@@ -86,35 +91,36 @@ def electrical(
         terms.append(
             Term(titled("series resistance", label),
                  outputs={place: lambda t, s, p, u, y: y + p[r] * amperes(s, p, u)},
-                 parameters=[amplitude(r, "V/A", low=0.0)], formula=f"{place} → {place} + {r} {current}",
+                 parameters=[amplitude(r, f"{volt}/{ampere}", low=0.0)], formula=f"{place} → {place} + {r} {current}",
                  description="Leads and contacts in series with what the model describes.")
         )  # fmt: skip
     if capacitance is not None:
-        terms.append(_capacitance(check_name(capacitance, "capacitance"), v, label))
+        terms.append(_capacitance(check_name(capacitance, "capacitance"), v, label, volt))
     if resistance is not None:
-        terms.append(_self_heating(check_name(resistance, "resistance"), current, v, label, time))
+        driver = (v, volt) if current is None else (current, ampere)
+        terms.append(_self_heating(check_name(resistance, "resistance"), driver, label, time))
     if inductance is not None:
         if current is None:
             raise DomainError("Expected current= beside inductance=. Got none, and saturation depends on it.")
-        terms.append(_saturation(check_name(inductance, "inductance"), current, label))
+        terms.append(_saturation(check_name(inductance, "inductance"), current, label, ampere))
     return terms
 
 
-def _absorption(v: str, label: str | None, time: str) -> Term:
+def _absorption(v: str, label: str | None, volt: str, time: str) -> Term:
     name = titled("dielectric absorption", label)
     hidden = f"{name}: {v}"
     return Term(
         name,
         rates={v: lambda t, s, p, u: -p["k"] * (s[v] - s[hidden]),
                hidden: lambda t, s, p, u: (s[v] - s[hidden]) / p["tau"]},
-        states={hidden: "V"}, initial={hidden: v},
+        states={hidden: volt}, initial={hidden: v},
         parameters=[amplitude("k", f"1/{time}", low=0.0), shape("tau", time)], scales={"tau": "t"},
         formula=f"d{v}/dt ∋ -k ({v} - z), dz/dt = ({v} - z)/tau, z(0) = {v}(0)",
         description="Charge that creeps into the dielectric and back, as a resistor and capacitor in parallel do.",
     )  # fmt: skip
 
 
-def _warburg(v: str, label: str | None, time: str) -> Term:
+def _warburg(v: str, label: str | None, volt: str, time: str) -> Term:
     name = titled("Warburg element", label)
     hidden = [f"{name}: {v}{number}" for number in range(1, len(LADDER) + 1)]
 
@@ -130,30 +136,29 @@ def _warburg(v: str, label: str | None, time: str) -> Term:
     rates: dict[str, Any] = {v: current}
     rates |= {branch: following(branch, stretch) for branch, (stretch, _) in zip(hidden, LADDER, strict=True)}
     return Term(
-        name, rates=rates, states=dict.fromkeys(hidden, "V"), initial=dict.fromkeys(hidden, v),
+        name, rates=rates, states=dict.fromkeys(hidden, volt), initial=dict.fromkeys(hidden, v),
         parameters=[amplitude("k", f"1/{time}", low=0.0), shape("tau", time)], scales={"tau": "t"},
         formula=f"d{v}/dt ∋ -k Σ wj ({v} - zj), dzj/dt = ({v} - zj)/(nj tau), zj(0) = {v}(0), nj = 1, 8, 64",
         description="Diffusion of ions or carriers, whose current after a step falls as one over the root of time.",
     )  # fmt: skip
 
 
-def _capacitance(capacitance: str, v: str, label: str | None) -> Term:
+def _capacitance(capacitance: str, v: str, label: str | None, volt: str) -> Term:
     a = own_name("a", capacitance)
     return Term(
         titled("non-linear capacitance", label),
         shifts={capacitance: lambda t, s, p, u: p[capacitance] * (p[a] * s[v]).clamp_min(EMPTIEST - 1.0)},
-        parameters=[amplitude(a, "1/V")], formula=f"{capacitance} → {capacitance} (1 + {a} {v})",
+        parameters=[amplitude(a, f"1/{volt}")], formula=f"{capacitance} → {capacitance} (1 + {a} {v})",
         description="The capacitance rises (a > 0) or falls (a < 0) with the voltage.",
     )  # fmt: skip
 
 
-def _self_heating(resistance: str, current: str | None, v: str, label: str | None, time: str) -> Term:
+def _self_heating(resistance: str, heated_by: tuple[str, str], label: str | None, time: str) -> Term:
     name = titled("self-heating", label)
     warmth = f"{name}: warmth"
-    driver = v if current is None else current
+    driver, unit = heated_by
     heat = quantity(driver, "what heats the resistance")
     a, tau = own_name("a", resistance, driver), own_name("tau", resistance, driver)
-    unit = "V" if current is None else "A"
     return Term(
         name,
         rates={warmth: lambda t, s, p, u: (torch.as_tensor(heat(s, p, u)).square() - s[warmth]) / p[tau]},
@@ -165,7 +170,7 @@ def _self_heating(resistance: str, current: str | None, v: str, label: str | Non
     )  # fmt: skip
 
 
-def _saturation(inductance: str, current: str, label: str | None) -> Term:
+def _saturation(inductance: str, current: str, label: str | None, ampere: str) -> Term:
     a = own_name("a", inductance, current)
     amperes = quantity(current, "the current")
 
@@ -175,7 +180,7 @@ def _saturation(inductance: str, current: str, label: str | None) -> Term:
 
     return Term(
         titled("saturation of the inductance", label), shifts={inductance: lost},
-        parameters=[amplitude(a, "1/A^2", low=0.0)],
+        parameters=[amplitude(a, f"1/{ampere}^2", low=0.0)],
         formula=f"{inductance} → {inductance}/(1 + {a} {current}²)",
         description="The core saturates, and the inductance falls at high current.",
     )  # fmt: skip

@@ -29,7 +29,7 @@ def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None
 
     Of a recording in time the last quarter of every run; of several runs with several conditions each run's end all the
     same, since every run may have initial states of its own. Of one condition its upper end, of several the data
-    farthest from their centre.
+    farthest from their centre; replicates stay together.
 
     Args:
         recording: The data.
@@ -100,6 +100,7 @@ def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None
         count = max(1, int(share * int(seen.sum())))
         mask = torch.zeros(recording.n, dtype=torch.bool)
         mask[distance.argsort(descending=True, stable=True)[:count]] = True
+        mask = _together(recording, mask)
     return mask.repeat(len(recording.outputs))
 
 
@@ -122,17 +123,36 @@ def check_left(found: Fitted, mask: Tensor) -> None:
 def within(recording: Recording) -> Tensor:
     """Blocks inside every run, or inside the range of the first condition, instead of its end; a quarter in all."""
     x = recording.x
-    columns = x if isinstance(x, dict) else {"x": x}
-    along = columns["time"] if recording.runs is not None else next(iter(columns.values()))
-    runs = columns["run"] if recording.runs is not None else torch.zeros(recording.n)
     seen = recording.observed_once.reshape(len(recording.outputs), recording.n).any(0)
     mask = torch.zeros(recording.n, dtype=torch.bool)
-    for r in runs.unique():
-        mine = ((runs == r) & seen).nonzero()[:, 0]
-        mine = mine[along[mine].argsort(stable=True)]
-        for block in mine.tensor_split(min(BLOCKS, max(len(mine), 1)))[1:-1:4]:
-            mask[block] = True
+    if recording.runs is not None and isinstance(x, dict):
+        for r in x["run"].unique():
+            mine = ((x["run"] == r) & seen).nonzero()[:, 0]
+            mask[_blocks(mine[x["time"][mine].argsort(stable=True)])] = True
+    else:
+        level = _levels(recording)
+        mask = seen & torch.isin(level, _blocks(level[seen].unique()))
     return mask.repeat(len(recording.outputs))
+
+
+def _blocks(row: Tensor) -> Tensor:
+    """What is in every fourth of the blocks of a row, but for the ends."""
+    return torch.cat([row[:0], *row.tensor_split(min(BLOCKS, max(len(row), 1)))[1:-1:4]])
+
+
+def _levels(recording: Recording) -> Tensor:
+    """Number of the conditions of every row ``(n,)``, in the order of the first of them."""
+    return recording.columns.unique(dim=0, return_inverse=True)[1]  # type: ignore[no-any-return]
+
+
+def _together(recording: Recording, mask: Tensor) -> Tensor:
+    """A choice of rows, bool ``(n,)``, by which data at the same conditions stay together: they go with most of them.
+
+    A fit has seen what is held out where it has seen replicates of it.
+    """
+    level = _levels(recording)
+    whole = (2 * torch.bincount(level[mask], minlength=int(level.max()) + 1) > torch.bincount(level))[level]
+    return whole if bool(whole.any()) else mask
 
 
 @dataclass(frozen=True, eq=False)
