@@ -9,8 +9,9 @@ import torch
 
 import torchcal as tc
 from torchcal.discovery.findings import where
-from torchcal.discovery.fits.candidates import _shape_points, sized
 from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.fits.ranges import sized
+from torchcal.discovery.fits.shapes import shape_points
 from torchcal.discovery.hypotheses import verify
 from torchcal.errors import DomainError, SimulatorError
 
@@ -68,12 +69,12 @@ def test_a_run_of_which_nothing_was_seen_is_no_trouble():
 )
 def test_a_shape_is_tried_within_its_only_bound(parameter, fits):
     for count in (1, 5):
-        points = _shape_points(parameter, count)
+        points = shape_points(parameter, count)
         assert len(points) == count
         assert all(fits(point) for point in points)
     if parameter.initial is not None:
-        assert _shape_points(parameter, 1) == [parameter.initial]
-    assert _shape_points(tc.Parameter("n", low=0.0), 3) == [0.25, 1.0, 4.0] == _shape_points(tc.Parameter("n"), 3)
+        assert shape_points(parameter, 1) == [parameter.initial]
+    assert shape_points(tc.Parameter("n", low=0.0), 3) == [0.25, 1.0, 4.0] == shape_points(tc.Parameter("n"), 3)
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,9 @@ from scipy.integrate import solve_ivp
 
 import torchcal as tc
 from torchcal.discovery.fits import sharpen as sharpening
-from torchcal.discovery.fits.candidates import drivers_scale, prepare
+from torchcal.discovery.fits.candidates import prepare
 from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.fits.ranges import drivers_scale
 from torchcal.discovery.fits.sharpen import accurate, sharpen
 from torchcal.discovery.hypotheses import search as search_module
 from torchcal.discovery.hypotheses.base import calibrate_base

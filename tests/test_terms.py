@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 import torchcal as tc
-from torchcal.discovery.fits.candidates import sized
+from torchcal.discovery.fits.ranges import sized
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators import Trajectories
 from torchcal.terms import extend

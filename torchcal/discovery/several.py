@@ -8,8 +8,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchcal.discovery.fits.candidates import Candidate, drivers_scale, prepare, replaces
+from torchcal.discovery.fits.candidates import Candidate, prepare, replaces
 from torchcal.discovery.fits.fitting import Fitted
+from torchcal.discovery.fits.ranges import drivers_scale
 from torchcal.discovery.hypotheses.beginnings import BENT, blind_rows, is_far, make_up
 from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.hypotheses.screen import screen

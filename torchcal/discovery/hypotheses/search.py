@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from torchcal.discovery.fits.candidates import Candidate, drivers_scale, prepare, widened
+from torchcal.discovery.fits.candidates import Candidate, prepare, widened
 from torchcal.discovery.fits.fitting import Fitted, fit, refit, weighed
 from torchcal.discovery.fits.local import Span
 from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.fits.ranges import drivers_scale
 from torchcal.discovery.fits.refits import Refit, refit_all
 from torchcal.discovery.fits.sharpen import SOLVER_SHARE, accurate, sharpen
 from torchcal.discovery.fits.stop import Stop

@@ -1,0 +1,97 @@
+"""Ranges in which shape parameters are sought that are measured on the scale of a driver."""
+
+import dataclasses
+from collections.abc import Mapping
+
+import torch
+
+from torchcal.data import Recording
+from torchcal.discovery.fits.fitting import Fitted
+from torchcal.discovery.fits.problem import Problem
+from torchcal.errors import DomainError
+from torchcal.simulators import Parameter
+from torchcal.terms import Term
+
+__all__ = ["drivers_scale", "sized", "with_room"]
+
+#: Range of a shape parameter measured on a driver's scale; on that of time it begins at a share of the usual gap
+#: between samples where that is less: lags and delays may be as fast as these show, however long the recording.
+SCALE_RANGE, OF_A_GAP = (0.02, 1.0), 0.1
+#: How many times as far a fit may go that an end of such a range holds back: nobody gave that end.
+WIDER = 4.0
+
+
+def drivers_scale(problem: Problem, found: Fitted) -> dict[str, float]:
+    """Largest magnitude of every driver and output on the calibrated trajectory; of time the longest run's length."""
+    scale = {
+        name: float(values.abs().max())
+        for name, values in problem.drivers(found.values[None], found.warm).items()
+        if bool(torch.isfinite(values).all())
+    }
+    if "t" in scale and problem.recording.runs:
+        scale["t"] = max(float(run.time[-1] - run.time[0]) for run in problem.recording.runs)
+    for number, name in enumerate(problem.recording.outputs):
+        scale.setdefault(name, float(found.y[problem.output_of == number].abs().max()))
+    return scale
+
+
+def sized(term: Term, scale: Mapping[str, float], recording: Recording) -> Term:
+    """The term with bounds for the shape parameters that it measures on a driver's scale.
+
+    Raises:
+        DomainError: If it names a driver or an input that there is not.
+    """
+    inputs = list(recording.runs[0].inputs) if recording.runs else []
+    if term.takes is not None and term.takes not in inputs:
+        raise DomainError(
+            f"Expected the term {term.name!r} to take the effect of one of the inputs {inputs}. Got {term.takes!r}."
+        )
+    if not term.scales:
+        return term
+    if "t" in scale and term.elapsed == "recording":
+        times = [run.time for run in recording.runs or ()]
+        scale = {**scale, "t": float(max(time[-1] for time in times) - min(time[0] for time in times))}
+    steps = [run.time.diff() for run in recording.runs or () if len(run.time) > 1]
+    gaps = [float(torch.cat(steps).median())] if steps else []
+    parameters = []
+    for parameter in term.parameters:
+        driver = term.scales.get(parameter.name)
+        if driver is None or (parameter.low is not None and parameter.high is not None):
+            parameters.append(parameter)
+            continue
+        if driver not in scale:
+            raise DomainError(
+                f"Expected the term {term.name!r} to measure {parameter.name!r} on the scale of one of "
+                f"{list(scale)}. Got {driver!r}."
+            )
+        size = scale[driver] or 1.0
+        low, high = (part * size for part in SCALE_RANGE)
+        if driver == "t":
+            low = min([low, *(OF_A_GAP * gap for gap in gaps)])
+        low, high = _narrowed(low, high, parameter)
+        initial = parameter.initial if parameter.initial is not None and low <= parameter.initial <= high else None
+        parameters.append(dataclasses.replace(parameter, low=low, high=high, initial=initial, neutral=None))
+    return dataclasses.replace(term, parameters=tuple(parameters))
+
+
+def _narrowed(low: float, high: float, parameter: Parameter) -> tuple[float, float]:
+    """A range of a driver's scale within the one bound that a parameter has, or else beside it."""
+    ratio = high / low
+    if parameter.low is not None and parameter.low > low:
+        return parameter.low, high if high > parameter.low else ratio * parameter.low
+    if parameter.high is not None and parameter.high < high:
+        below = parameter.high / ratio if parameter.high > 0 else parameter.high - high
+        return low if low < parameter.high else below, parameter.high
+    return low, high
+
+
+def with_room(sought: Parameter, given: Parameter) -> Parameter:
+    """A parameter with more room than it was sought in, but for an end that was given."""
+    low, high = sought.low or 0.0, sought.high or 0.0
+    more = (WIDER - 1) * (high - low)
+    low, high = low / WIDER if low > 0 else low - more, WIDER * high if high > 0 else high + more
+    low = low if given.low is None else max(low, given.low)
+    high = high if given.high is None else min(high, given.high)
+    return dataclasses.replace(sought, low=low, high=high)
+
+
