@@ -13,8 +13,9 @@ import pytest
 import torch
 from numpy.polynomial import legendre
 
-from torchcal import Recording, calibrate
+from torchcal import Recording, calibrate, diagnose, polychaos
 from torchcal.data import ROUNDING
+from torchcal.discovery.fits import trial
 from torchcal.embeddings import Gaussian
 from torchcal.errors import (
     DomainError,
@@ -35,6 +36,7 @@ from torchcal.simulators import (
     build_surrogate,
 )
 from torchcal.simulators.held_out import NUMBERS
+from torchcal.simulators.scattered import scatter
 
 A, B = Parameter("a", low=1.0, high=3.0), Parameter("b", unit="K", low=-2.0, high=4.0)
 BOX = {"s": (0.0, 2.0), "t": (5.0, 6.0)}
@@ -56,6 +58,73 @@ def smooth_in_torch(x, p):
 
 def two(x, p):
     return {"y": cubic(x, p), "z": p["b"] * x["t"]}
+
+
+# --- scattered points ----------------------------------------------------------------------------------
+
+
+def test_a_polynomial_is_found_exactly_from_scattered_points():
+    grid = build_surrogate(two, conditions=BOX, parameters=[A, B], order=3, progress=False)
+    scattered = build_surrogate(two, conditions=BOX, parameters=[A, B], order=3, points=70, progress=False)
+    largest = float(grid.coefficients.abs().max())
+    assert float((scattered.coefficients - grid.coefficients).abs().max()) < 1e-11 * largest
+    assert (scattered.outputs, scattered.nodes) == (("y", "z"), None)
+    assert bool((scattered.error.relative < 1e-11).all())
+
+
+def test_scattered_points_are_few_and_nearly_as_good_as_a_grid(tmp_path):
+    options = {"conditions": BOX, "parameters": [A, B], "order": 5, "progress": False}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SurrogateWarning)
+        grid, scattered = (build_surrogate(smooth, **options, **one) for one in ({}, {"points": 3 * 126}))
+        in_torch = build_surrogate(Simulator(smooth_in_torch, [A, B]), points=3 * 126, **options)
+    assert float(scattered.error.rms) < 3 * float(grid.error.rms)
+    assert float((in_torch.coefficients - scattered.coefficients).abs().max()) < 1e-12
+    scattered.save(tmp_path / "s.npz")
+    again = PolynomialSurrogate.load(tmp_path / "s.npz")
+    assert torch.equal(again.coefficients, scattered.coefficients)
+    assert again.nodes is None
+
+
+@pytest.mark.parametrize(("dim", "order"), [(1, 10), (2, 8), (5, 3)])
+def test_terms_are_told_apart_by_twice_as_many_scattered_points(dim, order):
+    indices = polychaos.multi_indices(dim, order)
+    worst = 0.0
+    for seed in range(10):
+        points = scatter(indices, 2 * len(indices), seed)
+        assert points.shape == (2 * len(indices), dim)
+        assert float(points.abs().max()) <= 1
+        psi = polychaos.evaluate(polychaos.LEGENDRE, indices, points)
+        psi = psi / polychaos.norms(polychaos.LEGENDRE, indices).sqrt()
+        worst = max(worst, float(torch.linalg.cond(psi / psi.norm(dim=1, keepdim=True))))
+    assert worst < 50
+
+
+@pytest.mark.parametrize("degree", [0, 1, 4, 9])
+def test_scattered_points_have_the_density_of_their_term(degree):
+    n = 20000
+    points = scatter(torch.tensor([[degree]]), n, 3)[:, 0]
+    grid, weights = (torch.from_numpy(v) for v in legendre.leggauss(40))
+    value = polychaos.evaluate(polychaos.LEGENDRE, torch.tensor([[degree]]), grid[:, None])[:, 0]
+    density = 0.5 * (2 * degree + 1) * value.square() * weights
+    for power in (1, 2, 4):
+        mean, square = float((density * grid**power).sum()), float((density * grid ** (2 * power)).sum())
+        sd = math.sqrt((square - mean**2) / n)
+        assert abs(float((points**power).mean()) - mean) < 4.5 * sd
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"points": 69}, "70"),
+        ({"points": 100, "nodes": 5}, "Got both"),
+        ({"points": "many"}, "points"),
+        ({"order": 9, "points": 10**7}, "memory"),
+    ],
+)
+def test_scattered_points_that_cannot_be(options, message):
+    with pytest.raises(DomainError, match=message):
+        build_surrogate(cubic, conditions=BOX, parameters=[A, B], progress=False, **{"order": 3, **options})
 
 
 def fails(x, p):
@@ -628,3 +697,33 @@ def test_a_posterior_that_leaves_the_box_is_told_though_the_maximum_does_not():
         assert float((found.sample_parameters(2000, kind="map").abs() > 1).double().mean()) == 0
         texts = [str(one.message) for one in caught if one.category is ExtrapolationWarning]
         assert [("of the posterior of the parameters lies outside the box" in text) for text in texts] == [True] * told
+
+
+@pytest.mark.parametrize(("noise", "told"), [(0.01, True), (1.0, False), (None, False)])
+def test_a_diagnosis_is_told_that_a_surrogate_is_coarser_than_the_noise(noise, told):
+    a = Parameter("a", low=0.5, high=2.0)
+    with pytest.warns(SurrogateWarning, match="held-out"):
+        surrogate = build_surrogate(
+            lambda x, p: math.tanh(8 * p["a"] * x), conditions=(-1.0, 1.0), parameters=[a], order=4, progress=False
+        )
+    x = torch.linspace(-1, 1, 30, dtype=torch.float64)
+    recording = Recording(x=x, y=torch.tanh(8 * x), noise=noise)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        diagnose(surrogate, recording, holdout=False, num_starts=2, progress=False)
+    texts = [str(w.message) for w in caught if w.category is SurrogateWarning]
+    assert len(texts) == told
+    assert all("large beside the noise" in text for text in texts)
+
+
+def test_a_diagnosis_says_how_long_a_slow_simulation_will_take(monkeypatch):
+    monkeypatch.setattr(trial, "LONG", 0.0)
+    slow = ExternalSimulator(lambda x, p: p["a"] * x, [A])
+    x = torch.linspace(0, 1, 12, dtype=torch.float64)
+    y = 2 * x + 0.1 * torch.sin(40 * x)
+    with pytest.warns(TorchcalWarning, match=r"1,000 to 10,000 times: that is .* to .*build_surrogate"):
+        diagnose(slow, Recording(x=x, y=y, noise=0.1), holdout=False, num_starts=2, progress=False)
+    with warnings.catch_warnings():  # what is written in torch is evaluated in batches
+        warnings.simplefilter("error")
+        diagnose(Simulator(lambda x, p: p["a"] * x, [A]), Recording(x=x, y=y, noise=0.1), holdout=False, progress=False)
+    assert [trial._span(s) for s in (600.0, 9000.0, 4e5)] == ["10 min", "2 h", "5 days"]

@@ -17,7 +17,7 @@ from torchcal.discovery.findings.result import Diagnosis
 from torchcal.discovery.fits.candidates import base_columns
 from torchcal.discovery.fits.fitting import Fitted, starts
 from torchcal.discovery.fits.problem import Problem
-from torchcal.discovery.fits.trial import check_repeats
+from torchcal.discovery.fits.trial import check_repeats, warn_if_coarse, warn_if_long
 from torchcal.discovery.hypotheses import verify
 from torchcal.discovery.hypotheses.own_noise import explains
 from torchcal.discovery.hypotheses.search import Search
@@ -89,6 +89,8 @@ def diagnose(
         ConvergenceError: If the base cannot be calibrated at all.
 
     Warns:
+        TorchcalWarning: If an external simulator is so slow that the diagnosis will take long.
+        SurrogateWarning: If a surrogate's own error is large beside the noise.
         ConvergenceWarning: If few starting values of the base agree, or it explains no more than a constant. After
             Ctrl-C, the diagnosis keeps the refits that have ended: it names nothing, and says what it has not refitted.
     """
@@ -120,6 +122,8 @@ def diagnose(
             raise DomainError(f"Expected the term {term.name!r} on outputs of {recording.outputs}. Got {unknown}.")
         extend(simulator, [term])  # raises for names that do not fit, before any long work
     mask = verify.choose(recording, holdout, len(free))
+    warn_if_coarse(problem)
+    warn_if_long(problem, starts(problem, 1, seed, held)[0])
     for values in starts(problem, 2, seed, held):  # at zero nothing may move
         check_repeats(problem, values)
         problem.check_slopes(values, free)

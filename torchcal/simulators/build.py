@@ -1,4 +1,4 @@
-r"""Building a polynomial surrogate: design, evaluation, projection, held-out error.
+r"""Building a polynomial surrogate: design, evaluation, projection or regression, held-out error.
 
 Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 41-43.
 """
@@ -23,10 +23,14 @@ from torchcal.simulators.external import ExternalSimulator
 from torchcal.simulators.held_out import HeldOutError, mean_and_sd, root_mean_square
 from torchcal.simulators.parameter import Parameter, Scaling
 from torchcal.simulators.points import PointCall, describe_point
+from torchcal.simulators.scattered import check_points, fit_scattered, scatter
 from torchcal.simulators.static import Conditions, Simulator, check_parameters
 from torchcal.simulators.surrogate import Box, PolynomialSurrogate, check_box
 
 __all__ = ["build_surrogate"]
+
+MANY = 4
+"""Conditions and parameters from which on scattered points are far fewer than those of a grid."""
 
 _ELEMENTS = 2**22
 """Numbers evaluated at once: 32 MiB."""
@@ -39,6 +43,7 @@ def build_surrogate(
     parameters: Sequence[Parameter] | None = None,
     order: int = 6,
     nodes: int | Sequence[int] | None = None,
+    points: int | None = None,
     outputs: Sequence[str] | None = None,
     executor: Executor | None = None,
     cache: str | os.PathLike[str] | Evaluations | None = None,
@@ -52,7 +57,9 @@ def build_surrogate(
     .. math:: s_k = \frac{1}{\langle L_k^2 \rangle} \int_{[-1,1]^D} f(\eta)\, L_k(\eta)\, \frac{d\eta}{2^D}
         \approx \frac{1}{\langle L_k^2 \rangle} \sum_q w_q f(\eta_q) L_k(\eta_q), \qquad |k| \le p
 
-    on a full grid of Gauss points: ``nodes**D`` evaluations for D conditions and parameters.
+    on a full grid of Gauss points: ``nodes**D`` evaluations for D conditions and parameters. From four of them on
+    that is a great many; ``points=`` takes so many random ones instead, and the same polynomial by weighted least
+    squares.
 
     Args:
         simulator: A function ``f(x, p)`` of plain floats that returns a number (or a dict of numbers), an
@@ -64,6 +71,8 @@ def build_surrogate(
         nodes: Gauss points per dimension, above `order`; one number, or one for each condition and parameter. The
             default ``order + 1`` is exact for polynomials of the order; more of them changed the error
             of smooth functions by less than a tenth, where a higher order divides it.
+        points: Number of random points instead of the grid, at least twice the number of terms, which is
+            :math:`\binom{D + p}{p}`: 420 for six conditions and parameters at order 4, where the grid has 15,625.
         outputs: Names of the outputs to keep, where there are several; by default all.
         executor: Any ``concurrent.futures.Executor`` for functions of plain floats; None evaluates here. When a
             worker dies, only what it had not handed over is repeated, in a fresh process pool where that broke.
@@ -86,7 +95,8 @@ def build_surrogate(
         SurrogateWarning: If the error is above `threshold`.
         TorchcalWarning: If workers died; nothing is lost then.
 
-    Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 41-43.
+    Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 41-43; with ``points=``
+    A. Cohen & G. Migliorati (2017), SMAI J. Comput. Math. 3, 181-203.
 
     >>> a = Parameter("a", low=0.0, high=2.0)
     >>> s = build_surrogate(lambda x, p: p["a"] * x["t"] ** 2, conditions={"t": (-1, 1)}, parameters=[a],
@@ -99,7 +109,11 @@ def build_surrogate(
     names, bounds = check_box(conditions, parameters)
     dim = len(bounds) + len(parameters)
     order = whole("order", order, 1)
-    counts = _check_nodes(nodes, order, dim)
+    if points is not None and nodes is not None:
+        raise DomainError("Expected nodes= of a grid, or points= instead of one. Got both.")
+    counts = _check_nodes(nodes, order, dim) if points is None else []
+    if points is not None:
+        points = check_points(points, math.comb(dim + order, order))
     holdout, seed = whole("holdout", holdout, 10), as_seed(seed)
     if not (isinstance(threshold, int | float) and threshold > 0):
         raise DomainError(f"Expected threshold > 0. Got {threshold!r}.")
@@ -109,29 +123,40 @@ def build_surrogate(
             "Expected no executor= or cache= beside a torch simulator, which is evaluated in one batch. "
             "They are for functions of plain floats."
         )
-    condition_rule = polychaos.tensor_rule(polychaos.LEGENDRE, len(bounds), counts[: len(bounds)])
-    parameter_rule = polychaos.tensor_rule(polychaos.LEGENDRE, len(parameters), counts[len(bounds) :])
     low, high = bounds.T
     scaling = Scaling.from_parameters(parameters)
-    x_nodes = 0.5 * (low + high) + 0.5 * (high - low) * condition_rule.nodes
-    p_nodes = scaling.physical(parameter_rule.nodes)
+
+    def located(x: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        return 0.5 * (low + high) + 0.5 * (high - low) * x, scaling.physical(p)
+
+    if points is None:
+        condition_rule = polychaos.tensor_rule(polychaos.LEGENDRE, len(bounds), counts[: len(bounds)])
+        parameter_rule = polychaos.tensor_rule(polychaos.LEGENDRE, len(parameters), counts[len(bounds) :])
+        x_design, p_design = located(condition_rule.nodes, parameter_rule.nodes)
+    else:
+        indices = polychaos.multi_indices(dim, order)
+        scattered = scatter(indices, points, seed)
+        x_design, p_design = located(scattered[:, : len(bounds)], scattered[:, len(bounds) :])
     random = 2 * torch.from_numpy(np.random.default_rng(seed).random((holdout, dim))) - 1
-    x_random = 0.5 * (low + high) + 0.5 * (high - low) * random[:, : len(bounds)]
-    p_random = scaling.physical(random[:, len(bounds) :])
+    x_random, p_random = located(random[:, : len(bounds)], random[:, len(bounds) :])
     labels = [*(names or ("x",)), *(parameter.name for parameter in parameters)]
     if external:
         call = _point_call(simulator, names, parameters)
         if isinstance(simulator, ExternalSimulator) and executor is None:
             executor = simulator.executor
         check_executor(executor, call.function)
-        design = torch.cat([x_nodes.repeat_interleave(len(p_nodes), 0), p_nodes.repeat(len(x_nodes), 1)], dim=-1)
+        pairs = (x_design, p_design)
+        if points is None:
+            pairs = (x_design.repeat_interleave(len(p_design), 0), p_design.repeat(len(x_design), 1))
+        design = torch.cat(pairs, dim=-1)
         every = torch.cat([design, torch.cat([x_random, p_random], dim=-1)])
         done = evaluate_points(call, every.numpy(), labels, executor=executor, cache=cache, progress=progress)
         found, values = done.outputs, torch.from_numpy(done.values).T
-        on_grid, held_out = values[:, : len(design)], values[:, len(design) :]
+        fitted, held_out = values[:, : len(design)], values[:, len(design) :]
     else:
         model = _TorchModel(simulator, names, parameters, outputs)  # type: ignore[arg-type]
-        on_grid, held_out = model.grid(x_nodes, p_nodes), model.pairs(x_random, p_random)
+        at_design = model.grid if points is None else model.pairs
+        fitted, held_out = at_design(x_design, p_design), model.pairs(x_random, p_random)
         found = model.outputs
     if found is None and outputs is not None and outputs != ("y",):  # which is what it is called elsewhere
         raise SimulatorError(
@@ -143,19 +168,22 @@ def build_surrogate(
         if missing:
             raise SimulatorError(f"Expected outputs {list(kept)}. Got {list(found)}: {missing} missing.")
         rows = [found.index(name) for name in kept]
-        on_grid, held_out, found = on_grid[rows], held_out[rows], kept
-    coefficients = _project(on_grid, condition_rule, parameter_rule, order)
+        fitted, held_out, found = fitted[rows], held_out[rows], kept
+    if points is None:
+        coefficients = _project(fitted, condition_rule, parameter_rule, order)
+    else:
+        coefficients = fit_scattered(fitted, indices, scattered)
     settings: dict[str, Any] = {
         "conditions": conditions,
         "parameters": parameters,
         "order": order,
         "outputs": found,
-        "nodes": counts[0] if len(set(counts)) == 1 else counts,
+        "nodes": None if points is not None else counts[0] if len(set(counts)) == 1 else counts,
     }
     surrogate = PolynomialSurrogate(coefficients, **settings)
     psi = polychaos.evaluate(polychaos.LEGENDRE, surrogate.indices, random)
     error = (coefficients @ psi.T - held_out).abs()
-    points = torch.cat([x_random, p_random], dim=-1)
+    where = torch.cat([x_random, p_random], dim=-1)
     mean, sd = mean_and_sd(held_out)
     measured = HeldOutError(
         num=holdout,
@@ -164,12 +192,13 @@ def build_surrogate(
         rms=root_mean_square(error),
         mean=mean,
         sd=sd,
-        worst=tuple(dict(zip(labels, points[int(i)].tolist(), strict=True)) for i in error.argmax(1)),
+        worst=tuple(dict(zip(labels, where[int(i)].tolist(), strict=True)) for i in error.argmax(1)),
     )
     if bool((measured.relative > threshold).any()):
+        grid = "" if points is not None or dim < MANY else " (points= takes fewer evaluations than a grid)"
         warn(
             f"The surrogate of order {order} has a large {measured}\n(threshold {threshold:g} of the sd). Raise "
-            "order=, narrow the box, or take the logarithm of an output that spans decades.",
+            f"order={grid}, narrow the box, or take the logarithm of an output that spans decades.",
             SurrogateWarning,
         )
     return PolynomialSurrogate(coefficients, error=measured, **settings)

@@ -59,7 +59,7 @@ class PolynomialSurrogate(Simulator):
         order: Total degree p.
         outputs: Names of the outputs; None for one without a name.
         error: Measured error on held-out points.
-        nodes: Gauss points per dimension that it was built with.
+        nodes: Gauss points per dimension that it was built with; None where it was not on a grid.
 
     Attributes:
         degree: The order: it is a polynomial of that degree in the parameters, so propagation is exact.

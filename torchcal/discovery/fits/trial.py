@@ -1,17 +1,24 @@
-"""What is asked of a simulator or a term before long work: that it repeats itself."""
+"""What is asked of a simulator or a term before long work: that it repeats itself, and is fast and exact enough."""
 
+import time
 from collections.abc import Mapping
 
 import torch
 from torch import Tensor
 
 from torchcal.discovery.fits.problem import Problem
-from torchcal.errors import SimulatorError
+from torchcal.errors import SimulatorError, SurrogateWarning, TorchcalWarning, warn
+from torchcal.simulators import ExternalSimulator, PolynomialSurrogate
 
-__all__ = ["check_repeats", "place_of"]
+__all__ = ["check_repeats", "place_of", "warn_if_coarse", "warn_if_long"]
 
 #: Difference of two evaluations, relative to the largest output, up to which a simulator repeats itself.
 JITTER = 1e-4
+#: Evaluations of an external simulator, at all conditions, that a diagnosis takes, from and to; and how many seconds
+#: the fewest of them may take without a word.
+EVALUATIONS, LONG = (1000, 10000), 120.0
+#: Error of a surrogate, in the noise sd, from which on it may be what is found.
+COARSE = 0.5
 
 
 def check_repeats(problem: Problem, values: Tensor, what: str = "the simulator") -> None:
@@ -29,6 +36,58 @@ def check_repeats(problem: Problem, values: Tensor, what: str = "the simulator")
             f"Expected the same outputs whenever {what} is called with the same parameters. Got {float(once[k]):.6g} "
             f"and then {float(again[k]):.6g}: {place_of(problem, k)}. Leave random numbers out of it, or draw them "
             "once, before."
+        )
+
+
+def warn_if_long(problem: Problem, values: Tensor) -> None:
+    """Say how long an external simulator will take, by one evaluation at parameter values ``(P,)``.
+
+    Warns:
+        TorchcalWarning: If that is long.
+    """
+    if not isinstance(problem.simulator, ExternalSimulator):
+        return
+    begun = time.perf_counter()
+    problem.evaluate(values[None], [])
+    seconds = time.perf_counter() - begun
+    few, many = (count * seconds for count in EVALUATIONS)
+    if few > LONG:
+        warn(
+            f"The simulator takes {seconds:.2g} s at all {problem.recording.n} conditions, and a diagnosis evaluates "
+            f"it {EVALUATIONS[0]:,} to {EVALUATIONS[1]:,} times: that is {_span(few)} to {_span(many)}. Build a "
+            "surrogate of it over the conditions and all parameters, the dormant ones too, and diagnose that "
+            "(torchcal.build_surrogate, with points= where they are many), or spread the runs (executor= of the "
+            "simulator).",
+            TorchcalWarning,
+        )
+
+
+def _span(seconds: float) -> str:
+    """A time in words."""
+    if seconds < 7200:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.0f} h" if seconds < 172800 else f"{seconds / 86400:.0f} days"
+
+
+def warn_if_coarse(problem: Problem) -> None:
+    """Hold a surrogate's error against the noise, where both are known.
+
+    Warns:
+        SurrogateWarning: If what is found may be that error.
+    """
+    simulator, noise = problem.simulator, problem.recording.noise
+    if not isinstance(simulator, PolynomialSurrogate) or simulator.error is None or not isinstance(noise, Tensor):
+        return
+    rms = dict(zip(simulator.error.outputs, simulator.error.rms.tolist(), strict=True))
+    sizes = {name: float(values[values.isfinite()].median())
+             for name, values in problem.recording.split(noise).items()}  # fmt: skip
+    large = [name for name, size in sizes.items() if rms.get(name, 0.0) > COARSE * size]
+    if large:
+        listed = ", ".join(f"{name!r}: {rms[name]:.2g} of a noise sd of {sizes[name]:.2g}" for name in large)
+        warn(
+            f"The surrogate's own error is large beside the noise of the data ({listed}): what is found may be that "
+            "error. Raise its order=, narrow its box, or add the error to the noise.",
+            SurrogateWarning,
         )
 
 
