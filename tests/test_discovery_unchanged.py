@@ -136,6 +136,20 @@ def test_a_noisier_run_is_seen():
     assert torch.equal(growth(problem, found.residual, found.jacobian, found.y, one), one)
 
 
+def test_a_noisier_run_is_seen_beside_one_that_is_sampled_at_another_rate():
+    model, recording = cooling((0.1, 0.1, 0.1, 0.5), (100, 100, 100, 30), (0.02, 0.02, 0.1, 0.02))
+    problem = Problem.of(model, recording)
+    one = torch.ones(330, dtype=F64)
+    begin = torch.tensor([[0.3, 1.0]], dtype=F64)
+    found = fit(problem, problem.whitening(0.05 * one, torch.zeros(1, dtype=F64)), begin, [0, 1])
+    unit = growth(problem, found.residual, found.jacobian, found.y, one)
+    by_run = [float(unit[recording.x["run"] == r].median()) for r in range(4)]
+    assert abs(math.log(by_run[2] / by_run[0] / 5.0)) < 5 * 0.14
+    # Nobody is sampled as the last one is, so that its noise is as that of all others together.
+    told = (2 * by_run[0] + by_run[2]) / 3
+    assert by_run[3] == pytest.approx(told, rel=0.1)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_a_noisier_run_is_no_missing_physics(seed):
     model, recording = cooling((0.1,) * 4, (100,) * 4, (0.01, 0.01, 0.01, 0.2), seed)

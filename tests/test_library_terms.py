@@ -83,6 +83,7 @@ def setting(case, term, *, batch=(), runs=2, seed=0, neutral=False):
 def contributions(term, t, s, p, u):
     """Everything that a term adds or replaces, hidden states' own rates included, each of the states' shape."""
     y = 1.1 * next(iter(s.values())) + 0.3
+    p = dict.fromkeys(term.constants, 1.5) | p
     found = {f"d{name}": function(t, s, p, u) for name, function in term.rates.items()}
     found |= {f"-> {name}": function(t, s, p, u) for name, function in term.shifts.items()}
     found |= {f"y {name}": function(t, s, p, u, y) - y for name, function in term.outputs.items()}
@@ -116,8 +117,8 @@ def as_function(case, term, t, s, p, u):
     def function(*values):
         given = dict(zip(names, values, strict=True))
         at = ({name: given[name] for name in s}, {name: given[name] for name in p})
-        # A state that only remembers its first value has no derivatives to look at.
         found = contributions(term, t, *at, u)
+        # A state that only remembers its first value has no derivatives to look at.
         return tuple(value for name, value in found.items() if not name.endswith("(0)"))
 
     return function, [*s.values(), *p.values()]
@@ -443,16 +444,19 @@ def test_torricelli_and_weir_by_hand():
 @pytest.mark.parametrize("log_rate", [False, True])
 def test_corrections_of_the_rate_constant(name, p, factor, log_rate):
     term = term_of(kinetics("A", "B", temperature="T", log_rate=log_rate), name)
-    s = {"A": tensor(3.0), "B": tensor(4.0), **{state: tensor(12.0) for state in term.states}}
+    s = {"A": tensor(3.0), "B": tensor(4.0)}
     given = {"k": tensor(math.log(5.0) if log_rate else 5.0), **{key: tensor(value) for key, value in p.items()}}
+    given |= dict.fromkeys(term.constants, 12.0)
     moved = given["k"] + term.shifts["k"](tensor(5.0), s, given, {"T": tensor(600.0)})
     torch.testing.assert_close(moved.exp() if log_rate else moved, tensor(5.0 * factor), rtol=1e-6, atol=0)
 
 
-def test_order_about_a_given_reference_needs_no_hidden_state():
+def test_order_about_a_given_reference():
     term = term_of(kinetics(reference=6.0), "reaction order")
-    assert not term.states
-    found = term.shifts["k"](0.0, {"A": tensor(3.0)}, {"k": tensor(2.0), "m": tensor(1.0)}, {})
+    assert term.constants == {"A_ref": 6.0}
+    assert "(A/6)^m" in term.formula
+    p = term.own({"k": tensor(2.0), "reaction order.m": tensor(1.0)})
+    found = term.shifts["k"](0.0, {"A": tensor(3.0)}, p, {})
     torch.testing.assert_close(found, tensor(-1.0), **EXACT)
 
 
@@ -581,8 +585,9 @@ def test_oblateness_is_the_gradient_of_its_potential():
 
 def test_pericentre_under_another_exponent_of_gravity():
     # Nearly circular orbits in a force r^-(2+e) turn by 2π (1/√(1-e) - 1) a revolution: π e to first order.
-    term = term_of(orbital(*PLANE, mu=1.0), "exponent of gravity")
-    assert precession(term, {"e": 1e-6}, mu=1.0, a=2.0, e=1e-3) == pytest.approx(math.pi * 1e-6, rel=1e-4)
+    term = term_of(orbital(*PLANE, mu=1.0, reference=2.0), "exponent of gravity")
+    turn = precession(term, {"e": 1e-6, **term.constants}, mu=1.0, a=2.0, e=1e-3)
+    assert turn == pytest.approx(math.pi * 1e-6, rel=1e-4)
 
 
 def test_a_distant_third_body_is_a_tide():
@@ -624,6 +629,8 @@ def test_a_distant_third_body_is_a_tide():
         (lambda: thermal(heater=""), "heater"),
         (lambda: hydraulics(level=""), "level"),
         (lambda: hydraulics(inflow=1.0), "inflow"),
+        (lambda: hydraulics(outlet="k", reference=-1.0), "reference"),
+        (lambda: hydraulics(time=""), "time"),
         (lambda: hydraulics(inflow="q", downstream=""), "downstream"),
         (lambda: kinetics(reactant=""), "reactant"),
         (lambda: kinetics("A", "A"), "different"),

@@ -129,10 +129,29 @@ def _convert(value: Any, unit: str, *, difference: bool) -> tuple[Any, float]:
     return type(value)(value.magnitude, source).to(target).magnitude, float(zero)
 
 
+#: Units of time, in seconds.
+TIMES = {
+    name: size
+    for size, names in {
+        1e-6: "us µs microsecond microseconds",
+        1e-3: "ms millisecond milliseconds",
+        1.0: "s sec second seconds",
+        60.0: "min minute minutes",
+        3600.0: "h hr hrs hour hours",
+        86400.0: "d day days",
+        31557600.0: "a yr yrs year years",
+    }.items()
+    for name in names.split()
+}
+
+
 def same_unit(one: str, other: str) -> bool:
-    """Whether two texts may be one unit: pint tells, where it is installed and knows both."""
-    if one.replace(" ", "") == other.replace(" ", ""):
+    """Whether two texts may be one unit: pint tells, where it is installed and knows both; of times a table."""
+    one, other = (text.replace(" ", "") for text in (one, other))
+    if one == other:
         return True
+    if one in TIMES and other in TIMES:
+        return TIMES[one] == TIMES[other]
     try:
         import pint
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchcal.checks import as_seed, outside_inference_mode, whole
-from torchcal.data import Recording
+from torchcal.data import Recording, same_unit
 from torchcal.discovery.conclude import Asked, conclude
 from torchcal.discovery.findings.result import Diagnosis
 from torchcal.discovery.fits.candidates import base_columns
@@ -28,7 +28,7 @@ from torchcal.discovery.verdicts.decision import Decision
 from torchcal.discovery.verdicts.given import resolved, told_apart
 from torchcal.discovery.verdicts.verdict import decide
 from torchcal.display import NONE
-from torchcal.errors import DomainError, EmbeddingError, InterruptionWarning, RecordingError, warn
+from torchcal.errors import DomainError, EmbeddingError, InterruptionWarning, RecordingError, UnitWarning, warn
 from torchcal.simulators import ODESimulator, Simulator, is_value_of
 from torchcal.simulators.executor import check_executor
 from torchcal.terms import Term, extend
@@ -89,6 +89,7 @@ def diagnose(
         ConvergenceError: If the base cannot be calibrated at all.
 
     Warns:
+        UnitWarning: If terms of a library are in another unit of time than the recording.
         TorchcalWarning: If an external simulator is so slow that the diagnosis will take long.
         SurrogateWarning: If a surrogate's own error is large beside the noise.
         ConvergenceWarning: If few starting values of the base agree, or it explains no more than a constant. After
@@ -121,6 +122,7 @@ def diagnose(
         if unknown and not isinstance(simulator, ODESimulator):  # which knows its outputs' names itself
             raise DomainError(f"Expected the term {term.name!r} on outputs of {recording.outputs}. Got {unknown}.")
         extend(simulator, [term])  # raises for names that do not fit, before any long work
+    _compare_times(recording, terms)
     mask = verify.choose(recording, holdout, len(free))
     warn_if_coarse(problem)
     warn_if_long(problem, starts(problem, 1, seed, held)[0])
@@ -223,6 +225,22 @@ def _check(simulator: Any, recording: Any, candidates: Any, confidence: float) -
             f"Got {confidence!r}."
         )
     return list(by_name.values())
+
+
+def _compare_times(recording: Recording, terms: Sequence[Term]) -> None:
+    """Warn where the units of terms are by another unit of time than the recording's: its numbers are what counts."""
+    mine = recording.units.get("time")
+    if mine is None or recording.runs is None:
+        return
+    others = [term for term in terms if term.time is not None and not same_unit(term.time, mine)]
+    if others:
+        named = ", ".join(repr(term.name) for term in others[:3]) + (", ..." if len(others) > 3 else "")
+        warn(
+            f"The recording's time is in {mine}, and the units of the terms {named} are by {others[0].time}: their "
+            f"estimates and limits will be numbers by {mine} under labels by {others[0].time}. Build them with "
+            f"time={mine!r}.",
+            UnitWarning,
+        )
 
 
 def _contains(simulator: Simulator, term: Term) -> bool:

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 
 from torchcal.errors import DomainError
-from torchcal.terms.pieces import amplitude, check_name, own_name, quantity, shape, titled
+from torchcal.terms.pieces import amplitude, check_name, own_name, quantity, shape, timed, titled
 from torchcal.terms.term import Term
 
 __all__ = ["electrical"]
@@ -103,7 +103,7 @@ def electrical(
         if current is None:
             raise DomainError("Expected current= beside inductance=. Got none, and saturation depends on it.")
         terms.append(_saturation(check_name(inductance, "inductance"), current, label, ampere))
-    return terms
+    return timed(terms, time)
 
 
 def _absorption(v: str, label: str | None, volt: str, time: str) -> Term:

@@ -10,19 +10,21 @@ from torchcal.terms.pieces import (
     adder,
     amplitude,
     check_name,
+    check_positive,
     excess,
     lagging,
     own_name,
     quantity,
     shape,
     square_root,
+    timed,
     titled,
 )
 from torchcal.terms.term import Term
 
 __all__ = ["hydraulics"]
 
-#: Level, relative to its first value, below which a changed discharge exponent is no longer followed.
+#: Level, relative to its reference, below which a changed discharge exponent is no longer followed.
 SHALLOW = 1e-6
 
 
@@ -32,6 +34,7 @@ def hydraulics(
     inflow: str | None = None,
     outlet: str | None = None,
     downstream: str | None = None,
+    reference: float | None = None,
     label: str | None = None,
     length: str = "m",
     time: str = "s",
@@ -47,6 +50,8 @@ def hydraulics(
         inflow: Input of the flow into the tank, or of the pump: adds bypass, pump saturation and pump lag.
         outlet: Parameter of the model that multiplies the discharge: adds its exponent and its clogging.
         downstream: State of the level of a tank of equal area below: what bypasses this tank arrives there.
+        reference: Level at which a changed discharge exponent leaves the discharge as it is, > 0; by default the
+            highest in the base's fit. It is the same in all runs, as the coefficient is.
         label: Added to the names of the terms, where several tanks need them.
         length: Unit of the level, for reports.
         time: Unit of time, for reports.
@@ -55,7 +60,7 @@ def hydraulics(
         The terms, with SI units unless ``length`` and ``time`` say otherwise.
 
     Raises:
-        DomainError: If a name is empty.
+        DomainError: If a name is empty, or the reference is not positive.
 
     Source: F. M. White, Fluid Mechanics, ch. 3 (Torricelli), 10 (weirs).
 
@@ -63,6 +68,8 @@ def hydraulics(
     ['leak', 'seepage', 'overflow', 'evaporation', 'second tank']
     """
     h = check_name(level, "level")
+    if reference is not None:
+        reference = check_positive(reference, "reference")
     units = Units(length, time)
     terms: list[Term] = []
     add = adder(terms, h, label)
@@ -80,8 +87,8 @@ def hydraulics(
     if inflow is not None:
         terms += _inflow(check_name(inflow, "inflow"), h, downstream, label, units)
     if outlet is not None:
-        terms += _outlet(check_name(outlet, "outlet"), h, label, units)
-    return terms
+        terms += _outlet(check_name(outlet, "outlet"), h, reference, label, units)
+    return timed(terms, time)
 
 
 def _second(h: str, label: str | None, units: Units) -> Term:
@@ -118,22 +125,19 @@ def _inflow(inflow: str, h: str, downstream: str | None, label: str | None, unit
     ]  # fmt: skip
 
 
-def _outlet(outlet: str, h: str, label: str | None, units: Units) -> list[Term]:
+def _outlet(outlet: str, h: str, reference: float | None, label: str | None, units: Units) -> list[Term]:
     coefficient = quantity(outlet, "the coefficient of the outlet")
     m, r = own_name("m", outlet), own_name("r", outlet)
-    name = titled("discharge exponent", label)
-    first = f"{name}: {h}(0)"
+    ref = own_name(f"{h}_ref", outlet)
 
     def bend(t: Any, s: Any, p: Any, u: Any) -> Any:
-        ratio = torch.relu(s[h]) / s[first].abs().clamp_min(1e-12)
+        ratio = torch.relu(s[h]) / p[ref]
         return coefficient(s, p, u) * torch.expm1(p[m] * ratio.clamp_min(SHALLOW).log())
 
     return [
-        Term(name, shifts={outlet: bend},
-             # A hidden state that never moves holds the first level, so that the exponent turns about it.
-             rates={first: lambda t, s, p, u: torch.zeros_like(s[first])}, states={first: units.length},
-             initial={first: h}, parameters=[amplitude(m, "1", low=-0.5, high=1.0)],
-             formula=f"{outlet} → {outlet} ({h}/{h}(0))^{m}",
+        Term(titled("discharge exponent", label), shifts={outlet: bend},
+             parameters=[amplitude(m, "1", low=-0.5, high=1.0)], constants={ref: h if reference is None else reference},
+             formula=f"{outlet} → {outlet} ({h}/{ref if reference is None else f'{reference:g}'})^{m}",
              description="The discharge follows another power of the head than the model's: a long pipe or a "
              "shaped outlet rather than a hole."),
         Term(titled("clogging", label),

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchcal.errors import DomainError
 from torchcal.simulators import Parameter
-from torchcal.terms.pieces import amplitude, check_name, check_positive, own_name, quantity, shape, titled
+from torchcal.terms.pieces import amplitude, check_name, check_positive, own_name, quantity, shape, timed, titled
 from torchcal.terms.term import Term
 
 __all__ = ["kinetics"]
@@ -46,8 +46,8 @@ def kinetics(
         rate: Parameter of the model that is the rate constant, or None: then there are no corrections of it.
         log_rate: Whether that parameter is the logarithm of the rate constant.
         temperature: Input, state or parameter that is the absolute temperature in K.
-        reference: Concentration at which a changed order leaves the rate as it is, > 0; by default that at the
-            beginning.
+        reference: Concentration at which a changed order leaves the rate as it is, > 0; by default the largest in
+            the base's fit. It is the same in all runs, as the rate constant is.
         reference_temperature: The same for the temperature, K.
         label: Added to the names of the terms, where several reactions need them.
         amount: Unit of the concentrations, for reports.
@@ -103,7 +103,7 @@ def kinetics(
         terms += law.corrections(a, b, reference, amount, time)
         if temperature is not None:
             terms += law.of_temperature(temperature, reference_temperature)
-    return terms
+    return timed(terms, time)
 
 
 def _onward(
@@ -162,7 +162,7 @@ class _Law:
 
     def term(
         self, name: str, log_factor: Callable[..., Tensor], parameter: Parameter, factor: str, description: str,
-        **hidden: Any,
+        **more: Any,
     ) -> Term:  # fmt: skip
         def shift(t: Any, s: Any, p: Any, u: Any) -> Tensor:
             exponent = log_factor(t, s, p, u)
@@ -171,26 +171,21 @@ class _Law:
         rate = self.rate
         return Term(
             titled(name, self.label), shifts={rate: shift}, parameters=[parameter], description=description,
-            formula=f"{rate} → {rate} + ln({factor})" if self.log_rate else f"{rate} → {rate} {factor}", **hidden,
+            formula=f"{rate} → {rate} + ln({factor})" if self.log_rate else f"{rate} → {rate} {factor}", **more,
         )  # fmt: skip
 
     def corrections(self, a: str, b: str | None, reference: float | None, amount: str, time: str) -> list[Term]:
         m, big, r = (own_name(name, self.rate) for name in ("m", "K", "r"))
-        name = titled("reaction order", self.label)
-        first = f"{name}: {a}(0)"
-        hidden: dict[str, Any] = {}
-        if reference is None:
-            hidden = {"rates": {first: lambda t, s, p, u: torch.zeros_like(s[first])},
-                      "states": {first: amount}, "initial": {first: a}}  # fmt: skip
+        ref = own_name(f"{a}_ref", self.rate)
 
         def order(t: Any, s: Any, p: Any, u: Any) -> Tensor:
-            unit = reference if reference is not None else s[first].abs().clamp_min(1e-12)
-            return p[m] * (s[a] / unit).clamp_min(DEPLETED).log()
+            return p[m] * (s[a] / p[ref]).clamp_min(DEPLETED).log()
 
         found = [
             self.term("reaction order", order, amplitude(m, "1", low=-2.0, high=2.0),
-                      f"({a}/{f'{a}(0)' if reference is None else f'{reference:g}'})^{m}",
-                      "The rate goes with another power of the concentration than the model's.", **hidden),
+                      f"({a}/{ref if reference is None else f'{reference:g}'})^{m}",
+                      "The rate goes with another power of the concentration than the model's.",
+                      constants={ref: a if reference is None else reference}),
             self.term("saturation", lambda t, s, p, u: -torch.log1p(p[big] * torch.relu(s[a])),
                       amplitude(big, f"1/({amount})", low=0.0), f"1/(1 + {big} {a})",
                       "Catalyst or enzyme is fully occupied at high concentration (Michaelis-Menten, Langmuir)."),

@@ -20,6 +20,7 @@ from torchcal.terms.pieces import (
     own_name,
     quantity,
     shape,
+    timed,
     titled,
 )
 from torchcal.terms.term import Term
@@ -126,7 +127,7 @@ def mechanics(
     terms.append(_viscoelastic(v, label, units))
     if force is not None:
         terms += _actuator(check_name(force, "force"), v, label, units)
-    return terms
+    return timed(terms, time)
 
 
 def _large_angle(x: str, v: str, stiffness: Quantity | None, label: str | None, unit: str) -> Term:
@@ -220,4 +221,4 @@ def _in_space(x: tuple[str, ...], v: tuple[str, ...], units: Units, label: str |
                  parameters=[amplitude("b", units(-1, 2))], formula=f"d{axis}/dt ∋ b",
                  description=f"Constant force along {axis}.")
         )  # fmt: skip
-    return terms
+    return timed(terms, units.time)

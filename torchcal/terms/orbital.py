@@ -21,6 +21,7 @@ from torchcal.terms.pieces import (
     own_name,
     quantity,
     shape,
+    timed,
     titled,
 )
 from torchcal.terms.term import Term
@@ -65,8 +66,8 @@ def orbital(
         light: Speed of light in the units of the velocities; m/s by default.
         body: Where the third body is, relative to the centre: names of inputs, or a function of t that returns the
             coordinates. Without it the tide of a distant body in a fixed direction of the x-y plane is taken.
-        reference: Distance at which a changed exponent of gravity leaves the force as it is; by default that at the
-            beginning.
+        reference: Distance at which a changed exponent of gravity leaves the force as it is; by default the largest
+            in the base's fit. It is the same in all runs, as the gravitational parameter is.
         label: Added to the names of the terms, where several bodies need them.
         length: Unit of the positions, for reports.
         time: Unit of time, for reports.
@@ -126,17 +127,11 @@ def orbital(
         r, distance = place(s)
         return tuple(p["c"] * a / distance**3 for a in r)
 
-    name = titled("exponent of gravity", label)
-    first = f"{name}: r(0)"
-    hidden: dict[str, Any] = {}
-    if reference is None:
-        hidden = {"rates": {first: lambda t, s, p, u: torch.zeros_like(s[first])}, "states": {first: length},
-                  "initial": {first: lambda s, p: place(s)[1]}}  # fmt: skip
+    ref = own_name("r_ref", mu)
 
     def exponent(t: Any, s: Any, p: Any, u: Any) -> Vector:
         r, distance = place(s)
-        unit = s[first] if reference is None else reference
-        extra = -gravity(s, p, u) / distance**3 * torch.expm1(-p[e] * (distance / unit).log())
+        extra = -gravity(s, p, u) / distance**3 * torch.expm1(-p[e] * (distance / p[ref]).log())
         return tuple(extra * a for a in r)
 
     terms = [
@@ -154,8 +149,9 @@ def orbital(
         add("radiation pressure", pressure, [amplitude("c", f"{length}^3/{time}^2", low=0.0)], "c r/r³",
             "Light of the central body pushes outward with the inverse square of the distance."),
         add("exponent of gravity", exponent, [amplitude(e, "1", low=-0.5, high=0.5)],
-            f"-mu r/r³ ((r/r0)^-{e} - 1), r0 = {'r(0)' if reference is None else f'{reference:g}'}",
-            "The central force falls with another power of the distance than the square.", **hidden),
+            f"-mu r/r³ ((r/{ref if reference is None else f'{reference:g}'})^-{e} - 1)",
+            "The central force falls with another power of the distance than the square.",
+            constants={ref: x if reference is None else reference}),
     ]  # fmt: skip
     for axis in v:
         terms.append(
@@ -163,7 +159,7 @@ def orbital(
                  parameters=[amplitude("b", units(-1, 2))], formula=f"d{axis}/dt ∋ b",
                  description=f"Constant push along {axis}: a thruster, or the light of a distant source.")
         )  # fmt: skip
-    return terms
+    return timed(terms, time)
 
 
 def _dot(a: Vector, b: Vector) -> Tensor:

@@ -1,5 +1,6 @@
 """What the library's terms are made of: parameters, names, and functions that are smooth enough to differentiate."""
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -28,6 +29,7 @@ __all__ = [
     "shape",
     "signed_power",
     "square_root",
+    "timed",
     "titled",
 ]
 
@@ -155,6 +157,11 @@ class Units:
 def titled(name: str, label: str | None) -> str:
     """The term's name, told apart from that of another body, tank or reaction."""
     return name if label is None else f"{name} ({check_name(label, 'label')})"
+
+
+def timed(terms: Sequence[Term], time: str) -> list[Term]:
+    """The terms, which remember the unit of time that their parameters are in."""
+    return [dataclasses.replace(term, time=check_name(time, "time")) for term in terms]
 
 
 def own_name(name: str, *taken: Any) -> str:

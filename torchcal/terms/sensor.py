@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchcal.errors import DomainError
 from torchcal.simulators import Parameter
-from torchcal.terms.pieces import amplitude, check_name, check_names, excess, shape
+from torchcal.terms.pieces import amplitude, check_name, check_names, excess, shape, timed
 from torchcal.terms.term import Term, outer
 
 __all__ = ["sensor"]
@@ -86,7 +86,7 @@ def sensor(
             terms.append(_drift(output, f"{unit}/{check_name(time, 'time')}", None))
             if dynamic:
                 terms += _dynamic(output, unit, time, _signal(output) if signal is None else signal)
-    return terms
+    return terms if static else timed(terms, time)
 
 
 def _instant(output: str, unit: str, static: bool) -> list[Term]:

@@ -30,7 +30,7 @@ BREAKS = ("Cc", "Zl", "Zp")
 
 
 class _Own(Values):
-    """``p`` of a term's functions: its own parameters before the simulator's of the same names."""
+    """``p`` of a term's functions: its own parameters and constants before the simulator's of the same names."""
 
     def __init__(self, outer: Mapping[str, Any], own: Mapping[str, Any]) -> None:
         began = outer if isinstance(outer, Values) else Values({}, None, None)
@@ -81,6 +81,11 @@ class Term:
             first sample of the ``"recording"``, or of each ``"run"``. By default t is the recording's own.
         takes: The input whose effect it takes away at first, as a slow drive does: an estimate that takes half as
             much again as the equation has of it, or more, is no name.
+        constants: Numbers that its functions find in ``p``, the same in all runs: say the concentration at which a
+            changed order leaves a rate as it is. In place of a number the name of a state, input, condition or output,
+            or several: the largest magnitude (of several as of a vector) in the base's fit, to three digits, which
+            `diagnose` fills in; elsewhere it is 1.
+        time: Unit of time that the units of its parameters are in, to be held against the recording's.
 
     Raises:
         DomainError: If it does nothing, or its parts do not fit together.
@@ -103,6 +108,8 @@ class Term:
     elapsed: str | None = None
     takes: str | None = None
     expected: dict[str, tuple[float, float]] = field(default_factory=dict)
+    constants: dict[str, float | str | tuple[str, ...]] = field(default_factory=dict)
+    time: str | None = None
     seen: set[int] = field(init=False, default_factory=set)
 
     def __init__(
@@ -124,6 +131,8 @@ class Term:
         elapsed: str | None = None,
         takes: str | None = None,
         expected: Mapping[str, tuple[float, float]] | None = None,
+        constants: Mapping[str, float | str | Sequence[str]] | None = None,
+        time: str | None = None,
     ) -> None:
         if not isinstance(name, str) or not name:
             raise DomainError(f"Expected a term's name (a non-empty string). Got {name!r}.")
@@ -194,6 +203,13 @@ class Term:
                     f"Expected expected={{{own!r}: (value, sd)}} of the term {name!r}, finite, with sd > 0. Got "
                     f"{known!r}."
                 )
+        for own, given in (constants or {}).items():
+            several = isinstance(given, Sequence) and given and all(isinstance(one, str) and one for one in given)
+            if own in names or not (_is_finite(given) or several):
+                raise DomainError(
+                    f"Expected constants= of the term {name!r} as finite numbers or names of what they are measured "
+                    f"on, under names that its parameters {names} do not have. Got {own!r}: {given!r}."
+                )
         put = object.__setattr__
         put(self, "name", name)
         put(self, "rates", every)
@@ -208,6 +224,11 @@ class Term:
         put(self, "scales", dict(scales or {}))
         put(self, "elapsed", elapsed)
         put(self, "takes", takes)
+        put(self, "time", time)
+        put(self, "constants", {
+            key: value if isinstance(value, str) else tuple(value) if isinstance(value, Sequence) else float(value)
+            for key, value in (constants or {}).items()
+        })  # fmt: skip
         put(self, "seen", set())
         put(self, "expected", {key: (float(value), float(sd)) for key, (value, sd) in (expected or {}).items()})
 
@@ -225,7 +246,8 @@ class Term:
 
     def own(self, p: Mapping[str, Any]) -> dict[str, Any]:
         """``p`` as the term's functions see it."""
-        return _Own(p, {parameter.name: p[self.full(parameter.name)] for parameter in self.parameters})
+        numbers = {name: value if isinstance(value, float) else 1.0 for name, value in self.constants.items()}
+        return _Own(p, numbers | {parameter.name: p[self.full(parameter.name)] for parameter in self.parameters})
 
     def began(self, p: Mapping[str, Any]) -> Any:
         """When t began from which its functions count, on the recording's clock: 0 unless ``elapsed`` says otherwise.

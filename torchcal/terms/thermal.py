@@ -17,6 +17,7 @@ from torchcal.terms.pieces import (
     quantity,
     shape,
     signed_power,
+    timed,
     titled,
 )
 from torchcal.terms.term import Term
@@ -140,7 +141,7 @@ def thermal(
     terms.append(_second(T, ambient, label, time, unit))
     if heater is not None:
         terms += _heater(check_name(heater, "heater"), T, label, time)
-    return terms
+    return timed(terms, time)
 
 
 def _drift(T: str, loss: str | None, label: str | None, time: str) -> Term:

@@ -139,6 +139,8 @@ def multiplied(
         scales=term.scales,
         elapsed=term.elapsed,
         expected=term.expected,
+        constants=term.constants,
+        time=term.time,
     )
 
 

@@ -1,6 +1,7 @@
 """Ranges in which shape parameters are sought that are measured on the scale of a driver."""
 
 import dataclasses
+import math
 from collections.abc import Mapping
 
 import torch
@@ -36,7 +37,7 @@ def drivers_scale(problem: Problem, found: Fitted) -> dict[str, float]:
 
 
 def sized(term: Term, scale: Mapping[str, float], recording: Recording) -> Term:
-    """The term with bounds for the shape parameters that it measures on a driver's scale.
+    """The term with bounds for the shape parameters, and numbers for the constants, that it measures on a scale.
 
     Raises:
         DomainError: If it names a driver or an input that there is not.
@@ -46,6 +47,7 @@ def sized(term: Term, scale: Mapping[str, float], recording: Recording) -> Term:
         raise DomainError(
             f"Expected the term {term.name!r} to take the effect of one of the inputs {inputs}. Got {term.takes!r}."
         )
+    term = _with_numbers(term, scale)
     if not term.scales:
         return term
     if "t" in scale and term.elapsed == "recording":
@@ -72,6 +74,25 @@ def sized(term: Term, scale: Mapping[str, float], recording: Recording) -> Term:
         initial = parameter.initial if parameter.initial is not None and low <= parameter.initial <= high else None
         parameters.append(dataclasses.replace(parameter, low=low, high=high, initial=initial, neutral=None))
     return dataclasses.replace(term, parameters=tuple(parameters))
+
+
+def _with_numbers(term: Term, scale: Mapping[str, float]) -> Term:
+    """The term with numbers for its constants, which its formula tells."""
+    numbers = {}
+    for name, drivers in term.constants.items():
+        if isinstance(drivers, float):
+            continue
+        drivers = (drivers,) if isinstance(drivers, str) else drivers
+        if unknown := [driver for driver in drivers if driver not in scale]:
+            raise DomainError(
+                f"Expected the term {term.name!r} to measure {name!r} on the scale of some of {list(scale)}. Got "
+                f"{unknown[0]!r}."
+            )
+        numbers[name] = float(f"{math.hypot(*(scale[driver] for driver in drivers)) or 1.0:.3g}")
+    if not numbers:
+        return term
+    told = "".join(f", {name} = {value:g}" for name, value in numbers.items())
+    return dataclasses.replace(term, constants=term.constants | numbers, formula=term.formula and term.formula + told)
 
 
 def _narrowed(low: float, high: float, parameter: Parameter) -> tuple[float, float]:

@@ -104,34 +104,42 @@ def _in_runs(problem: Problem, residual: Tensor, unit: Tensor, parts: list[Tenso
     """An output's noise, in a unit ``(n_total,)``, as it differs from run to run, ``(n_total,)``, and by how much that
     is likelier; 1 and 0 where all runs may be alike.
 
-    All must be sampled as fast, and be unlike in the same way beside near and beside far neighbours: noise that goes on
-    from sample to sample otherwise in one run, or physics that one run alone shows, is no noise of another size.
+    Runs are held against those that are sampled as fast.
     """
     factor, run_of = torch.ones_like(unit), problem.recording.x["run"].repeat(len(problem.recording.outputs))  # type: ignore[index]
-    sizes, far, told, runs, steps = [], [], [], [], []
-    for places in parts:
-        r = residual[places] / unit[problem.index[places]]
-        if len(r) < FEWEST:
-            continue
-        sizes.append(_off_neighbours(r, 1))
-        far.append(sum(_off_neighbours(r, apart) for apart in FAR) / len(FAR))
-        told.append(INDEPENDENT * len(r))
-        runs.append(float(run_of[problem.index[places[0]]]))
-        steps.append(float(problem.steps(places).median()))
-    if len(sizes) < 2 or max(steps) > AS_FAST * min(steps):
-        return factor, 0.0
-    if not UNLIKE * min(sizes) < max(sizes) < MOST_UNLIKE * min(sizes):
-        return factor, 0.0
-    ratios = [one / other for one, other in zip(far, sizes, strict=True)]
+    long = sorted((p for p in parts if len(p) >= FEWEST), key=lambda p: float(problem.steps(p).median()))
+    groups: list[list[Tensor]] = []
+    for places in long:
+        step = float(problem.steps(places).median())
+        if not groups or step > AS_FAST * float(problem.steps(groups[-1][0]).median()):
+            groups.append([])
+        groups[-1].append(places)
+    total = 0.0
+    for group in groups:
+        sizes, gain = _unlike([residual[places] / unit[problem.index[places]] for places in group])
+        total += gain
+        for places, size in zip(group, sizes, strict=True):
+            factor[run_of == run_of[problem.index[places[0]]]] = size
+    return factor / factor[problem.index[torch.cat(parts)]].median(), total
+
+
+def _unlike(residuals: list[Tensor]) -> tuple[list[float], float]:
+    """Noise of runs sampled as fast, in that of all, and by how much that is likelier; 1 and 0 where they may be alike.
+
+    They must be unlike in the same way beside near and beside far neighbours: noise that goes on from sample to sample
+    otherwise in one run, or physics that one run alone shows, is no noise of another size.
+    """
+    alike = [1.0] * len(residuals), 0.0
+    sizes = [_off_neighbours(r, 1) for r in residuals]
+    if len(sizes) < 2 or not UNLIKE * min(sizes) < max(sizes) < MOST_UNLIKE * min(sizes):
+        return alike
+    ratios = [sum(_off_neighbours(r, apart) for apart in FAR) / size for r, size in zip(residuals, sizes, strict=True)]
     if max(ratios) > AGREE * min(ratios):
-        return factor, 0.0
+        return alike
+    told = [INDEPENDENT * len(r) for r in residuals]
     pooled = sum(n * size for n, size in zip(told, sizes, strict=True)) / sum(told)
     gain = sum(n * math.log(pooled / size) for n, size in zip(told, sizes, strict=True)) - GROWS * len(sizes)
-    if gain <= 0:
-        return factor, 0.0
-    for run, size in zip(runs, sizes, strict=True):
-        factor[run_of == run] = size / pooled
-    return factor / factor[problem.index[torch.cat(parts)]].median(), gain
+    return ([size / pooled for size in sizes], gain) if gain > 0 else alike
 
 
 def _off_neighbours(r: Tensor, apart: int) -> float:
