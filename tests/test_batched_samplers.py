@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from torchcal import Parameter, Recording, Simulator, calibrate, calibrate_additive
 from torchcal.errors import ConvergenceError, InterruptionWarning
-from torchcal.inference import batched, diagnostics, hmc_step, nuts_step
+from torchcal.inference import batched, diagnostics, hmc_step, nuts_step, sampling
 from torchcal.inference.arrays import Device, Host
 from torchcal.inference.batched import run_batched
 from torchcal.inference.bends import Bend
@@ -485,6 +486,24 @@ def test_points_that_are_alone_in_their_modes_stay():
     other, there = gathered(space, z, torch.arange(8), torch.zeros(8, dtype=torch.float64), generator)
     assert other is space
     torch.testing.assert_close(there, z, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("function", [calibrate, calibrate_additive])
+@pytest.mark.parametrize("sampler", ["nuts", "pyro"])
+def test_a_calibration_that_is_interrupted_before_it_draws_keeps_its_maximum(function, sampler, monkeypatch):
+    def interrupted(*args, **options):
+        raise KeyboardInterrupt
+
+    x = torch.linspace(0, 1, 8, dtype=torch.float64)
+    line = Simulator(lambda x, p: p["a"] * x, [Parameter("a")])
+    recording = Recording(x=x, y=2 * x + 0.1 * torch.sin(9 * x))
+    want = function(line, recording, num_samples=0, seed=0, progress=False)
+    monkeypatch.setattr(sampling, "run_batched", interrupted)
+    monkeypatch.setattr(sampling, "_draw_with_pyro", interrupted)
+    with pytest.warns(InterruptionWarning, match="maximum alone"):
+        found = function(line, recording, sampler=sampler, seed=0, progress=False)
+    assert found.samples is None
+    assert torch.equal(found.map.alpha, want.map.alpha)
 
 
 @pytest.mark.parametrize("drawn", [0, 8])

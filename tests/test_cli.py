@@ -55,6 +55,14 @@ def test_diagnose_names_what_is_missing_and_writes_a_report(problem, tmp_path, c
     assert capsys.readouterr().out.startswith("Verdict: named: bend")
     assert "bend" in page.read_text()
     assert json.loads(out.read_text(encoding="utf-8"))["terms"] == ["bend"]
+    assert cli.main(["show", str(out)]) == 0
+    assert capsys.readouterr().out.startswith("Verdict: named: bend")
+    assert cli.main(["show", str(page)]) == 1
+
+
+def test_bars_are_for_terminals(problem, capsys):
+    assert cli.main(["diagnose", str(problem)]) == 0
+    assert capsys.readouterr().err == ""
 
 
 def test_show_reads_an_additive_calibration_too(tmp_path, capsys):

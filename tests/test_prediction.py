@@ -388,3 +388,16 @@ def test_a_parameter_without_a_density_is_told_as_it_is():
     alpha = torch.tensor([[0.0, 0.0]], dtype=torch.float64)
     with pytest.raises(DomainError, match="Got the value 100 alone in column 0"):
         parameter_density(propagate, alpha, torch.ones(1, 1, dtype=torch.float64))
+
+
+def test_results_are_shown_in_lines_that_can_be_read():
+    x = torch.linspace(0, 1, 200, dtype=torch.float64)
+    line = tc.Simulator(lambda x, p: p["a"] * x, [tc.Parameter("a")], degree=1)
+    fit = tc.calibrate(line, tc.Recording(x=x, y=2 * x + x**2), num_samples=0, seed=0, progress=False)
+    additive = tc.calibrate_additive(line, tc.Recording(x=x, y=2 * x + x**2), num_samples=0, seed=0, progress=False)
+    for shown in (fit.predict(), fit.predict().map, fit.map, fit.diagnostics, additive.predict(), additive.map):
+        assert "tensor" not in repr(shown)
+        assert max(map(len, repr(shown).splitlines())) < 160
+        assert len(repr(shown)) < 1000
+    assert repr(fit.predict()).startswith("prediction of 200 outputs: mean 0 to ")
+    assert "E[λ]" in repr(fit.map)

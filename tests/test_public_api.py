@@ -49,6 +49,12 @@ def test_public_methods_have_docstrings(name):
     assert not missing, f"without a docstring in torchcal.{name}: {missing}"
 
 
+def test_what_is_asked_for_later_is_listed():
+    assert {"plots", "__version__", "calibrate"} <= set(dir(torchcal))
+    assert "importlib" not in dir(torchcal)
+    assert torchcal.__version__[0].isdigit()
+
+
 def test_nothing_public_is_left_out_of_all():
     public = {
         name

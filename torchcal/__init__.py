@@ -1,6 +1,7 @@
 """torchcal: calibrate a simulation that is wrong, and find the physics that it leaves out."""
 
 import importlib
+import importlib.metadata
 import typing
 
 from torchcal import discovery, embeddings, errors, likelihoods, models, polychaos, priors, results, terms
@@ -52,7 +53,13 @@ __all__ = [
 
 
 def __getattr__(name: str) -> typing.Any:
-    """`torchcal.plots`, which brings matplotlib, when it is asked for."""
+    """`torchcal.plots`, which brings matplotlib, and the version of the installed package, when they are asked for."""
     if name == "plots":
         return importlib.import_module("torchcal.plots")
+    if name == "__version__":
+        return importlib.metadata.version("torchcal")
     raise AttributeError(f"module 'torchcal' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted([*__all__, "__version__"])

@@ -20,6 +20,7 @@ from types import ModuleType
 from typing import Any
 
 from torchcal.discovery import diagnose
+from torchcal.discovery.findings.as_json import text_of
 from torchcal.errors import DomainError, InterruptionWarning, TorchcalError
 from torchcal.files import check_target
 from torchcal.inference import calibrate
@@ -105,7 +106,7 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument("--quiet", action="store_true", help="show no progress")
     showing = commands.add_parser("show", help="print a result that was written")
     showing.set_defaults(run=_show)
-    showing.add_argument("result", type=Path, metavar="RESULT.nc")
+    showing.add_argument("result", type=Path, metavar="RESULT", help="of calibrate (.nc) or of diagnose (.json)")
     return parser
 
 
@@ -155,6 +156,9 @@ def _finish(result: object, writes: Sequence[Callable[[], object]]) -> None:
 
 
 def _show(given: argparse.Namespace) -> None:
+    if (text := text_of(given.result)) is not None:
+        print(text)
+        return
     try:
         print(Calibration.load(given.result))
     except TorchcalError as first:
@@ -178,7 +182,8 @@ def _options(
             f"Expected {name} in {given.problem} with keys among {known}. Got {unknown} (check the spelling)."
         )
     line = {"seed": given.seed, "progress": False if given.quiet else None, **more}
-    return {"progress": True, **own, **{key: value for key, value in line.items() if value is not None}}
+    # Bars are for a terminal; in a job's log they are pages of carriage returns.
+    return {"progress": sys.stderr.isatty(), **own, **{key: value for key, value in line.items() if value is not None}}
 
 
 def _problem(path: Path) -> ModuleType:

@@ -32,15 +32,24 @@ __all__ = [
 ROUNDING = 1e-13
 
 
-@dataclass(frozen=True)
+def _ends(values: Tensor) -> str:
+    """From where to where, in words."""
+    low, high = (float(v) for v in values.aminmax()) if values.numel() else (math.nan, math.nan)
+    return f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
+
+
+@dataclass(frozen=True, repr=False)
 class Moments:
     """Mean and standard deviation of a predictive distribution, ``(n,)`` each, in the output's unit."""
 
     mean: Tensor
     sd: Tensor
 
+    def __repr__(self) -> str:
+        return f"{self.mean.numel()} outputs: mean {_ends(self.mean)}, sd {_ends(self.sd)}"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Prediction:
     r"""Predictive moments of an embedded calibration (Table AI).
 
@@ -66,8 +75,14 @@ class Prediction:
     posterior: Moments | None
     mean_predictive: Moments | None
 
+    def __repr__(self) -> str:
+        parts = [f"model error {_ends(self.sd_model_error)}"]
+        if self.sd_posterior is not None:
+            parts.append(f"posterior {_ends(self.sd_posterior)}")
+        return f"prediction of {Moments(self.mean, self.sd)} ({', '.join(parts)})"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class AdditivePrediction:
     """Predictive moments of a conventional calibration, the two kinds kept apart.
 
@@ -82,6 +97,9 @@ class AdditivePrediction:
     push_forward: Moments
     posterior: Moments
     map: Moments
+
+    def __repr__(self) -> str:
+        return f"prediction of {self.posterior}; the calibrated model alone: sd {_ends(self.push_forward.sd)}"
 
 
 def embedded_prediction(propagate: NISP, alpha_map: Tensor, draws: Tensor | None) -> Prediction:

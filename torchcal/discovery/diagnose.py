@@ -92,8 +92,9 @@ def diagnose(
         UnitWarning: If terms of a library are in another unit of time than the recording.
         TorchcalWarning: If an external simulator is so slow that the diagnosis will take long.
         SurrogateWarning: If a surrogate's own error is large beside the noise.
-        ConvergenceWarning: If few starting values of the base agree, or it explains no more than a constant. After
-            Ctrl-C, the diagnosis keeps the refits that have ended: it names nothing, and says what it has not refitted.
+        ConvergenceWarning: If few starting values of the base agree, or it explains no more than a constant.
+        InterruptionWarning: After Ctrl-C: the diagnosis keeps the refits that have ended, names nothing, and says what
+            it has not refitted.
     """
     begun = time.perf_counter()
     given = _check(simulator, recording, candidates, confidence)

@@ -11,7 +11,7 @@ from torchcal.data import Recording
 from torchcal.errors import IdentifiabilityWarning, ImproperPosteriorError, warn
 from torchcal.inference.estimate import maximise
 from torchcal.inference.fitting import LeastSquares, least_squares, plain_propagation
-from torchcal.inference.sampling import Plan, draw
+from torchcal.inference.sampling import Plan, draw_unless_interrupted
 from torchcal.inference.setup import check_dtype, check_inputs, check_run
 from torchcal.inference.summary import diagnose, settings_of, to_result, warn_of_bounds, warn_of_box, warn_of_chains
 from torchcal.models import Problem
@@ -83,6 +83,7 @@ def calibrate_additive(
 
     Warns:
         ConvergenceWarning: If starts or chains disagree.
+        InterruptionWarning: After Ctrl-C while it draws: the result has the draws that there are, or the maximum alone.
         IdentifiabilityWarning: If the data do not determine a parameter, or the posterior has no finite variance.
         TorchcalWarning: If a table or a run of the recording is there twice.
 
@@ -142,7 +143,7 @@ def calibrate_additive(
     draws = None
     if plan.samples:
         with few_threads(problem.cost * plan.chains(problem.cost)):
-            draws = draw(problem, estimate, models.additive, plan)
+            draws = draw_unless_interrupted(problem, estimate, models.additive, plan)
     names = (*propagate.pattern.names, "ln sigma")
     samples = None if draws is None else draws.alpha
     quality = diagnose(estimate, draws, samples, None, names, None)

@@ -15,7 +15,7 @@ from torchcal.errors import DomainError
 from torchcal.inference.draws import Draws
 from torchcal.inference.estimate import maximise
 from torchcal.inference.fitting import allowed_solver_error, least_squares
-from torchcal.inference.sampling import Plan, draw
+from torchcal.inference.sampling import Plan, draw_unless_interrupted
 from torchcal.inference.setup import PriorMaker, check_dtype, check_inputs, check_run, embedded_problem, warn_of_tails
 from torchcal.inference.starts import check_starts
 from torchcal.inference.summary import (
@@ -115,6 +115,7 @@ def calibrate(
 
     Warns:
         ConvergenceWarning: If starts or chains disagree.
+        InterruptionWarning: After Ctrl-C while it draws: the result has the draws that there are, or the maximum alone.
         ToleranceWarning: If the tolerance rather than the model error sets the width of the prediction.
         PropagationWarning: If moments have not converged in nodes or order, or the best density has none.
         ExtrapolationWarning: If the calibration leaves the box of a surrogate.
@@ -184,8 +185,8 @@ def calibrate(
     samples: Tensor | None = None
     if plan.samples:
         with few_threads(problem.cost * plan.chains(problem.cost)):
-            draws = draw(problem, estimate, models.embedded, plan)
-        samples = draws.alpha
+            draws = draw_unless_interrupted(problem, estimate, models.embedded, plan)
+        samples = None if draws is None else draws.alpha
     check = _check_propagation(propagate, estimate.alpha, samples)
     prediction = embedded_prediction(propagate, estimate.alpha, None if samples is None else samples.flatten(0, 1))
     quality = diagnose(estimate, draws, samples, propagate, propagate.alpha_names, check)

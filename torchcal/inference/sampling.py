@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchcal import models
 from torchcal.checks import as_seed, whole
-from torchcal.errors import ConvergenceWarning, DomainError, ImproperPosteriorError, warn
+from torchcal.errors import ConvergenceWarning, DomainError, ImproperPosteriorError, InterruptionWarning, warn
 from torchcal.inference.batched import MOST_ELEMENTS, run_batched
 from torchcal.inference.by_hand import by_hand
 from torchcal.inference.coordinates import Laplace, dealt_out, slopes_of
@@ -188,6 +188,22 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
         )
     told = tuple(_mode(problem, mode, k in begun) for k, mode in enumerate(modes))
     return Draws(alpha, draws.divergences, told, found)
+
+
+def draw_unless_interrupted(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws | None:
+    """As `draw`; None after Ctrl-C before there were draws to keep: the maximum is there, and took its time.
+
+    Warns:
+        InterruptionWarning: Then.
+    """
+    try:
+        return draw(problem, estimate, model, plan)
+    except KeyboardInterrupt:
+        warn(
+            "The sampler was interrupted before there were draws to keep. The result is the maximum alone.",
+            InterruptionWarning,
+        )
+        return None
 
 
 def _mode(problem: Problem, mode: Laplace, started: bool) -> Mode:

@@ -61,7 +61,7 @@ class Mode:
     started: bool = True
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Diagnostics:
     """Convergence of optimiser, propagation and chains.
 
@@ -111,7 +111,7 @@ class Diagnostics:
     def _all(self) -> list[Quality]:
         return [*self.alpha.values(), *self.parameters.values()]
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         lines = [f"starts that agree: {self.agreeing} of {self.starts}"]
         if self.ties > 1:
             lines.append(f"different maxima of the same objective: {self.ties}")

@@ -4,10 +4,12 @@ import dataclasses
 
 from torch import Tensor
 
+from torchcal.results.diagnostics import table
+
 __all__ = ["MapEstimate"]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class MapEstimate:
     """The maximum a posteriori.
 
@@ -26,6 +28,11 @@ class MapEstimate:
     objective: float
     alpha_names: tuple[str, ...]
     parameters: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        numbers = zip(self.parameters, self.mean.tolist(), self.sd.tolist(), strict=True)
+        rows = [(name, f"{mean:.4g}", f"{sd:.2g}") for name, mean, sd in numbers]
+        return f"maximum a posteriori, -log likelihood {self.objective:.6g}\n" + table(("", "E[λ]", "Sd[λ]"), rows)
 
     @property
     def sd(self) -> Tensor:

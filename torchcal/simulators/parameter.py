@@ -94,7 +94,7 @@ class Parameter:
             if value is None:
                 continue
             try:
-                number = float(value)
+                number = math.nan if isinstance(value, str | bytes) else float(value)
             except (TypeError, ValueError):
                 number = math.nan
             if not math.isfinite(number):

@@ -16,7 +16,7 @@ from torchcal.files import replacing
 if TYPE_CHECKING:
     from torchcal.discovery.findings.result import Diagnosis
 
-__all__ = ["plain", "write"]
+__all__ = ["plain", "text_of", "write"]
 
 FORMAT = 1
 
@@ -34,6 +34,16 @@ def write(diagnosis: "Diagnosis", path: str | os.PathLike[str]) -> None:
     content |= {name: plain(getattr(diagnosis, name)) for name in fields}
     with replacing(path) as temporary:
         temporary.write_text(json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False), encoding="utf-8")
+
+
+def text_of(path: str | os.PathLike[str]) -> str | None:
+    """The diagnosis in words that a file holds which `write` wrote; None of any other file."""
+    try:
+        with open(path, encoding="utf-8") as file:
+            content = json.load(file)
+    except (OSError, ValueError):
+        return None
+    return str(content["text"]) if isinstance(content, dict) and content.get("kind") == "diagnosis" else None
 
 
 def plain(value: Any) -> Any:
