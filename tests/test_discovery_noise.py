@@ -241,6 +241,23 @@ def test_spikes_at_the_ends_and_side_by_side(places):
             assert spikes_in(spiked) == places
 
 
+@pytest.mark.parametrize("noise", [0.05, None])
+def test_two_neighbours_alone_that_are_set_aside_are_told(noise):
+    x = torch.linspace(0, 10, 50, dtype=F64)
+    y = 2 * torch.exp(-0.3 * x) + draw(50, 0.05, 3)
+    y[[26, 27]] += torch.tensor([0.8, 0.6], dtype=F64)
+    d = tc.diagnose(DECAY, tc.Recording(x=x, y=y, noise=noise), LIBRARY, seed=0, progress=False)
+    assert d.set_aside.nonzero()[:, 0].tolist() == [26, 27]
+    assert str(d).startswith("Verdict: consistent (nothing is surely missing)")
+    (told,) = [line for line in d.symptoms if "neighbours" in line]
+    assert told.startswith("two that were set aside as outliers are neighbours, at x = 5.306 and at x = 5.51, off by +")
+    assert "probability of 0.039" in told  # 1 - exp(-2/50)
+    y[[5, 40]] += 0.9  # of four on that side two are neighbours with a probability of 0.2
+    d = tc.diagnose(DECAY, tc.Recording(x=x, y=y, noise=noise), LIBRARY, seed=0, progress=False)
+    assert d.set_aside.nonzero()[:, 0].tolist() == [5, 26, 27, 40]
+    assert not [line for line in d.symptoms if "neighbours" in line]
+
+
 def test_what_begins_or_ends_steeply_is_no_outlier():
     x = torch.linspace(0, 1, 80, dtype=F64)
     for tau in (0.03, 0.05, 0.1):

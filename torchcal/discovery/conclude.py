@@ -7,6 +7,7 @@ import time
 from torch import Tensor
 
 from torchcal.data import Recording
+from torchcal.discovery.findings.aside import side_by_side
 from torchcal.discovery.findings.experiment import propose
 from torchcal.discovery.findings.limits import limits
 from torchcal.discovery.findings.ranking import ranking
@@ -97,6 +98,8 @@ def conclude(
     improved = asked.simulator if best is None else _improved(asked.simulator, best)
     left = search.base if best is None else best.found
     apart = unlike(search, left) if decision.verdict in ("consistent", "named") else []
+    aside = asked.recording.observed_once & ~search.problem.keep
+    apart += side_by_side(search.problem, final.residual / search.noise.sd, aside)
     any_unlike = bool(apart)
     if decision.verdict != "consistent":
         apart = [*unbounded(search), *begun_elsewhere(search), *more_than_replicates(search, left), *apart]
@@ -151,7 +154,7 @@ def conclude(
         recording=asked.recording,
         simulator=asked.simulator,
         held_out=mask,
-        set_aside=asked.recording.observed_once & ~search.problem.keep,
+        set_aside=aside,
         p_detect=search.p_detect,
         confidence=asked.confidence,
         library=[term.name for term in asked.terms],

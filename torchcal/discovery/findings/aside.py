@@ -1,0 +1,57 @@
+"""What was set aside as outliers and may be none, in words."""
+
+import dataclasses
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.fits.problem import Problem
+
+__all__ = ["side_by_side"]
+
+#: Probability by chance of as many outliers side by side, on the same side, below which they are told.
+CHANCE = 0.05
+
+
+def side_by_side(problem: Problem, off: Tensor, aside: Tensor) -> list[str]:
+    """Outliers that are neighbours in an order, and on the same side, though outliers do not know of each other.
+
+    Of a above and b below among m data, as many are as a Poisson variable with a mean of (a (a - 1) + b (b - 1)) / m.
+
+    Args:
+        problem: The used data.
+        off: How far all data are off the fit that the verdict rests on, in noise sd, ``(n_total,)``.
+        aside: Which of them were set aside, bool ``(n_total,)``.
+    """
+    if problem.order is None or int(aside.sum()) < 2:
+        return []
+    problem = dataclasses.replace(problem, keep=problem.keep | aside)
+    far, out = off[problem.index], aside[problem.index]
+    pairs = [pair for places in problem.sequences for pair in _pairs(places, far, out)]
+    if not pairs:
+        return []
+    above, below = (int((out & (far * sign > 0)).sum()) for sign in (1, -1))
+    mean = (above * (above - 1) + below * (below - 1)) / problem.n
+    chance = float(torch.special.gammainc(torch.tensor(float(len(pairs))), torch.tensor(mean)))
+    if chance >= CHANCE:
+        return []
+    first, second = max(pairs, key=lambda pair: float(far[list(pair)].abs().min()))
+    return [
+        f"two that were set aside as outliers are neighbours, {_at(problem, first)} and {_at(problem, second)}, off by "
+        f"{float(far[first]):+.1f} and {float(far[second]):+.1f} noise sd: outliers are so by chance with a "
+        f"probability of {chance:.2g}. Something short may act there; repeat them, or record more densely there"
+    ]
+
+
+def _pairs(places: Tensor, far: Tensor, out: Tensor) -> list[tuple[int, int]]:
+    """Neighbours in a sequence that are both out, on the same side."""
+    one, other = places[:-1], places[1:]
+    both = out[one] & out[other] & (far[one] * far[other] > 0)
+    return list(zip(one[both].tolist(), other[both].tolist(), strict=True))
+
+
+def _at(problem: Problem, k: int) -> str:
+    x = problem.recording.x
+    name = "t" if problem.in_time else next(iter(x)) if isinstance(x, dict) else "x"
+    assert problem.order is not None
+    return f"at {name} = {float(problem.order[problem.condition_of[k]]):.4g}"
