@@ -682,3 +682,33 @@ def test_another_name_of_a_term_in_a_window_is_told_with_the_window():
     assert d.ranking[0].refitted
     assert f"drift where {regions['drift'][0]}" in " ".join(str(d).split())
     assert sum(r.probability for r in d.ranking) == pytest.approx(1.0)
+
+
+def test_another_range_that_is_nearly_as_likely_is_told_beside_the_named_one():
+    rows = [
+        row(["saturation"], 0.45, region="T < 1796"),
+        row(["saturation"], 0.38, region="tau < 11.8"),
+        row(["saturation"], 0.02),
+        row(["saturation"], 0.3, region="p > 3", physical=False),
+        row(["offset"], 0.4, region="p > 2"),
+    ]
+    d = SimpleNamespace(ranking=rows, terms=["saturation"], settings={"region": "T < 1796"})
+    assert called.with_region(d, "saturation") == "saturation, where T < 1796 (or, nearly as likely, tau < 11.8)"
+    d.ranking = [rows[0], rows[2]]
+    assert called.with_region(d, "saturation") == "saturation, where T < 1796"
+
+
+@pytest.mark.parametrize(("low", "verdict"), [(5.0, "ambiguous"), (4.05, "named")])
+def test_a_shape_at_a_given_bound_along_which_the_size_is_open_is_no_name(low, verdict):
+    x = torch.linspace(0.1, 4, 50, dtype=F64)
+    noise = 0.03 * torch.randn(50, generator=torch.Generator().manual_seed(0), dtype=F64)
+    base = tc.Simulator(lambda x, p: p["a"] + p["r"] * x, [tc.Parameter("a"), tc.Parameter("r")])
+    term = tc.Term(
+        "overpotential",
+        outputs={"y": lambda x, p, y: y - p["b"] * torch.log1p(-x / p["il"])},
+        parameters=[tc.Parameter("b", low=0.0), tc.Parameter("il", low=low, high=50.0)],
+    )
+    recording = tc.Recording(x=x, y=1.2 + 0.3 * x + 0.15 * (x / 4) ** 4 + noise, noise=0.03)
+    d = tc.diagnose(base, recording, [term], seed=0, progress=False)
+    assert d.verdict == verdict
+    assert ("ends at a bound of overpotential.il" in d.settings["doubt"]) == (verdict == "ambiguous")

@@ -25,6 +25,8 @@ __all__ = [
 LITTLE = 0.005
 #: Probability from which on the base, or something unknown, is told beside what is named or tied.
 LISTED = 0.05
+#: Probability of another range of what is named, in that of the named one, from which on it is told too.
+NEARLY = 0.2
 #: Pairs of hypotheses that an experiment leaves, of which the paragraph lists so many.
 UNTOLD = 3
 
@@ -72,9 +74,14 @@ def accepted(d: Any) -> Any:
 
 
 def with_region(d: Any, name: str) -> str:
-    """A named term in a sentence, with the range that it acts in."""
-    region = accepted(d).region
-    return f"{name}, where {region}" if region else name
+    """A named term in a sentence, with the range that it acts in, and others that are nearly as likely."""
+    row = accepted(d)
+    if not row.region:
+        return name
+    same = [one for one in d.ranking if one.refitted and one.physical and set(one.terms) == set(row.terms)]
+    likely = [one for one in same if one is not row and one.probability > NEARLY * row.probability]
+    others = list(dict.fromkeys(one.region or "everywhere" for one in likely if one.region != row.region))
+    return f"{name}, where {row.region}" + (f" (or, nearly as likely, {', or '.join(others)})" if others else "")
 
 
 def holds_named(d: Any, row: Any) -> bool:

@@ -87,7 +87,15 @@ def left_open(search: Search, model: Model) -> str:
         sure = model.window is None and len(model.candidate.terms) == 1 and not search.exact
         least = OPEN if sure else CLEARLY_OPEN
         # Without noise the misfit is what an amplitude is uncertain by.
-        if places and _distance(model, places, shapes, misfit_size(model.found) if search.exact else 1.0) <= least:
+        size = misfit_size(model.found) if search.exact else 1.0
+        ends = [i for i in shapes if i not in places and _at_given_end(search, model, i)]
+        if places and ends and _distance(model, places, (), size) <= CLEARLY_OPEN:
+            listed = " and ".join(names[i] for i in ends)
+            return (
+                f"The fit ends at a bound of {listed}, along with which the data leave the size of what it adds open: "
+                "more conditions would tell, or a bound that is surer."
+            )
+        if places and _distance(model, places, shapes, size) <= least:
             bound = search.base.stuck
             looks = f" {', '.join(bound)} ran to a bound in the base: a bound that is wrong looks like this too."
             told = "The data leave the size of what it adds open: more conditions would tell."
@@ -101,6 +109,13 @@ def left_open(search: Search, model: Model) -> str:
     if distinct(search.problem) - len(model.found.free) <= len(model.candidate.own):
         return "There are hardly more distinct conditions than parameters: more conditions would tell."
     return ""
+
+
+def _at_given_end(search: Search, model: Model, i: int) -> bool:
+    """Whether a term's parameter is at a bound that the user gave, whether or not it wants to cross it."""
+    name, value = model.found.problem.parameters[i].name, float(model.found.values[i])
+    terms = [search.terms[number] for number in model.numbers]
+    return any(term.full(q.name) == name and value in (q.low, q.high) for term in terms for q in term.parameters)
 
 
 def _no_better(search: Search, model: Model) -> str:
