@@ -275,7 +275,7 @@ def expansion(p: Array, temperature: Array, spectrum: str) -> Array:
     else:
         z = u[:, None] * np.linspace(1e-6, 1.0, 2001)
         inner = z**4 * np.exp(-z) / np.expm1(-z) ** 2
-        capacity = 3 / u**3 * np.trapezoid(inner, z, axis=1)
+        capacity = 3 / u**3 * integrate.trapezoid(inner, z, axis=1)
     return p[0] * capacity * (1 + (1e-4 * p[2] * temperature if len(p) > 2 else 0.0))
 
 

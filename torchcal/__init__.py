@@ -1,10 +1,9 @@
 """torchcal: calibrate a simulation that is wrong, and find the physics that it leaves out."""
 
 import importlib
-import importlib.metadata
 import typing
 
-from torchcal import discovery, embeddings, errors, likelihoods, models, polychaos, priors, results, terms
+from torchcal import discovery, display, embeddings, errors, likelihoods, models, polychaos, priors, results, terms
 from torchcal.data import Recording, Run
 from torchcal.discovery import diagnose
 from torchcal.errors import TorchcalError, TorchcalWarning
@@ -57,7 +56,7 @@ def __getattr__(name: str) -> typing.Any:
     if name == "plots":
         return importlib.import_module("torchcal.plots")
     if name == "__version__":
-        return importlib.metadata.version("torchcal")
+        return display.version("torchcal")
     raise AttributeError(f"module 'torchcal' has no attribute {name!r}")
 
 

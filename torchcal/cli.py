@@ -6,7 +6,6 @@ further arguments, ``calibrate_options`` and ``diagnose_options``.
 
 import argparse
 import functools
-import importlib.metadata
 import importlib.util
 import inspect
 import io
@@ -21,6 +20,7 @@ from typing import Any
 
 from torchcal.discovery import diagnose
 from torchcal.discovery.findings.as_json import text_of
+from torchcal.display import version
 from torchcal.errors import DomainError, InterruptionWarning, TorchcalError
 from torchcal.files import check_target
 from torchcal.inference import calibrate
@@ -90,7 +90,7 @@ def _line(error: BaseException | None, path: Path | None) -> int | None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="torchcal", description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--version", action="version", version=f"torchcal {_version()}")
+    parser.add_argument("--version", action="version", version=f"torchcal {version('torchcal')}")
     commands = parser.add_subparsers(required=True, metavar="command")
     calibrating = commands.add_parser("calibrate", help="calibrate with model error embedded in the parameters")
     calibrating.set_defaults(run=_calibrate)
@@ -108,13 +108,6 @@ def _parser() -> argparse.ArgumentParser:
     showing.set_defaults(run=_show)
     showing.add_argument("result", type=Path, metavar="RESULT", help="of calibrate (.nc) or of diagnose (.json)")
     return parser
-
-
-def _version() -> str:
-    try:
-        return importlib.metadata.version("torchcal")
-    except importlib.metadata.PackageNotFoundError:  # run from its sources
-        return "(not installed)"
 
 
 def _calibrate(given: argparse.Namespace) -> None:

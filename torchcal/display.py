@@ -2,8 +2,11 @@
 
 import math
 from collections.abc import Sequence
+from importlib import metadata
 
-__all__ = ["DECADES", "FAR", "NONE", "PATIENCE", "between", "percent", "placed", "raised", "up_to", "with_unit"]
+__all__ = [
+    "DECADES", "FAR", "NONE", "PATIENCE", "between", "percent", "placed", "raised", "up_to", "version", "with_unit"
+]  # fmt: skip
 
 NONE = ("none of these",)
 """In place of terms: something that is not among the candidates."""
@@ -99,3 +102,11 @@ def raised(error: BaseException) -> str:
     'ValueError: Not so'
     """
     return f"{type(error).__name__}: {error}".rstrip(". ")
+
+
+def version(package: str) -> str:
+    """Of an installed package; "unknown" where it runs from its sources."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return "unknown"

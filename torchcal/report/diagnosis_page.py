@@ -5,11 +5,10 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from torchcal.display import between, percent, up_to
+from torchcal.display import between, percent, up_to, version
 from torchcal.files import check_target, replacing
 from torchcal.plots.discovery import FigurePart, figure_parts
 from torchcal.plots.discovery.pieces import likeliest_with
@@ -119,7 +118,7 @@ def page(diagnosis: Any) -> str:
             "<main>",
             *[part for part in body if part],
             "</main>",
-            f"<footer>Written by torchcal {escaped(_version('torchcal'))} on {when}.</footer>",
+            f"<footer>Written by torchcal {escaped(version('torchcal'))} on {when}.</footer>",
             "</body>",
             "</html>",
             "",
@@ -337,7 +336,7 @@ def _settings(diagnosis: Any) -> str:
     rows = [{"setting": name, "value": in_words(value)} for name, value in flat.items()]
     known = " ".join(flat)
     rows += [
-        {"setting": f"version {name}", "value": _version(name)}
+        {"setting": f"version {name}", "value": version(name)}
         for name in PACKAGES
         if not re.search(rf"\bversions?[.\s_]{re.escape(name)}", known)
     ]
@@ -379,13 +378,6 @@ def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             flat[f"{prefix}{name}"] = value
     return flat
-
-
-def _version(package: str) -> str:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return "unknown"
 
 
 def _get(diagnosis: Any, name: str) -> list[Any]:
