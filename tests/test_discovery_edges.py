@@ -10,7 +10,7 @@ import torch
 import torchcal as tc
 from torchcal.discovery.findings import where
 from torchcal.discovery.fits.problem import Problem
-from torchcal.discovery.fits.ranges import sized
+from torchcal.discovery.fits.ranges import Scale, sized
 from torchcal.discovery.fits.shapes import shape_points
 from torchcal.discovery.hypotheses import verify
 from torchcal.errors import DomainError, SimulatorError
@@ -93,7 +93,7 @@ def test_what_is_said_of_a_shape_holds_on_a_scale_too(given, low, high, initial)
             "onset", equation="x", rate=lambda t, s, p, u: p["k"] * torch.exp(-t / p["tau"]), scales={"tau": "t"},
             parameters=[tc.Parameter("k"), tc.Parameter("tau", **given)],
         )  # fmt: skip
-        return sized(term, {"t": 10.0}, recording).parameters[1]
+        return sized(term, Scale({"t": 10.0}, {}), recording).parameters[1]
 
     t = torch.linspace(0, 10, 21, dtype=F64)
     recording = tc.Recording(runs=[tc.Run(time=t, outputs={"x": t})])
@@ -168,7 +168,28 @@ def test_replicates_are_held_out_together(each):
         assert set(shares.tolist()) == {0.0, 1.0}
         assert 2 <= int(shares.sum()) <= 4
     x = torch.tensor([0.0, 1.0], dtype=F64).repeat_interleave(10)  # of two conditions neither can go
-    assert int(verify.choose(tc.Recording(x=x, y=noise(20, 0)), None, 2).sum()) == 5
+    recording = tc.Recording(x=x, y=noise(20, 0))
+    assert int(verify.choose(recording, None, 2).sum()) == 5
+    assert int(verify.within(recording).sum()) > 0
+
+
+@pytest.mark.parametrize("missing", [False, True])
+def test_whole_corners_of_a_factorial_are_held_out_in_any_order_of_the_rows(missing):
+    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=F64)] * 3).repeat(4, 1)
+    y = noise(32, 0)
+    if missing:
+        y[:8] = math.nan
+    found = []
+    for order in (torch.arange(32), torch.randperm(32, generator=torch.Generator().manual_seed(1))):
+        columns = corners[order]
+        recording = tc.Recording(x=dict(zip("abc", columns.unbind(-1), strict=True)), y=y[order], missing=missing)
+        mask = verify.choose(recording, None, 2)
+        level = columns.unique(dim=0, return_inverse=True)[1]
+        seen = ~y[order].isnan()
+        assert set(level[mask].tolist()).isdisjoint(level[seen & ~mask].tolist())
+        found.append(set(level[mask].tolist()))
+        assert len(found[-1]) == 2
+    assert found[0] == found[1]
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-9])

@@ -250,7 +250,8 @@ def test_two_neighbours_alone_that_are_set_aside_are_told(noise):
     assert d.set_aside.nonzero()[:, 0].tolist() == [26, 27]
     assert str(d).startswith("Verdict: consistent (nothing is surely missing)")
     (told,) = [line for line in d.symptoms if "neighbours" in line]
-    assert told.startswith("two that were set aside as outliers are neighbours, at x = 5.306 and at x = 5.51, off by +")
+    where = "output 'y' at x = 5.306 and output 'y' at x = 5.51, off by +"
+    assert told.startswith(f"two that were set aside as outliers are neighbours, {where}")
     assert "probability of 0.039" in told  # 1 - exp(-2/50)
     y[[5, 40]] += 0.9  # of four on that side two are neighbours with a probability of 0.2
     d = tc.diagnose(DECAY, tc.Recording(x=x, y=y, noise=noise), LIBRARY, seed=0, progress=False)

@@ -9,7 +9,9 @@ import torch
 from scipy.integrate import solve_ivp
 
 import torchcal as tc
-from torchcal.discovery.fits.ranges import sized
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.fits.ranges import Scale, drivers_scale, sized
+from torchcal.discovery.hypotheses.base import calibrate_base
 from torchcal.errors import DomainError, UnitWarning
 
 F64 = torch.float64
@@ -73,11 +75,12 @@ def test_constants_are_measured_on_what_the_base_does():
         )  # fmt: skip
 
     recording = tc.Recording(runs=[tc.Run([0.0, 1.0, 2.0], {"x": [1.0, 2.0, 3.0]})])
-    scale = {"x": 3.0001, "y": 4.0, "t": 2.0, "none": 0.0}
+    turning = {"x": torch.tensor([[3.0001], [0.0]]), "y": torch.tensor([[0.0], [-4.0]])}
+    scale = Scale({"x": 3.0001, "y": 4.0, "t": 2.0, "none": 0.0}, turning)
     found = sized(term(c="x"), scale, recording)
     assert (found.constants, found.formula) == ({"c": 3.0}, "dx/dt ∋ q (x/c)², c = 3")
-    assert sized(found, {"x": 7.0}, recording).constants == {"c": 3.0}
-    assert sized(term(c=("x", "y")), scale, recording).constants == {"c": 5.0}
+    assert sized(found, Scale({"x": 7.0}, {}), recording).constants == {"c": 3.0}
+    assert sized(term(c=("x", "y")), scale, recording).constants == {"c": 4.0}  # of the vector, not of its parts
     assert sized(term(c="none"), scale, recording).constants == {"c": 1.0}
     assert sized(term(c=2), scale, recording).constants == {"c": 2.0}
     assert term(c="x").own({"power.q": 1.0})["c"] == 1.0
@@ -89,6 +92,37 @@ def test_constants_are_measured_on_what_the_base_does():
 def test_constants_that_cannot_be(given):
     with pytest.raises(DomainError, match="constants="):
         tc.Term("t", equation="x", rate=lambda t, s, p, u: p["q"], parameters=[tc.Parameter("q")], constants=given)
+
+
+def test_labels_without_time_are_not_told_and_every_unit_is():
+    untimed = {term.name for term in tc.terms.kinetics("A", time="h") if term.time is None}
+    assert untimed == {"reaction order", "saturation"}
+    timed = {term.name for term in tc.terms.sensor(("A",), time="h") if term.time == "h"}
+    assert timed == {"drift of A", "lag of A", "delay of A"}
+    model, recording = decay((1.0,), units={"time": "min", "A": "mol/L"})
+    two = [tc.terms.kinetics("A", rate=None, time="s")[0], tc.terms.kinetics("A", rate=None, time="h", label="b")[1]]
+    with pytest.warns(UnitWarning) as caught:
+        diagnose(model, recording, two, holdout=False, num_starts=2)
+    texts = [str(w.message) for w in caught if w.category is UnitWarning]
+    assert ["'reverse reaction'" in texts[0], "'autocatalysis (b)'" in texts[1]] == [True, True]
+    with pytest.raises(DomainError, match="time as the name"):
+        tc.Term("t", equation="x", rate=lambda t, s, p, u: p["q"], parameters=[tc.Parameter("q")], time=60)
+
+
+def test_the_reference_of_gravity_is_the_largest_distance():
+    t = torch.linspace(0, 6, 40, dtype=F64)
+    runs = [tc.Run(t, {"x": t.cos(), "y": t.sin()}, initial={"x": 1.0, "y": 0.0, "vx": 0.0, "vy": 1.0})]
+
+    def rates(t, s, p, u):
+        pull = -p["mu"] / (s["x"] ** 2 + s["y"] ** 2) ** 1.5
+        return {"x": s["vx"], "y": s["vy"], "vx": pull * s["x"], "vy": pull * s["y"]}
+
+    states = {"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"}
+    model = tc.ODESimulator(rates, states, [tc.Parameter("mu", low=0.1, initial=1.0)], observe=("x", "y"))
+    problem = Problem.of(model.bind(tc.Recording(runs=runs)), tc.Recording(runs=runs))
+    base, _ = calibrate_base(problem, {}, 2, 0)
+    (term,) = [one for one in tc.terms.orbital(("x", "y"), ("vx", "vy")) if one.name == "exponent of gravity"]
+    assert sized(term, drivers_scale(problem, base), problem.recording).constants == {"r_ref": 1.0}
 
 
 @pytest.mark.parametrize(

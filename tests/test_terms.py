@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 import torchcal as tc
-from torchcal.discovery.fits.ranges import sized
+from torchcal.discovery.fits.ranges import Scale, sized
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators import Trajectories
 from torchcal.terms import extend
@@ -478,7 +478,7 @@ def test_durations_are_measured_on_what_they_count_in(elapsed: str | None, lengt
     runs = [tc.Run(time=clock + time, outputs={"x": 0 * time}) for clock in (200.0, 1200.0)]
     term = tc.Term("rise", equation="x", rate=grows, parameters=[tc.Parameter("q"), tc.Parameter("tau")],
                    scales={"tau": "t"}, elapsed=elapsed)  # fmt: skip
-    tau = sized(term, {"t": 10.0}, tc.Recording(runs=runs)).parameters[1]
+    tau = sized(term, Scale({"t": 10.0}, {}), tc.Recording(runs=runs)).parameters[1]
     shortest = min(0.02 * length, 0.1 * 10.0 / (samples - 1))  # of a gap between samples, if that is less
     assert (tau.low, tau.high) == pytest.approx((shortest, length))
 

@@ -126,9 +126,10 @@ def diagnose(
     _compare_times(recording, terms)
     mask = verify.choose(recording, holdout, len(free))
     warn_if_coarse(problem)
-    warn_if_long(problem, starts(problem, 1, seed, held)[0])
-    for values in starts(problem, 2, seed, held):  # at zero nothing may move
+    for number, values in enumerate(starts(problem, 2, seed, held)):  # at zero nothing may move
         check_repeats(problem, values)
+        if number == 0:  # the first call may take longer, for what it imports or begins
+            warn_if_long(problem, values)
         problem.check_slopes(values, free)
     bar = tqdm(disable=not progress, desc="diagnose", unit="step", leave=False)
 
@@ -233,13 +234,15 @@ def _compare_times(recording: Recording, terms: Sequence[Term]) -> None:
     mine = recording.units.get("time")
     if mine is None or recording.runs is None:
         return
-    others = [term for term in terms if term.time is not None and not same_unit(term.time, mine)]
-    if others:
-        named = ", ".join(repr(term.name) for term in others[:3]) + (", ..." if len(others) > 3 else "")
+    others: dict[str, list[str]] = {}
+    for term in terms:
+        if term.time is not None and not same_unit(term.time, mine):
+            others.setdefault(term.time, []).append(repr(term.name))
+    for unit, names in others.items():
+        named = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
         warn(
-            f"The recording's time is in {mine}, and the units of the terms {named} are by {others[0].time}: their "
-            f"estimates and limits will be numbers by {mine} under labels by {others[0].time}. Build them with "
-            f"time={mine!r}.",
+            f"The recording's time is in {mine}, and in the units of the terms {named} it is in {unit}: their "
+            f"estimates and limits will be numbers in {mine} under labels in {unit}. Build them with time={mine!r}.",
             UnitWarning,
         )
 

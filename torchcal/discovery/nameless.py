@@ -168,7 +168,7 @@ def _effect(search: Search, term: Term) -> Tensor | None:
     """What the amplitudes of a term without shapes do to the data, ``(n, amplitudes)``, at the base as it stands: that
     has moved with the noise since the candidates' own tangents. None where it cannot be taken."""
     try:
-        tangents = prepare(search.base.problem, search.base, [term], search.fixed, {}).tangents
+        tangents = prepare(search.base.problem, search.base, [term], search.fixed).tangents
     except (SimulatorError, DomainError):
         return None
     return tangents[0] if len(tangents) == 1 else None
@@ -263,7 +263,7 @@ def _wanted(
             static=not search.problem.in_time, edge=edge,
         )  # fmt: skip
         try:
-            candidate = prepare(search.base.problem, search.base, [local], search.fixed, {})
+            candidate = prepare(search.base.problem, search.base, [local], search.fixed)
             begin, chi2 = _begin(search, model, candidate, chosen, span)
         except (SimulatorError, DomainError):
             continue
@@ -282,7 +282,7 @@ def _anywhere(search: Search, model: Model) -> Hypothetical | None:
     cuts = [span.moved(span.low, k / (CUTS - 1) * span.size) for k in range(CUTS)]
     local = localised(term, w.driver, cuts[0], cuts[-1], span, static=not search.problem.in_time, edge=True)
     try:
-        candidate = prepare(search.base.problem, search.base, [local], search.fixed, {})
+        candidate = prepare(search.base.problem, search.base, [local], search.fixed)
         begin, _ = _begin(search, model, candidate, list(itertools.combinations(cuts, 2)), span)
     except (SimulatorError, DomainError):
         return None

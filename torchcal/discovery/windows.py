@@ -323,7 +323,7 @@ def _begun(
     span = span.edged(w.low, w.high)
     local = localised(term, w.driver, w.low, w.high, span, static=not search.problem.in_time, edge=edge)
     try:
-        candidate = prepare(search.base.problem, search.base, [local], search.fixed, {})
+        candidate = prepare(search.base.problem, search.base, [local], search.fixed)
     except (SimulatorError, DomainError):
         return None
     column = search.screening.acting[w.candidate]

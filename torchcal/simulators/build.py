@@ -80,7 +80,7 @@ def build_surrogate(
             the ``.partial`` of an error. One kept evaluation is repeated, to see that the function is the same.
         progress: Whether to show a bar.
         holdout: Number of random points at which the error is measured, >= 10.
-        seed: Of these points.
+        seed: Of these points, and of those of ``points=``, of which more begin with the fewer.
         threshold: Largest error, rms over the output's sd, that passes without a warning.
 
     Returns:
@@ -195,10 +195,11 @@ def build_surrogate(
         worst=tuple(dict(zip(labels, where[int(i)].tolist(), strict=True)) for i in error.argmax(1)),
     )
     if bool((measured.relative > threshold).any()):
-        grid = "" if points is not None or dim < MANY else " (points= takes fewer evaluations than a grid)"
+        few = " (points= takes fewer evaluations than a grid)" if points is None and dim >= MANY else ""
+        few = " and points=" if points is not None else few
         warn(
             f"The surrogate of order {order} has a large {measured}\n(threshold {threshold:g} of the sd). Raise "
-            f"order={grid}, narrow the box, or take the logarithm of an output that spans decades.",
+            f"order={few}, narrow the box, or take the logarithm of an output that spans decades.",
             SurrogateWarning,
         )
     return PolynomialSurrogate(coefficients, error=measured, **settings)

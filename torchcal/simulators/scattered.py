@@ -15,8 +15,10 @@ __all__ = ["check_points", "fit_scattered", "scatter"]
 
 #: Points for each term at least: fewer than so many may lie where terms cannot be told apart.
 LEAST = 2
-#: Numbers in the least-squares problem at most: 2 GiB.
-MOST = 2**28
+#: Numbers in the least-squares problem at most, of which there are three of such a size: 3 GiB.
+MOST = 2**27
+#: Points that are drawn at once, and how often each is tried, of which half are taken.
+PIECE, TRIES = 256, 40
 
 
 def check_points(points: int, terms: int) -> int:
@@ -44,19 +46,19 @@ def scatter(indices: Tensor, num: int, seed: int) -> Tensor:
     :math:`\tfrac12 \tilde L_n^2 \le 2 / (\pi \sqrt{1 - \eta^2})`, twice the density of the cosine of a uniform angle.
     """
     generator = np.random.default_rng([seed, 1])  # others than where the error is measured
-    degree = indices[torch.arange(num) % len(indices)].flatten()
-    found, left = torch.zeros(len(degree), dtype=torch.float64), torch.arange(len(degree))
-    highest = int(degree.max())
-    table = torch.arange(highest + 1)[:, None]
-    while len(left):
-        tried = torch.cos(np.pi * torch.from_numpy(generator.random(len(left))))
-        value = polychaos.evaluate(polychaos.LEGENDRE, table, tried[:, None])[torch.arange(len(left)), degree[left]]
-        density = 0.5 * (2 * degree[left] + 1) * value.square()
-        bound = 2.0 / (np.pi * (1 - tried.square()).sqrt())
-        good = torch.from_numpy(generator.random(len(left))) * bound < density
-        found[left[good]] = tried[good]
-        left = left[~good]
-    return found.reshape(num, indices.shape[1])
+    table = torch.arange(int(indices.max()) + 1)[:, None]
+    parts = []
+    for first in range(0, num, PIECE):  # row by row, so that fewer points are the first of more
+        degree = indices[torch.arange(first, min(first + PIECE, num)) % len(indices)]
+        even, at = torch.from_numpy(generator.random((*degree.shape, TRIES, 2))).unbind(-1)
+        tried = torch.cos(np.pi * at)
+        values = polychaos.evaluate(polychaos.LEGENDRE, table, tried.reshape(-1, 1)).reshape(*tried.shape, -1)
+        value = values.gather(-1, degree[..., None, None].expand(*tried.shape, 1))[..., 0]
+        density = 0.5 * (2 * degree[..., None] + 1) * value.square()
+        good = even * 2.0 < density * np.pi * (1 - tried.square()).sqrt()
+        place = good.int().argmax(-1, keepdim=True)  # the first; with a probability of 2^-TRIES there is none
+        parts.append(tried.gather(-1, place)[..., 0])
+    return torch.cat(parts)
 
 
 def fit_scattered(values: Tensor, indices: Tensor, points: Tensor) -> Tensor:

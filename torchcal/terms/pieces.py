@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -160,8 +161,13 @@ def titled(name: str, label: str | None) -> str:
 
 
 def timed(terms: Sequence[Term], time: str) -> list[Term]:
-    """The terms, which remember the unit of time that their parameters are in."""
-    return [dataclasses.replace(term, time=check_name(time, "time")) for term in terms]
+    """The terms, of which those with time in the units of their parameters remember it."""
+    check_name(time, "time")
+
+    def has_time(term: Term) -> bool:
+        return any(time in re.split(r"[\s/*^()0-9.-]+", q.unit or "") for q in term.parameters)
+
+    return [dataclasses.replace(term, time=time) if has_time(term) else term for term in terms]
 
 
 def own_name(name: str, *taken: Any) -> str:

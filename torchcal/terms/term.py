@@ -83,8 +83,8 @@ class Term:
             much again as the equation has of it, or more, is no name.
         constants: Numbers that its functions find in ``p``, the same in all runs: say the concentration at which a
             changed order leaves a rate as it is. In place of a number the name of a state, input, condition or output,
-            or several: the largest magnitude (of several as of a vector) in the base's fit, to three digits, which
-            `diagnose` fills in; elsewhere it is 1.
+            or several: the largest magnitude (of several the vector's) in the base's fit, to three digits, which
+            `diagnose` fills in; elsewhere, as in `extend`, it is 1.
         time: Unit of time that the units of its parameters are in, to be held against the recording's.
 
     Raises:
@@ -203,6 +203,8 @@ class Term:
                     f"Expected expected={{{own!r}: (value, sd)}} of the term {name!r}, finite, with sd > 0. Got "
                     f"{known!r}."
                 )
+        if time is not None and not (isinstance(time, str) and time):
+            raise DomainError(f"Expected time as the name of a unit or None for the term {name!r}. Got {time!r}.")
         for own, given in (constants or {}).items():
             several = isinstance(given, Sequence) and given and all(isinstance(one, str) and one for one in given)
             if own in names or not (_is_finite(given) or several):
@@ -244,10 +246,14 @@ class Term:
         added = name in (self.full(q.name) for q in self.parameters)
         return added or any(is_value_of(name, freed) for freed in self.frees)
 
+    @property
+    def numbers(self) -> dict[str, float]:
+        """Its constants; 1 for those that nobody has measured."""
+        return {name: value if isinstance(value, float) else 1.0 for name, value in self.constants.items()}
+
     def own(self, p: Mapping[str, Any]) -> dict[str, Any]:
         """``p`` as the term's functions see it."""
-        numbers = {name: value if isinstance(value, float) else 1.0 for name, value in self.constants.items()}
-        return _Own(p, numbers | {parameter.name: p[self.full(parameter.name)] for parameter in self.parameters})
+        return _Own(p, self.numbers | {parameter.name: p[self.full(parameter.name)] for parameter in self.parameters})
 
     def began(self, p: Mapping[str, Any]) -> Any:
         """When t began from which its functions count, on the recording's clock: 0 unless ``elapsed`` says otherwise.

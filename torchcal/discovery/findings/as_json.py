@@ -41,9 +41,10 @@ def text_of(path: str | os.PathLike[str]) -> str | None:
     try:
         with open(path, encoding="utf-8") as file:
             content = json.load(file)
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         return None
-    return str(content["text"]) if isinstance(content, dict) and content.get("kind") == "diagnosis" else None
+    text = content.get("text") if isinstance(content, dict) and content.get("kind") == "diagnosis" else None
+    return text if isinstance(text, str) else None
 
 
 def plain(value: Any) -> Any:

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.fits.trial import place_of
 
 __all__ = ["side_by_side"]
 
@@ -23,11 +24,13 @@ def side_by_side(problem: Problem, off: Tensor, aside: Tensor) -> list[str]:
         off: How far all data are off the fit that the verdict rests on, in noise sd, ``(n_total,)``.
         aside: Which of them were set aside, bool ``(n_total,)``.
     """
-    if problem.order is None or int(aside.sum()) < 2:
+    order = problem.order
+    if order is None or int(aside.sum()) < 2:
         return []
     problem = dataclasses.replace(problem, keep=problem.keep | aside)
     far, out = off[problem.index], aside[problem.index]
-    pairs = [pair for places in problem.sequences for pair in _pairs(places, far, out)]
+    at = order[problem.condition_of]  # of every used datum
+    pairs = [pair for places in problem.sequences for pair in _pairs(places, far, out, at)]
     if not pairs:
         return []
     above, below = (int((out & (far * sign > 0)).sum()) for sign in (1, -1))
@@ -37,21 +40,15 @@ def side_by_side(problem: Problem, off: Tensor, aside: Tensor) -> list[str]:
         return []
     first, second = max(pairs, key=lambda pair: float(far[list(pair)].abs().min()))
     return [
-        f"two that were set aside as outliers are neighbours, {_at(problem, first)} and {_at(problem, second)}, off by "
-        f"{float(far[first]):+.1f} and {float(far[second]):+.1f} noise sd: outliers are so by chance with a "
-        f"probability of {chance:.2g}. Something short may act there; repeat them, or record more densely there"
+        f"two that were set aside as outliers are neighbours, {place_of(problem, first)} and "
+        f"{place_of(problem, second)}, off by {float(far[first]):+.1f} and {float(far[second]):+.1f} noise sd: "
+        f"outliers are so by chance with a probability of {chance:.2g}. Something short may act there; repeat them, or "
+        "record more densely there"
     ]
 
 
-def _pairs(places: Tensor, far: Tensor, out: Tensor) -> list[tuple[int, int]]:
-    """Neighbours in a sequence that are both out, on the same side."""
+def _pairs(places: Tensor, far: Tensor, out: Tensor, at: Tensor) -> list[tuple[int, int]]:
+    """Neighbours in a sequence, and no replicates, that are both out, on the same side."""
     one, other = places[:-1], places[1:]
-    both = out[one] & out[other] & (far[one] * far[other] > 0)
+    both = out[one] & out[other] & (far[one] * far[other] > 0) & (at[one] != at[other])
     return list(zip(one[both].tolist(), other[both].tolist(), strict=True))
-
-
-def _at(problem: Problem, k: int) -> str:
-    x = problem.recording.x
-    name = "t" if problem.in_time else next(iter(x)) if isinstance(x, dict) else "x"
-    assert problem.order is not None
-    return f"at {name} = {float(problem.order[problem.condition_of[k]]):.4g}"

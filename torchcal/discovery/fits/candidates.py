@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.problem import Problem
-from torchcal.discovery.fits.ranges import sized, with_room
+from torchcal.discovery.fits.ranges import NOTHING, Scale, sized, with_room
 from torchcal.discovery.fits.shapes import driver_values, grid_of_shapes, lies_anywhere, shape_points
 from torchcal.discovery.fits.trial import check_repeats, place_of
 from torchcal.errors import SimulatorError
@@ -123,6 +123,7 @@ def replaces(problem: Problem, values: Tensor, term: Term) -> bool:
     p = {q.name: value for q, value in zip(problem.parameters, values, strict=True)}
     p |= {q.name: values.new_tensor(shape_points(q, 1)[0] if (at := neutral_of(q)) is None else at)
           for q in term.parameters}  # fmt: skip
+    p |= term.numbers
     y = problem.recording.spread.new_ones(problem.recording.n)
     try:
         return any(torch.equal(f(x, p, y) + 0 * y, f(x, p, 2 * y) + 0 * y) for f in term.outputs.values())
@@ -170,7 +171,7 @@ def spread_values(target: Problem, names: Sequence[str], values: Tensor) -> Tens
 
 
 def prepare(
-    base: Problem, found: Fitted, terms: Sequence[Term], fixed: Mapping[str, float], scale: Mapping[str, float]
+    base: Problem, found: Fitted, terms: Sequence[Term], fixed: Mapping[str, float], scale: Scale = NOTHING
 ) -> Candidate:
     """Extend the simulator by terms and take the tangents of their amplitudes at the base's fit.
 
@@ -268,5 +269,3 @@ def _hidden_amplitudes(
         if bool((torch.nan_to_num(jacobian).abs() > 0).any()):
             return [place]
     return [own[0]]
-
-

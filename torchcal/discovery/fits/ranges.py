@@ -1,10 +1,10 @@
 """Ranges in which shape parameters are sought that are measured on the scale of a driver."""
 
 import dataclasses
-import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
+from torch import Tensor
 
 from torchcal.data import Recording
 from torchcal.discovery.fits.fitting import Fitted
@@ -13,7 +13,7 @@ from torchcal.errors import DomainError
 from torchcal.simulators import Parameter
 from torchcal.terms import Term
 
-__all__ = ["drivers_scale", "sized", "with_room"]
+__all__ = ["NOTHING", "Scale", "drivers_scale", "sized", "with_room"]
 
 #: Range of a shape parameter measured on a driver's scale; on that of time it begins at a share of the usual gap
 #: between samples where that is less: lags and delays may be as fast as these show, however long the recording.
@@ -22,13 +22,38 @@ SCALE_RANGE, OF_A_GAP = (0.02, 1.0), 0.1
 WIDER = 4.0
 
 
-def drivers_scale(problem: Problem, found: Fitted) -> dict[str, float]:
+class Scale(dict[str, float]):
+    """Largest magnitudes by name, and what they are the largest of.
+
+    Args:
+        sizes: By name.
+        drivers: Values on the calibrated trajectory, all of one shape but what does not vary in it.
+    """
+
+    def __init__(self, sizes: Mapping[str, float], drivers: Mapping[str, Tensor]) -> None:
+        super().__init__(sizes)
+        self.drivers = drivers
+
+    def together(self, names: Sequence[str]) -> float:
+        """The largest length of the vector of several."""
+        if len(names) == 1:
+            return self[names[0]]
+        values = torch.broadcast_tensors(*(self.drivers[name] for name in names))
+        return float(torch.stack(values).square().sum(0).sqrt().max())
+
+
+#: For terms that measure nothing, or have been measured.
+NOTHING = Scale({}, {})
+
+
+def drivers_scale(problem: Problem, found: Fitted) -> Scale:
     """Largest magnitude of every driver and output on the calibrated trajectory; of time the longest run's length."""
-    scale = {
-        name: float(values.abs().max())
+    drivers = {
+        name: values
         for name, values in problem.drivers(found.values[None], found.warm).items()
         if bool(torch.isfinite(values).all())
     }
+    scale = Scale({name: float(values.abs().max()) for name, values in drivers.items()}, drivers)
     if "t" in scale and problem.recording.runs:
         scale["t"] = max(float(run.time[-1] - run.time[0]) for run in problem.recording.runs)
     for number, name in enumerate(problem.recording.outputs):
@@ -36,7 +61,7 @@ def drivers_scale(problem: Problem, found: Fitted) -> dict[str, float]:
     return scale
 
 
-def sized(term: Term, scale: Mapping[str, float], recording: Recording) -> Term:
+def sized(term: Term, scale: Scale, recording: Recording) -> Term:
     """The term with bounds for the shape parameters, and numbers for the constants, that it measures on a scale.
 
     Raises:
@@ -47,12 +72,13 @@ def sized(term: Term, scale: Mapping[str, float], recording: Recording) -> Term:
         raise DomainError(
             f"Expected the term {term.name!r} to take the effect of one of the inputs {inputs}. Got {term.takes!r}."
         )
+    if "t" in scale and term.elapsed == "recording":
+        times = [run.time for run in recording.runs or ()]
+        length = float(max(time[-1] for time in times) - min(time[0] for time in times))
+        scale = Scale({**scale, "t": length}, scale.drivers)
     term = _with_numbers(term, scale)
     if not term.scales:
         return term
-    if "t" in scale and term.elapsed == "recording":
-        times = [run.time for run in recording.runs or ()]
-        scale = {**scale, "t": float(max(time[-1] for time in times) - min(time[0] for time in times))}
     steps = [run.time.diff() for run in recording.runs or () if len(run.time) > 1]
     gaps = [float(torch.cat(steps).median())] if steps else []
     parameters = []
@@ -76,7 +102,7 @@ def sized(term: Term, scale: Mapping[str, float], recording: Recording) -> Term:
     return dataclasses.replace(term, parameters=tuple(parameters))
 
 
-def _with_numbers(term: Term, scale: Mapping[str, float]) -> Term:
+def _with_numbers(term: Term, scale: Scale) -> Term:
     """The term with numbers for its constants, which its formula tells."""
     numbers = {}
     for name, drivers in term.constants.items():
@@ -88,7 +114,7 @@ def _with_numbers(term: Term, scale: Mapping[str, float]) -> Term:
                 f"Expected the term {term.name!r} to measure {name!r} on the scale of some of {list(scale)}. Got "
                 f"{unknown[0]!r}."
             )
-        numbers[name] = float(f"{math.hypot(*(scale[driver] for driver in drivers)) or 1.0:.3g}")
+        numbers[name] = float(f"{scale.together(drivers) or 1.0:.3g}")
     if not numbers:
         return term
     told = "".join(f", {name} = {value:g}" for name, value in numbers.items())
@@ -114,5 +140,3 @@ def with_room(sought: Parameter, given: Parameter) -> Parameter:
     low = low if given.low is None else max(low, given.low)
     high = high if given.high is None else min(high, given.high)
     return dataclasses.replace(sought, low=low, high=high)
-
-

@@ -45,19 +45,20 @@ def warn_if_long(problem: Problem, values: Tensor) -> None:
     Warns:
         TorchcalWarning: If that is long.
     """
-    if not isinstance(problem.simulator, ExternalSimulator):
+    simulator = problem.simulator.extended[0] if problem.simulator.extended else problem.simulator
+    if not isinstance(simulator, ExternalSimulator):
         return
     begun = time.perf_counter()
     problem.evaluate(values[None], [])
     seconds = time.perf_counter() - begun
     few, many = (count * seconds for count in EVALUATIONS)
     if few > LONG:
+        spread = "" if simulator.executor is not None else ", or spread the runs (executor= of the simulator)"
         warn(
             f"The simulator takes {seconds:.2g} s at all {problem.recording.n} conditions, and a diagnosis evaluates "
             f"it {EVALUATIONS[0]:,} to {EVALUATIONS[1]:,} times: that is {_span(few)} to {_span(many)}. Build a "
             "surrogate of it over the conditions and all parameters, the dormant ones too, and diagnose that "
-            "(torchcal.build_surrogate, with points= where they are many), or spread the runs (executor= of the "
-            "simulator).",
+            f"(torchcal.build_surrogate, with points= where they are many){spread}.",
             TorchcalWarning,
         )
 
@@ -78,10 +79,11 @@ def warn_if_coarse(problem: Problem) -> None:
     simulator, noise = problem.simulator, problem.recording.noise
     if not isinstance(simulator, PolynomialSurrogate) or simulator.error is None or not isinstance(noise, Tensor):
         return
-    rms = dict(zip(simulator.error.outputs, simulator.error.rms.tolist(), strict=True))
+    names = simulator.error.outputs if simulator.outputs is not None else problem.recording.outputs  # or it has no name
+    rms = dict(zip(names, simulator.error.rms.tolist(), strict=True))
     sizes = {name: float(values[values.isfinite()].median())
              for name, values in problem.recording.split(noise).items()}  # fmt: skip
-    large = [name for name, size in sizes.items() if rms.get(name, 0.0) > COARSE * size]
+    large = [name for name, size in sizes.items() if name in rms and rms[name] > COARSE * size]
     if large:
         listed = ", ".join(f"{name!r}: {rms[name]:.2g} of a noise sd of {sizes[name]:.2g}" for name in large)
         warn(

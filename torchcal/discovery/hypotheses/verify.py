@@ -96,11 +96,7 @@ def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None
             middle = 0.5 * (columns.amax(0) + columns.amin(0))
             half = 0.5 * (columns.amax(0) - columns.amin(0)).clamp_min(1e-300)
             distance = ((columns - middle) / half).square().sum(-1)
-        distance = torch.where(seen, distance, torch.full_like(distance, -math.inf))
-        count = max(1, int(share * int(seen.sum())))
-        mask = torch.zeros(recording.n, dtype=torch.bool)
-        mask[distance.argsort(descending=True, stable=True)[:count]] = True
-        mask = _together(recording, mask)
+        mask = _farthest(distance, _levels(recording), seen, max(1, int(share * int(seen.sum()))))
     return mask.repeat(len(recording.outputs))
 
 
@@ -131,7 +127,10 @@ def within(recording: Recording) -> Tensor:
             mask[_blocks(mine[x["time"][mine].argsort(stable=True)])] = True
     else:
         level = _levels(recording)
-        mask = seen & torch.isin(level, _blocks(level[seen].unique()))
+        blocks = _blocks(level[seen].unique())
+        mask = seen & torch.isin(level, blocks)
+        if not len(blocks):  # at two conditions replicates are all that there is
+            mask[_blocks(seen.nonzero()[:, 0])] = True
     return mask.repeat(len(recording.outputs))
 
 
@@ -145,14 +144,20 @@ def _levels(recording: Recording) -> Tensor:
     return recording.columns.unique(dim=0, return_inverse=True)[1]  # type: ignore[no-any-return]
 
 
-def _together(recording: Recording, mask: Tensor) -> Tensor:
-    """A choice of rows, bool ``(n,)``, by which data at the same conditions stay together: they go with most of them.
+def _farthest(distance: Tensor, level: Tensor, seen: Tensor, count: int) -> Tensor:
+    """The farthest of the rows that are seen, bool ``(n,)``: up to so many, all of a condition or none of them.
 
-    A fit has seen what is held out where it has seen replicates of it.
+    A fit has seen what is held out where it has seen replicates of it; only where one condition alone has more than
+    that, some of them go.
     """
-    level = _levels(recording)
-    whole = (2 * torch.bincount(level[mask], minlength=int(level.max()) + 1) > torch.bincount(level))[level]
-    return whole if bool(whole.any()) else mask
+    sizes = torch.bincount(level[seen], minlength=int(level.max()) + 1)
+    farness = torch.zeros(len(sizes), dtype=distance.dtype).index_copy_(0, level, distance)
+    order = torch.where(sizes > 0, farness, -math.inf).argsort(descending=True, stable=True)
+    whole = order[sizes[order].cumsum(0) <= count]
+    mask = torch.isin(level, whole) & seen
+    if not bool(mask.any()):
+        mask[((level == order[0]) & seen).nonzero()[:count, 0]] = True
+    return mask
 
 
 @dataclass(frozen=True, eq=False)

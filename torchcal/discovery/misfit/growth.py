@@ -104,7 +104,8 @@ def _in_runs(problem: Problem, residual: Tensor, unit: Tensor, parts: list[Tenso
     """An output's noise, in a unit ``(n_total,)``, as it differs from run to run, ``(n_total,)``, and by how much that
     is likelier; 1 and 0 where all runs may be alike.
 
-    Runs are held against those that are sampled as fast.
+    Runs are held against those that are sampled as fast; those of one rate together are taken to be as noisy as those
+    of another, as differences of neighbours depend on the rate too where noise goes on.
     """
     factor, run_of = torch.ones_like(unit), problem.recording.x["run"].repeat(len(problem.recording.outputs))  # type: ignore[index]
     long = sorted((p for p in parts if len(p) >= FEWEST), key=lambda p: float(problem.steps(p).median()))
