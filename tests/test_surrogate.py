@@ -738,7 +738,7 @@ def test_a_diagnosis_says_how_long_a_slow_simulation_will_take(monkeypatch):
     x = torch.linspace(0, 1, 12, dtype=torch.float64)
     y = 2 * x + 0.1 * torch.sin(40 * x)
     with warnings.catch_warnings():  # what the first call takes is no measure
-        warnings.simplefilter("error")
+        warnings.simplefilter("error", TorchcalWarning)
         model, recording = ExternalSimulator(begins_slowly, [A]), Recording(x=x, y=y, noise=0.1)
         diagnose(model, recording, holdout=False, num_starts=2, progress=False)
     monkeypatch.setattr(trial, "LONG", 0.0)
@@ -749,6 +749,6 @@ def test_a_diagnosis_says_how_long_a_slow_simulation_will_take(monkeypatch):
     with pytest.warns(TorchcalWarning, match="1,000 to 10,000 times"):
         diagnose(more, Recording(x=x, y=y, noise=0.1), holdout=False, num_starts=2, progress=False)
     with warnings.catch_warnings():  # what is written in torch is evaluated in batches
-        warnings.simplefilter("error")
+        warnings.simplefilter("error", TorchcalWarning)
         diagnose(Simulator(lambda x, p: p["a"] * x, [A]), Recording(x=x, y=y, noise=0.1), holdout=False, progress=False)
     assert [trial._span(s) for s in (600.0, 9000.0, 4e5)] == ["10 min", "2 h", "5 days"]
