@@ -107,7 +107,7 @@ def captured(monkeypatch, calibrate, *arguments, **options):
 
     monkeypatch.setattr(sampling, "run_batched", batched)
     monkeypatch.setattr(sampling, "run_nuts", reference)
-    monkeypatch.setattr(module, "draw", draw)
+    monkeypatch.setattr(module, "draw_unless_interrupted", draw)
     with warnings.catch_warnings():
         # Two starts, which need not find the maximum: any point will do to compare densities around.
         warnings.simplefilter("ignore", ConvergenceWarning)

@@ -58,6 +58,7 @@ def test_another_thread_has_its_own():
     assert seen == [2]
 
 
+@pytest.mark.filterwarnings("ignore:Only 1 of 4 starts")  # as few may end a rounding apart
 @pytest.mark.parametrize("run", [tc.calibrate, tc.calibrate_additive, tc.diagnose])
 def test_the_functions_that_compute_for_long_take_one(run):
     seen = set()
