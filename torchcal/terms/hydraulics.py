@@ -51,8 +51,8 @@ def hydraulics(
         outlet: Parameter of the model that multiplies the discharge: adds its exponent and its clogging.
         downstream: State of the level of a tank of equal area below: what bypasses this tank arrives there.
         reference: Level at which a changed discharge exponent leaves the discharge as it is, > 0; by default the
-            highest in the base's fit, which `diagnose` finds: by
-            hand give one. It is the same in all runs, as the coefficient is.
+            highest in the base's fit, which `diagnose` finds (by hand give one). It is the same in all runs, as the
+            coefficient is.
         label: Added to the names of the terms, where several tanks need them.
         length: Unit of the level, for reports.
         time: Unit of time, for reports.

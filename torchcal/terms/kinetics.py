@@ -47,8 +47,8 @@ def kinetics(
         log_rate: Whether that parameter is the logarithm of the rate constant.
         temperature: Input, state or parameter that is the absolute temperature in K.
         reference: Concentration at which a changed order leaves the rate as it is, > 0; by default the largest in
-            the base's fit, which `diagnose` finds: by
-            hand give one. It is the same in all runs, as the rate constant is.
+            the base's fit, which `diagnose` finds (by hand give one). It is the same in all runs, as the rate constant
+            is.
         reference_temperature: The same for the temperature, K.
         label: Added to the names of the terms, where several reactions need them.
         amount: Unit of the concentrations, for reports.

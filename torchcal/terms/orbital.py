@@ -67,8 +67,8 @@ def orbital(
         body: Where the third body is, relative to the centre: names of inputs, or a function of t that returns the
             coordinates. Without it the tide of a distant body in a fixed direction of the x-y plane is taken.
         reference: Distance at which a changed exponent of gravity leaves the force as it is; by default the largest
-            in the base's fit, which `diagnose` finds: by
-            hand give one. It is the same in all runs, as the gravitational parameter is.
+            in the base's fit, which `diagnose` finds (by hand give one). It is the same in all runs, as the
+            gravitational parameter is.
         label: Added to the names of the terms, where several bodies need them.
         length: Unit of the positions, for reports.
         time: Unit of time, for reports.

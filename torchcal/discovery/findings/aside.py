@@ -2,11 +2,11 @@
 
 import dataclasses
 
-import torch
 from torch import Tensor
 
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.trial import place_of
+from torchcal.discovery.misfit.outliers import chance_of_pairs
 
 __all__ = ["side_by_side"]
 
@@ -15,9 +15,7 @@ CHANCE = 0.05
 
 
 def side_by_side(problem: Problem, off: Tensor, aside: Tensor) -> list[str]:
-    """Outliers that are neighbours in an order, and on the same side, though outliers do not know of each other.
-
-    Of a above and b below among m data, as many are as a Poisson variable with a mean of (a (a - 1) + b (b - 1)) / m.
+    """Outliers that are neighbours in an order, and on the same side, where that is hardly chance (`chance_of_pairs`).
 
     Args:
         problem: The used data.
@@ -34,8 +32,7 @@ def side_by_side(problem: Problem, off: Tensor, aside: Tensor) -> list[str]:
     if not pairs:
         return []
     above, below = (int((out & (far * sign > 0)).sum()) for sign in (1, -1))
-    mean = (above * (above - 1) + below * (below - 1)) / problem.n
-    chance = float(torch.special.gammainc(torch.tensor(float(len(pairs))), torch.tensor(mean)))
+    chance = chance_of_pairs(len(pairs), above, below, problem.n)
     if chance >= CHANCE:
         return []
     first, second = max(pairs, key=lambda pair: float(far[list(pair)].abs().min()))

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.misfit.curves import smooth_columns
 
-__all__ = ["lone", "spikes"]
+__all__ = ["chance_of_pairs", "lone", "spikes"]
 
 #: A sample that leaves its neighbours' range by more than this many robust sd, alone or with one beside it, is one.
 SPIKE = 4.5
@@ -243,16 +243,26 @@ def _clustered(problem: Problem, places: Tensor, high: Tensor, r: Tensor) -> boo
 
 def _in_a_row(column: Tensor, high: Tensor, r: Tensor, chance: float) -> bool:
     """Whether more data that stick out to one side follow each other along a condition than by chance of less than
-    this: of a above and b below among m, as many as a Poisson variable with a mean of
-    (a (a - 1) + b (b - 1)) `BESIDE` / m."""
+    this (`chance_of_pairs`)."""
     m = len(column)
     if 2 * len(column.unique()) < m:
         return False
     order = column.argsort(stable=True)
     at, side = high[order].nonzero()[:, 0], r[order][high[order]].sign()
-    pairs = ((at.diff() <= BESIDE) & (side.diff() == 0)).sum().double()
-    mean = BESIDE * sum(c * (c - 1) for c in ((side > 0).sum(), (side < 0).sum())) / torch.tensor(m).double()
-    return bool(pairs > 0) and float(torch.special.gammainc(pairs, mean)) < chance
+    pairs = int(((at.diff() <= BESIDE) & (side.diff() == 0)).sum())
+    return chance_of_pairs(pairs, int((side > 0).sum()), int((side < 0).sum()), m, BESIDE) < chance
+
+
+def chance_of_pairs(pairs: int, above: int, below: int, m: int, beside: int = 1) -> float:
+    """Probability that so many or more pairs of data that stick out to one side lie at most ``beside`` places apart.
+
+    Outliers do not know of each other: of a above and b below among m, as many do as a Poisson variable with a mean of
+    (a (a - 1) + b (b - 1)) ``beside`` / m.
+    """
+    if pairs == 0:
+        return 1.0
+    mean = torch.tensor(beside * (above * (above - 1) + below * (below - 1)) / m, dtype=torch.float64)
+    return float(torch.special.gammainc(torch.tensor(pairs, dtype=torch.float64), mean))
 
 
 def _one_level(column: Tensor, high: Tensor, chance: float) -> bool:
