@@ -92,6 +92,7 @@ def test_what_is_likely_beside_a_name_is_listed():
     assert sorted(map(sorted, d.tied)) == [["age"], ["age", "cube"], ["age", "root"], ["age", "square"]]
     assert 0.0 < d.remaining < 0.05
     words = str(d).replace("\n", " ")
+    assert words.startswith("Verdict: named: age (most likely with ")
     assert "probability alone or with others 0.9" in words
     assert "Something else acts beside it with a probability of 0.9" in words
     assert d.experiment is None or d.experiment.description in words

@@ -12,6 +12,7 @@ import torchcal as tc
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.ranges import Scale, drivers_scale, sized
 from torchcal.discovery.hypotheses.base import calibrate_base
+from torchcal.discovery.hypotheses.search import Search
 from torchcal.errors import DomainError, UnitWarning
 
 F64 = torch.float64
@@ -84,8 +85,28 @@ def test_constants_are_measured_on_what_the_base_does():
     assert sized(term(c="none"), scale, recording).constants == {"c": 1.0}
     assert sized(term(c=2), scale, recording).constants == {"c": 2.0}
     assert term(c="x").own({"power.q": 1.0})["c"] == 1.0
-    with pytest.raises(DomainError, match="'z'"):
-        sized(term(c="z"), scale, recording)
+
+
+@pytest.mark.parametrize("given", [{"constants": {"c": "z"}}, {"constants": {"c": ("x", "z")}}, {"scales": {"q": "z"}}])
+@pytest.mark.parametrize("static", [False, True])
+def test_what_a_term_is_measured_on_is_there_before_any_long_work(monkeypatch, given, static):
+    def calibrated(search):
+        raise AssertionError("the base was calibrated before the names were looked at")
+
+    monkeypatch.setattr(Search, "calibrate_base", calibrated)
+    parameters = [tc.Parameter("k", initial=1.0)]
+    x = torch.arange(10.0, dtype=torch.float64)
+    if static:
+        model, recording = tc.Simulator(lambda x, p: p["k"] * x, parameters), tc.Recording(x={"x": x}, y=2 * x)
+        parts = {"outputs": {"y": lambda x, p, y: y + p["q"]}}
+    else:
+        model = tc.ODESimulator(lambda t, s, p, u: {"x": -p["k"] * s["x"] + u["f"]}, {"x": None}, parameters)
+        recording = tc.Recording(runs=[tc.Run(x, {"x": x}, inputs={"f": x})])
+        parts = {"equation": "x", "rate": lambda t, s, p, u: p["q"]}
+    term = tc.Term("power", parameters=[tc.Parameter("q")], **parts, **given)
+    known = r"\['x', 'y'\]" if static else r"\['t', 'x', 'f'\]"
+    with pytest.raises(DomainError, match=rf"scale of some of {known}. Got 'z'"):
+        tc.diagnose(model, recording, [term], seed=0, progress=False)
 
 
 @pytest.mark.parametrize("given", [{"q": 1.0}, {"c": math.nan}, {"c": True}, {"c": ()}, {"c": ""}, {"c": None}])

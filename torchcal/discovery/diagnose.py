@@ -17,6 +17,7 @@ from torchcal.discovery.findings.result import Diagnosis
 from torchcal.discovery.fits.candidates import base_columns
 from torchcal.discovery.fits.fitting import Fitted, starts
 from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.fits.ranges import check_measured
 from torchcal.discovery.fits.trial import check_repeats, warn_if_coarse, warn_if_long
 from torchcal.discovery.hypotheses import verify
 from torchcal.discovery.hypotheses.own_noise import explains
@@ -123,6 +124,7 @@ def diagnose(
         if unknown and not isinstance(simulator, ODESimulator):  # which knows its outputs' names itself
             raise DomainError(f"Expected the term {term.name!r} on outputs of {recording.outputs}. Got {unknown}.")
         extend(simulator, [term])  # raises for names that do not fit, before any long work
+        check_measured(problem, term)
     _compare_times(recording, terms)
     mask = verify.choose(recording, holdout, len(free))
     warn_if_coarse(problem)

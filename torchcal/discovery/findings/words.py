@@ -3,7 +3,16 @@
 import textwrap
 from typing import Any
 
-from torchcal.discovery.findings.called import LISTED, called, chance, joined, rmse_unit, unknown_share, with_region
+from torchcal.discovery.findings.called import (
+    LISTED,
+    called,
+    chance,
+    holds_named,
+    joined,
+    rmse_unit,
+    unknown_share,
+    with_region,
+)
 from torchcal.discovery.findings.named_in_words import named
 from torchcal.discovery.findings.unnamed_in_words import ambiguous, consistent, likelier, unexplained
 from torchcal.display import NONE
@@ -45,7 +54,7 @@ def _headline(d: Any) -> str:
         told = "nothing is surely missing" if sign else "nothing is missing that these data could show"
         return f"Verdict: consistent ({told})"
     if d.verdict == "named":
-        return f"Verdict: named: {joined([with_region(d, name) for name in d.terms])}"
+        return f"Verdict: named: {joined([with_region(d, name) for name in d.terms])}{_company(d)}"
     if d.verdict == "ambiguous":
         known = [tied for tied in d.tied if tuple(tied) != NONE]
         if len(known) == 1 and unknown_share(d) < LISTED:
@@ -56,6 +65,22 @@ def _headline(d: Any) -> str:
         choices += [called(d, NONE)] if len(known) < len(d.tied) else []
         return "Verdict: ambiguous: " + ", or ".join(choices)
     return "Verdict: unexplained (something is missing that is not in this library)"
+
+
+def _company(d: Any) -> str:
+    """What is named is seldom alone, where the hypotheses that add more to it are likelier: with what."""
+    shares: dict[frozenset[str], float] = {}
+    for row in d.ranking:
+        if holds_named(d, row):
+            shares[frozenset(row.terms)] = shares.get(frozenset(row.terms), 0.0) + row.probability
+    alone = shares.get(frozenset(d.terms), 0.0)
+    total = sum(shares.values())
+    if total - alone <= alone:
+        return ""
+    largest = max(shares, key=lambda names: shares[names])
+    more = [name for row in d.ranking if frozenset(row.terms) == largest for name in row.terms if name not in d.terms]
+    told = joined(list(dict.fromkeys(more))) if shares[largest] > 0.5 * total else "something else of this library"
+    return f" (most likely with {told})"
 
 
 def _detected(d: Any) -> str:

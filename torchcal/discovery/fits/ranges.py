@@ -10,10 +10,10 @@ from torchcal.data import Recording
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.problem import Problem
 from torchcal.errors import DomainError
-from torchcal.simulators import Parameter
+from torchcal.simulators import Parameter, Trajectories
 from torchcal.terms import Term
 
-__all__ = ["NOTHING", "Scale", "drivers_scale", "sized", "with_room"]
+__all__ = ["NOTHING", "Scale", "check_measured", "drivers_scale", "sized", "with_room"]
 
 #: Range of a shape parameter measured on a driver's scale; on that of time it begins at a share of the usual gap
 #: between samples where that is less: lags and delays may be as fast as these show, however long the recording.
@@ -61,17 +61,38 @@ def drivers_scale(problem: Problem, found: Fitted) -> Scale:
     return scale
 
 
-def sized(term: Term, scale: Scale, recording: Recording) -> Term:
-    """The term with bounds for the shape parameters, and numbers for the constants, that it measures on a scale.
+def check_measured(problem: Problem, term: Term) -> None:
+    """Raise if a term names a driver, an output or an input that there is not.
 
     Raises:
-        DomainError: If it names a driver or an input that there is not.
+        DomainError: If it does.
     """
+    recording, bound = problem.recording, problem.simulator
     inputs = list(recording.runs[0].inputs) if recording.runs else []
     if term.takes is not None and term.takes not in inputs:
         raise DomainError(
             f"Expected the term {term.name!r} to take the effect of one of the inputs {inputs}. Got {term.takes!r}."
         )
+    if isinstance(bound, Trajectories):
+        conditions = ["t", *bound.ode.states, *inputs]
+    elif problem.in_time:
+        conditions = ["t"]
+    else:
+        conditions = list(recording.x) if isinstance(recording.x, dict) else ["x"]
+    known = list(dict.fromkeys([*conditions, *recording.outputs]))
+    drivers: dict[str, tuple[str, ...]] = {name: (driver,) for name, driver in term.scales.items()}
+    for name, given in term.constants.items():
+        drivers[name] = (given,) if isinstance(given, str) else given if isinstance(given, tuple) else ()
+    for name, several in drivers.items():
+        if unknown := [driver for driver in several if driver not in known]:
+            raise DomainError(
+                f"Expected the term {term.name!r} to measure {name!r} on the scale of some of {known}. Got "
+                f"{unknown[0]!r}."
+            )
+
+
+def sized(term: Term, scale: Scale, recording: Recording) -> Term:
+    """The term with bounds for the shape parameters, and numbers for the constants, that it measures on a scale."""
     if "t" in scale and term.elapsed == "recording":
         times = [run.time for run in recording.runs or ()]
         length = float(max(time[-1] for time in times) - min(time[0] for time in times))
@@ -87,11 +108,6 @@ def sized(term: Term, scale: Scale, recording: Recording) -> Term:
         if driver is None or (parameter.low is not None and parameter.high is not None):
             parameters.append(parameter)
             continue
-        if driver not in scale:
-            raise DomainError(
-                f"Expected the term {term.name!r} to measure {parameter.name!r} on the scale of one of "
-                f"{list(scale)}. Got {driver!r}."
-            )
         size = scale[driver] or 1.0
         low, high = (part * size for part in SCALE_RANGE)
         if driver == "t":
@@ -109,11 +125,6 @@ def _with_numbers(term: Term, scale: Scale) -> Term:
         if isinstance(drivers, float):
             continue
         drivers = (drivers,) if isinstance(drivers, str) else drivers
-        if unknown := [driver for driver in drivers if driver not in scale]:
-            raise DomainError(
-                f"Expected the term {term.name!r} to measure {name!r} on the scale of some of {list(scale)}. Got "
-                f"{unknown[0]!r}."
-            )
         numbers[name] = float(f"{scale.together(drivers) or 1.0:.3g}")
     if not numbers:
         return term
