@@ -1,6 +1,7 @@
 """Experiments that are proposed where hypotheses are tied: which there are, and when more samples are asked for."""
 
 import dataclasses
+import math
 import re
 from types import SimpleNamespace
 
@@ -9,6 +10,7 @@ import torch
 
 import torchcal as tc
 from torchcal.discovery.findings import conditions, experiment
+from torchcal.discovery.findings.feasible import Feasible
 from torchcal.discovery.fits.fitting import fit
 from torchcal.discovery.fits.problem import Problem
 from torchcal.simulators import Trajectories
@@ -34,7 +36,7 @@ def test_denser_samples_lie_between_the_others_and_inputs_hold_as_they_did(hold)
 
 def test_static_options_keep_to_what_they_say_and_to_positive_conditions():
     x = {"dose": torch.logspace(-2, 2, 30, dtype=F64), "shift": torch.linspace(-1, 1, 30, dtype=F64)}
-    options = conditions._static(tc.Recording(x=x, y=torch.zeros(30, dtype=F64)))
+    options = conditions._static(tc.Recording(x=x, y=torch.zeros(30, dtype=F64)), conditions.ANYWHERE)
     texts = [text for text, _, _ in options]
     assert texts[0] == "the same conditions again"
     assert len(texts) == len(set(texts)) == 11
@@ -50,7 +52,8 @@ def test_static_options_keep_to_what_they_say_and_to_positive_conditions():
 
 
 def rivals():
-    """An offset and a signal in proportion to a small dose: apart only far below the doses recorded."""
+    """Base, recording and terms: an offset, and a signal in proportion to a small dose, apart only far below the doses
+    recorded."""
     base = tc.Simulator(
         lambda x, p: p["top"] * x["dose"] / (1.0 + x["dose"]),
         parameters=[tc.Parameter("top", low=0.1, high=5.0)],
@@ -61,15 +64,14 @@ def rivals():
         outputs={"y": lambda x, p, y: y + p["b"] * x["dose"] / (0.02 + x["dose"])},
         parameters=[tc.Parameter("b")],
     )
-    return base, [offset, steep]
-
-
-def test_the_condition_at_which_the_models_differ_is_proposed_and_more_samples_where_they_hardly_do():
-    base, terms = rivals()
     g = torch.Generator().manual_seed(4)
     dose = torch.logspace(-0.7, 2, 60, dtype=F64)
     y = 2 * dose / (1 + dose) + 0.1 + 0.02 * torch.randn(60, generator=g, dtype=F64)
-    d = tc.diagnose(base, tc.Recording(x={"dose": dose}, y=y, noise=0.02), terms, seed=0, progress=False)
+    return base, tc.Recording(x={"dose": dose}, y=y, noise=0.02), [offset, steep]
+
+
+def test_the_condition_at_which_the_models_differ_is_proposed_and_more_samples_where_they_hardly_do():
+    d = tc.diagnose(*rivals(), seed=0, progress=False)
     assert d.verdict == "ambiguous"
     assert "dose below" in d.experiment.description
     assert ("each 4 times" in d.experiment.description) == (len(d.experiment.conditions["x"]["dose"]) == 240)
@@ -238,7 +240,7 @@ def test_multiples_of_a_state_of_rest_are_no_experiments():
 
 def test_bolder_conditions_go_further_and_two_move_together_without_going_together():
     x = {"dose": torch.logspace(-2, 2, 30, dtype=F64), "shift": torch.linspace(-1, 1, 30, dtype=F64)}
-    options = conditions._static_bolder(tc.Recording(x=x, y=torch.zeros(30, dtype=F64)))
+    options = conditions._static_bolder(tc.Recording(x=x, y=torch.zeros(30, dtype=F64)), conditions.ANYWHERE)
     assert len({text for text, _, _ in options}) == len(options) == 8
     (far,) = [chosen["x"] for text, _, chosen in options if text.startswith("conditions with shift above")]
     assert float(far["shift"].max()) == pytest.approx(4.0)
@@ -346,3 +348,80 @@ def test_what_each_run_has_for_itself_is_unknown_in_a_new_one():
     assert same < 1e-6
     known = dataclasses.replace(found, free=[2], jacobian=found.jacobian[:, 2:])
     assert experiment._predict(known, blank)[1].shape == (20, 1)
+
+
+# --- what can be done ----------------------------------------------------------------------------------------------
+
+
+def test_static_experiments_stay_within_what_is_feasible_and_go_up_to_its_ends():
+    x = {"T": torch.linspace(290, 320, 30, dtype=F64), "dose": torch.linspace(1, 2, 30, dtype=F64)[_order(30)]}
+    recording = tc.Recording(x=x, y=torch.zeros(30, dtype=F64))
+    model = SimpleNamespace(problem=SimpleNamespace(in_time=False, recording=recording))
+    feasible = Feasible.of({"T": (285.0, 320.0), "dose": (None, 2.2)}, None, recording)
+    options = [*conditions.simple(model, feasible), *conditions.bolder(model, feasible)]
+    assert options
+    for text, new, chosen in options:
+        assert torch.equal(new.x["T"], chosen["x"]["T"])
+        assert 285.0 <= float(new.x["T"].min()) <= float(new.x["T"].max()) <= 320.0
+        assert float(new.x["dose"].max()) <= 2.2 + 1e-9
+        assert "T above" not in text
+    texts = [text for text, _, _ in options]
+    assert "conditions with T below the recorded range, to 285" in texts
+    assert "conditions with dose above the recorded range, to 2.2" in texts
+    assert any(float(new.x["dose"].min()) < 0.9 for _, new, _ in options)  # that end is open
+
+
+def _order(n):
+    return torch.randperm(n, generator=torch.Generator().manual_seed(0))
+
+
+def test_runs_stay_within_what_is_feasible_and_are_tried_at_its_ends():
+    model = driven({"x": 0.5, "v": 0.0})
+    recording = model.problem.recording
+    given = {"x": (0.0, 1.2), "f": (-2.0, 2.0), "t": (None, 6.0)}
+    feasible = Feasible.of(given, model.problem.simulator.ode, recording)
+    assert not feasible.allows(tc.Recording(runs=[_begun(recording, 1.3)]))
+    options = [*conditions.simple(model, feasible), *conditions.bolder(model, feasible)]
+    for _, new, chosen in options:
+        assert 0.0 <= chosen["initial"]["x"] <= 1.2
+        assert float(new.runs[0].inputs["f"].abs().max()) <= 2.0
+        assert float(new.runs[0].time[-1]) <= 6.0
+    found = {text: chosen for text, _, chosen in options}
+    assert "a run that starts from 2 times the initial states of the first" in found
+    assert "a run that starts from 3 times the initial states of the first" not in found
+    assert not [text for text in found if ("twice" in text and "fast" not in text) or "three times" in text]
+    assert found["a run that starts from x = 1.2, all else as in the first"]["initial"] == {"x": 1.2, "v": 0.0}
+    assert found["a run with f held at -2"]["inputs"]["f"].unique().tolist() == [-2.0]
+
+
+def _begun(recording, x):
+    first = recording.runs[0]
+    return tc.Run(first.time, first.outputs, inputs=first.inputs, initial={"x": x, "v": 0.0})
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"z": (0, 1)}, r"some of \['t', 'x', 'v', 'f'\].*Got 'z'"),
+        ({"x": (2, 1)}, r"low <= high.*Got \(2, 1\)"),
+        ({"x": 3.0}, r"'x': \(low, high\).*Got 3.0"),
+        ({"x": ("a", None)}, r"'x': \(low, high\)"),
+        ({"x": (math.nan, 1)}, r"'x': \(low, high\)"),
+        ([("x", (0, 1))], r"feasible=\{name"),
+    ],
+)
+def test_what_is_feasible_is_told_in_ranges_of_what_can_be_chosen(given, told):
+    model = driven({"x": 0.5, "v": 0.0})
+    with pytest.raises(tc.errors.DomainError, match=told):
+        tc.diagnose(model.problem.simulator.ode, model.problem.recording, feasible=given, progress=False)
+
+
+def test_a_diagnosis_proposes_what_is_feasible():
+    base, recording, terms = rivals()
+    free = tc.diagnose(base, recording, terms, seed=0, progress=False)
+    assert free.verdict == "ambiguous"
+    assert float(free.experiment.conditions["x"]["dose"].min()) < 0.5 * float(recording.x["dose"].min())
+    low = float(recording.x["dose"].min())
+    kept = tc.diagnose(base, recording, terms, seed=0, progress=False, feasible={"dose": (low, None)})
+    assert kept.tied == free.tied
+    assert kept.experiment is None or float(kept.experiment.conditions["x"]["dose"].min()) >= low

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchcal.data import Recording
 from torchcal.discovery.findings.aside import side_by_side
 from torchcal.discovery.findings.experiment import propose
+from torchcal.discovery.findings.feasible import Feasible
 from torchcal.discovery.findings.limits import limits
 from torchcal.discovery.findings.ranking import ranking
 from torchcal.discovery.findings.result import Diagnosis
@@ -50,6 +51,7 @@ class Asked:
         confidence: As in `diagnose`.
         seed: As in `diagnose`.
         begun: When, by ``time.perf_counter``.
+        feasible: Where a new experiment can be made.
     """
 
     simulator: Simulator
@@ -58,6 +60,7 @@ class Asked:
     confidence: float
     seed: int
     begun: float
+    feasible: Feasible
 
 
 def conclude(
@@ -142,7 +145,7 @@ def conclude(
         ),
         shifts=needed_shifts(places),
         missing=missing_rate(search, places),
-        experiment=propose(decision.tied_models, search.noise) if decision.tied_models else None,
+        experiment=propose(decision.tied_models, search.noise, asked.feasible) if decision.tied_models else None,
         equations=explain.formulas(best) if best else [],
         identifiability=explain.identifiability(search, best)
         + ([] if best is None else explain.other_minima(search, best))

@@ -13,6 +13,7 @@ from tqdm.auto import tqdm
 from torchcal.checks import as_seed, outside_inference_mode, whole
 from torchcal.data import Recording, same_unit
 from torchcal.discovery.conclude import Asked, conclude
+from torchcal.discovery.findings.feasible import Feasible
 from torchcal.discovery.findings.result import Diagnosis
 from torchcal.discovery.fits.candidates import base_columns
 from torchcal.discovery.fits.fitting import Fitted, starts
@@ -49,6 +50,7 @@ def diagnose(
     confidence: float = 0.99,
     max_terms: int = 3,
     num_starts: int = 12,
+    feasible: Mapping[str, tuple[float | None, float | None]] | None = None,
     seed: int = 0,
     executor: Executor | None = None,
     progress: bool = True,
@@ -73,6 +75,9 @@ def diagnose(
             simulated residuals tell no more.
         max_terms: Terms that may be missing together: 1, 2 or 3; more is taken for 3.
         num_starts: Starting values of the base's calibration.
+        feasible: Ranges ``{name: (low, high)}`` in which new experiments can be made, None for an open end: of
+            conditions, or in time of initial states, inputs and the clock, ``"t"``. What is not named may be anything
+            in the experiment that `Diagnosis.experiment` proposes.
         seed: Of every random number.
         executor: Any ``concurrent.futures.Executor``, on whose workers hypotheses are refitted; None refits them
             here. It pays where one refit takes seconds. Every term but one that only frees a parameter needs
@@ -102,7 +107,7 @@ def diagnose(
     max_terms, num_starts = whole("max_terms", max_terms, 1), whole("num_starts", num_starts, 1)
     seed = as_seed(seed)
     check_executor(executor, diagnose)
-    asked = Asked(simulator, recording, given, confidence, seed, begun)
+    asked = Asked(simulator, recording, given, confidence, seed, begun, Feasible.of(feasible, simulator, recording))
     terms = [term for term in given if not _contains(simulator, term)]
     problem = Problem.of(simulator, resolved(recording)).keeping(recording.observed_once)
     try:

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchcal.data import Recording, Run
+from torchcal.discovery.findings.feasible import Feasible
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.display import between, placed
 from torchcal.simulators import Trajectories
@@ -30,6 +31,9 @@ BEYOND, FAR_BEYOND = 0.5, 1.5
 MOST = 60
 #: Share of its largest value up to which a state begins at nothing, of which a multiple is nothing too.
 NOTHING = 0.01
+
+#: Where every experiment can be made.
+ANYWHERE = Feasible()
 
 Option = tuple[str, Recording, dict[str, Any]]
 """An experiment in words, a recording of it without data, and its conditions as `Experiment` holds them."""
@@ -75,15 +79,15 @@ def _counted(zero: Mapping[str, float]) -> str:
     return f" ({', '.join(told)})" if told else ""
 
 
-def simple(model: Fitted) -> list[Option]:
+def simple(model: Fitted, feasible: Feasible = ANYWHERE) -> list[Option]:
     """Experiments close to the recording.
 
-    Runs are repeated with other initial states, stronger or weaker inputs, both, or for longer; static conditions are
-    gathered in a third of their range, or moved just beyond it.
+    Runs are repeated with other initial states, stronger or weaker inputs, both, or for longer, or with one of them at
+    an end of what is feasible; static conditions are gathered in a third of their range, or moved just beyond it.
     """
     recording = model.problem.recording
     if not model.problem.in_time:
-        return _static(recording)
+        return _allowed(_static(recording, feasible), feasible)
     begin = _states(model)
     ask = _ask(recording, begin.values)
     options = [_run(recording, "the first run again" + ask, begin.values)]
@@ -93,10 +97,10 @@ def simple(model: Fitted) -> list[Option]:
     if begin.moves:
         text = f"a run that starts from 2 times the initial states{begin.counted} and is twice as long"
         options.append(_run(recording, text, begin.times(2.0), copies=2))
-    return options
+    return _allowed([*options, *_at_ends(recording, begin, ask, feasible)], feasible)
 
 
-def bolder(model: Fitted) -> list[Option]:
+def bolder(model: Fitted, feasible: Feasible = ANYWHERE) -> list[Option]:
     """Experiments farther from the recording, or less simple to do, for where the simple ones tell too little.
 
     Runs begin with one state alone elsewhere, or with all far off; inputs are much stronger, steady, faster or slower.
@@ -104,7 +108,7 @@ def bolder(model: Fitted) -> list[Option]:
     """
     recording = model.problem.recording
     if not model.problem.in_time:
-        return _static_bolder(recording)
+        return _allowed(_static_bolder(recording, feasible), feasible)
     begin = _states(model)
     values, ask = begin.values, _ask(recording, begin.values)
     options = _elsewhere(recording, begin, BOLD)
@@ -129,7 +133,7 @@ def bolder(model: Fitted) -> list[Option]:
         options.append(_run(recording, f"a run with the inputs held at their largest{ask}", values, change=steady))
         for factor, text in ((2.0, "twice as slowly"), (0.5, "twice as fast")):
             options.append(_run(recording, f"a run with the inputs of the first {text}{ask}", values, slower=factor))
-    return options
+    return _allowed(options, feasible)
 
 
 def denser(option: Option, recording: Recording, times: int) -> Option:
@@ -145,6 +149,28 @@ def denser(option: Option, recording: Recording, times: int) -> Option:
     dense = {"time": time, "initial": conditions["initial"], "inputs": run.inputs_at(time)}
     text = f"{description}, sampled {times} times as densely"
     return text, Recording(runs=[_blank_run(recording, dense)]), dense
+
+
+def _allowed(options: Sequence[Option], feasible: Feasible) -> list[Option]:
+    return [option for option in options if feasible.allows(option[1])]
+
+
+def _at_ends(recording: Recording, begin: _Begin, ask: str, feasible: Feasible) -> list[Option]:
+    """Runs that begin with one state, or have one input held, at an end of what is feasible."""
+    options = []
+    for name, value in begin.values.items():
+        others = _ask(recording, [one for one in begin.values if one != name])
+        for end in feasible.ends(name):
+            if end != value:
+                text = f"a run that starts from {name} = {end:.4g}, all else as in the first{others}"
+                options.append(_run(recording, text, {**begin.values, name: end}))
+    for name in _runs(recording)[0].inputs:
+        for end in feasible.ends(name):
+            def held(one: str, values: Tensor, name: str = name, end: float = end) -> Tensor:
+                return torch.full_like(values, end) if one == name else values
+
+            options.append(_run(recording, f"a run with {name} held at {end:.4g}{ask}", begin.values, change=held))
+    return options
 
 
 def _runs(recording: Recording) -> tuple[Run, ...]:
@@ -245,7 +271,7 @@ def _conditions(recording: Recording) -> dict[str, Tensor]:
     return recording.x if isinstance(recording.x, dict) else {"x": recording.x}
 
 
-def _static(recording: Recording) -> list[Option]:
+def _static(recording: Recording, feasible: Feasible) -> list[Option]:
     x = _conditions(recording)
     found = [_moved(recording, "the same conditions again", {})]
     for name, values in x.items():
@@ -254,37 +280,39 @@ def _static(recording: Recording) -> list[Option]:
         for text, ends in zip(between(thirds, "and"), thirds, strict=True):
             found.append(_moved(recording, f"conditions with {name} between {text}", {name: ends}))
     for name in x:
-        for text, ends in _outside(recording, name, BEYOND):
+        for text, ends in _outside(recording, name, BEYOND, feasible):
             found.append(_moved(recording, f"conditions with {name} {text}", {name: ends}))
     return found
 
 
-def _static_bolder(recording: Recording) -> list[Option]:
+def _static_bolder(recording: Recording, feasible: Feasible) -> list[Option]:
     found = []
     names = list(_conditions(recording))
     for name in names:
-        for text, ends in _outside(recording, name, FAR_BEYOND):
+        for text, ends in _outside(recording, name, FAR_BEYOND, feasible):
             found.append(_moved(recording, f"conditions with {name} {text}", {name: ends}))
     for one, other in itertools.combinations(names, 2):
-        corners = itertools.product(_outside(recording, one, BEYOND), _outside(recording, other, BEYOND))
+        corners = itertools.product(*(_outside(recording, name, BEYOND, feasible) for name in (one, other)))
         for (first, ends), (second, others) in corners:
             text = f"conditions with {one} {first}, and {other} {second}"
             found.append(_moved(recording, text, {one: ends, other: others}))
     return found[:MOST]
 
 
-def _outside(recording: Recording, name: str, share: float) -> list[tuple[str, tuple[float, float]]]:
-    """The ranges above and, where there is one, below that of a condition."""
+def _outside(
+    recording: Recording, name: str, share: float, feasible: Feasible
+) -> list[tuple[str, tuple[float, float]]]:
+    """The ranges above and below that of a condition, where there is any."""
     values = _conditions(recording)[name]
     low, high = float(values.min()), float(values.max())
     width = high - low
     if not width:  # one value tells nothing of how far others may be
         return []
-    above = high + share * width
-    found = [(f"above the recorded range, to {placed(above, width)}", (high, above))]
+    above = feasible.clipped(name, high + share * width)
+    found = [(f"above the recorded range, to {placed(above, width)}", (high, above))] if above > high else []
     # Of what spans decades a share of the width is below nothing; a factor is as far on their scale.
     below = low / (1 + 4 * share) if 0 < low < share * width else low - share * width
-    below = max(below, ABSOLUTE_ZERO.get(recording.units.get(name, ""), -math.inf))
+    below = feasible.clipped(name, max(below, ABSOLUTE_ZERO.get(recording.units.get(name, ""), -math.inf)))
     if (below >= 0 or low < 0) and below < low:
         found.append((f"below the recorded range, to {placed(below, width)}", (below, low)))
     return found

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from torchcal.data import Recording
-from torchcal.discovery.findings.conditions import Option, bolder, denser, simple
+from torchcal.discovery.findings.conditions import ANYWHERE, Option, bolder, denser, simple
+from torchcal.discovery.findings.feasible import Feasible
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.problem import Problem, Whitening
 from torchcal.discovery.hypotheses.model import Model
@@ -55,7 +56,7 @@ class Tried:
         return min(self.nearest(told), PLENTY)
 
 
-def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
+def propose(models: Sequence[Model], noise: Noise, feasible: Feasible = ANYWHERE) -> Experiment | None:
     """The experiment, of those tried in thought, that separates the two nearest of the models most, those aside that
     none of them tells apart; the first, and mildest, of those that separate them by `PLENTY`.
 
@@ -63,7 +64,7 @@ def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
     samples either, `conditions.bolder` ones are tried too. The best is asked for with more samples where it takes them.
     The predicted distance is what is left after every model's parameters have been fitted to old and new data together
     (linearised). None where no experiment separates them by `LEAST` noise sd. What one of the models does not bear (an
-    orbit that falls into its star) is no experiment.
+    orbit that falls into its star) is no experiment, nor is what is not feasible.
     """
     models = models[:MOST]
     # One with a term more than another predicts what that one does, and is told from it by its cost alone.
@@ -71,10 +72,10 @@ def propose(models: Sequence[Model], noise: Noise) -> Experiment | None:
     if not pairs:
         return None
     thought = _Thought(models, pairs, noise)
-    thought.consider(simple(models[0].found))
+    thought.consider(simple(models[0].found, feasible))
     found = thought.best()
     if found is None or found.separation < ENOUGH:
-        thought.consider(bolder(models[0].found))
+        thought.consider(bolder(models[0].found, feasible))
         found = thought.best()
     return found
 
