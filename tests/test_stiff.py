@@ -10,13 +10,24 @@ import torch
 from scipy.integrate import solve_ivp
 
 import torchcal as tc
+import torchcal.discovery.fits.sharpen as sharpening
 from torchcal.discovery.fits.fitting import fit
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.sharpen import sharpen
+from torchcal.discovery.hypotheses.base import calibrate_base
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.inference.summary import settings_of
 from torchcal.results.reading import _with_steps
-from torchcal.simulators import Trajectories, magnified, outgrown, settled, settled_implicitly, workable
+from torchcal.simulators import (
+    Trajectories,
+    fading,
+    magnified,
+    outgrown,
+    settled,
+    settled_implicitly,
+    stepping,
+    workable,
+)
 from torchcal.terms import extend
 
 F64 = torch.float64
@@ -485,3 +496,53 @@ def test_a_fast_neighbour_is_no_bound_of_a_fit():
     for name, truth in (("be", beta), ("G", 1.0), ("Doppler feedback.a", a)):  # nearly one scale of all three
         assert told[name].value == pytest.approx(truth, abs=3 * told[name].sd)
         assert told[name].sd > 0.05 * truth
+
+
+# --- short steps that implicit ones would have to be as well --------------------------------------------------------
+
+
+def passage(star, eccentricity, number):
+    """A body that begins at its farthest from a star of μ = 1, with a period of 2π, and passes close by it."""
+    t = np.linspace(0.0, 2 * math.pi, number)
+    farthest = 1 + eccentricity
+    begin = [farthest, 0.0, 0.0, math.sqrt(2 / farthest - 1)]
+    truth = solve_ivp(
+        lambda t, s: [s[2], s[3], *(-s[:2] * math.hypot(s[0], s[1]) ** -3)], (0, t[-1]), begin, t_eval=t,
+        rtol=1e-11, atol=1e-13, method="DOP853",
+    ).y  # fmt: skip
+    rng = np.random.default_rng(0)
+    outputs = {name: truth[i] + 0.003 * rng.standard_normal(number) for i, name in enumerate("xy")}
+    return tc.Recording(runs=[tc.Run(t, outputs)], noise=0.003), tensor(1.0, *begin)[None]
+
+
+def test_what_fades_no_faster_than_it_grows_is_no_reason_for_implicit_steps(star):
+    recording, values = passage(star, 0.9, 61)
+    bound = Trajectories(star, recording)
+    names = [q.name for q in bound.parameters]
+    assert names == ["mu", "x(0)", "y(0)", "vx(0)", "vy(0)"]
+    states = bound.solve(values)
+    h, r = float(bound.grid.h[0, 0]), float(states[0, 0, :, :2].norm(dim=-1).min())
+    assert h * math.sqrt(2 / r**3) > 1  # something grows, and something fades, within a step
+    assert not fading(bound, values, states)
+
+
+@pytest.mark.parametrize(("k", "wanted"), [(1000.0, True), (1.0, False)])
+def test_what_fades_within_a_step_is_one(k, wanted):
+    ode = tc.ODESimulator(lambda t, s, p, u: {"a": p["k"] * (torch.cos(t) - s["a"])}, {"a": None}, [tc.Parameter("k")])
+    bound = Trajectories(ode, tc.Recording(runs=[run_of(np.linspace(0, 6, 31), {"a": 1.0})]))
+    states = torch.cos(bound.grid.nodes)[None, ..., None]
+    assert fading(bound, tensor(k)[None], states) is wanted
+    assert fading(bound, tensor(k)[None], states.fill_(math.inf))
+
+
+def test_the_base_follows_a_close_passage_with_short_explicit_steps(star, monkeypatch):
+    def tried(*arguments, **options):
+        raise AssertionError("implicit steps were tried")
+
+    monkeypatch.setattr(stepping, "settled_implicitly", tried)
+    monkeypatch.setattr(sharpening, "settled_implicitly", tried)
+    recording, values = passage(star, 0.85, 61)
+    base, _ = calibrate_base(Problem.of(star, recording), {}, 12, 0)
+    assert base.chi2 == pytest.approx(122 - 5, abs=5 * math.sqrt(2 * 117))
+    assert base.values[0] == pytest.approx(1.0, abs=0.01)
+    assert base.values[1:] == pytest.approx(values[0, 1:], abs=0.02)

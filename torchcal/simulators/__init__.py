@@ -20,6 +20,7 @@ from torchcal.simulators.static import (
 )
 from torchcal.simulators.stepping import (
     calmed,
+    fading,
     focused,
     magnified,
     may_change,
@@ -52,6 +53,7 @@ __all__ = [
     "careful",
     "check_parameters",
     "check_slopes",
+    "fading",
     "focused",
     "free_parameters",
     "is_value_of",

@@ -12,6 +12,7 @@ from torchcal.simulators.trajectories import Trajectories
 
 __all__ = [
     "calmed",
+    "fading",
     "focused",
     "magnified",
     "may_change",
@@ -40,6 +41,9 @@ UNSTABLE, ON_END, MAGNIFIED, LOOKED_AT, CALMING = 2.5, 3, 7.0, 4, 4
 #: How many times as fast as at those values a fit may want what fades to be: where steps magnified it there, χ² would
 #: rise as at a bound that is none.
 FASTER = 1.5
+#: Size of h λ of what fades from which on explicit steps may be held back by it, and not by what they follow; and how
+#: many times that of what grows in the same step it is, where implicit steps may be longer.
+FADING, FADES_FASTER = 1.0, 3.0
 #: Implicit steps that are solved at most while their lengths are chosen: a model that jumps needs ever more of them.
 WORK = 200_000
 #: Choices of their lengths in which the error must fall by `CONVERGING`.
@@ -91,7 +95,8 @@ def settled(
         if bool((change <= allowed).all()) and not outgrown(here.simulator, values, here.states):
             return calmed(here.simulator, values, allowed, here.states, switch=switch)
         before, share = share, float((change / allowed).nan_to_num(nan=math.inf).max())
-        if switch and number == 1 and not share < before / CONVERGING and not simulator.implicit:
+        slow = number == 1 and not share < before / CONVERGING
+        if switch and slow and not simulator.implicit and fading(here.simulator, values, here.states):
             other = settled_implicitly(simulator, values, allowed)
             if other is not None:
                 return other
@@ -178,6 +183,23 @@ def _through(simulator: Trajectories, values: Tensor, work: _Work) -> _Solved | 
             return None
         simulator = simulator.with_steps(simulator.subdivide, tuple(denser))
     return None
+
+
+def fading(simulator: Trajectories, values: Tensor, states: Tensor) -> bool:
+    """Whether anything fades within an explicit step, at some values and their solved states, that grows by far less:
+    else implicit steps would have to be as short. Where the solution is not finite anything may."""
+    if not bool(torch.isfinite(states).all()):
+        return True
+    t, h, u = simulator.grid.flat
+    slopes = simulator.steps.slopes_at(values, states[:, :, :-1], t, {name: table[0] for name, table in u.items()})
+    possible = slopes.abs().sum(-1).amax(-1) * h > FADING
+    if not bool(slopes.isfinite().all()):
+        return True
+    if not bool(possible.any()):
+        return False
+    z = torch.linalg.eigvals(slopes[possible]) * h.expand(possible.shape)[possible][:, None]
+    fastest = torch.where(z.real < 0, z.abs(), torch.zeros_like(z.real)).amax(-1)
+    return bool(((fastest > FADING) & (fastest > FADES_FASTER * z.real.amax(-1))).any())
 
 
 def outgrown(simulator: Trajectories, values: Tensor, states: Tensor) -> bool:

@@ -11,6 +11,7 @@ from torchcal.errors import DomainError
 from torchcal.simulators import (
     Trajectories,
     calmed,
+    fading,
     focused,
     magnified,
     may_change,
@@ -79,8 +80,10 @@ def sharpen(
             return _calm(found, most, states, ROUNDS if patient else 1), 0.0
         before, share = share, float((error / most).nan_to_num(nan=math.inf).max())
         slow = branch or (number > 0 and not share < before / CONVERGING)
-        if slow and (again := _implicit(found, most, ROUNDS if patient else 1)) is not None:
-            return sharpen(again, allowed, rounds=rounds, patient=patient)
+        if slow and (simulator.implicit or fading(simulator, found.values[None], states)):
+            again = _implicit(found, most, ROUNDS if patient else 1)
+            if again is not None:
+                return sharpen(again, allowed, rounds=rounds, patient=patient)
         if number == rounds or (slow and not patient):
             break
         try:

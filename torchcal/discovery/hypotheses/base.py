@@ -14,8 +14,8 @@ from torchcal.discovery.fits.sharpen import SOLVER_SHARE, sharpen
 from torchcal.discovery.misfit.growth import growth
 from torchcal.discovery.misfit.noise import Noise, estimate
 from torchcal.discovery.misfit.outliers import spikes
-from torchcal.errors import ConvergenceError, SimulatorError
-from torchcal.simulators import Trajectories, workable
+from torchcal.errors import ConvergenceError, DomainError, SimulatorError
+from torchcal.simulators import Trajectories, focused, may_change, step_errors, workable
 
 __all__ = ["calibrate_base", "growing"]
 
@@ -24,6 +24,8 @@ HALVED = 7
 #: The solver's error at the first starting value, in the data's spread, from which on the fit begins with shorter
 #: steps, and how often they are halved for that at most.
 WRONG, EARLY = 0.1, 2
+#: How often they are shortened where they err, when the first part of the runs has been fitted.
+FOCUSED = 4
 #: Misfit of an output, in that of all, each in its spread, below which the solver need not be more exact for it.
 FAR_BELOW = 0.03
 #: Difference of χ² up to which an initial angle in another turn gives the same fit.
@@ -164,7 +166,26 @@ def _from_starts(problem: Problem, begin: Tensor, free: list[int], rough: Tensor
         if first is not None and first.ends is not None and first.ends_chi2 is not None:
             order = first.ends_chi2.argsort()
             ends = torch.cat([first.ends[order[: max(4, len(order) // 2)]], guided[:4]])
+            problem = _as_short(problem, first.values)
     return fit(problem, problem.whitening(rough, outputs), ends, free)
+
+
+def _as_short(problem: Problem, values: Tensor) -> Problem:
+    """With steps that are shorter where those at hand err by more than little at some values ``(P,)``: what is sudden
+    and follows later, as the passage of a comet, would lead every fit astray."""
+    simulator = problem.simulator
+    for _ in range(FOCUSED):
+        if not isinstance(simulator, Trajectories) or not may_change(simulator) or simulator.implicit:
+            break
+        states = simulator.solve(values[None])
+        excess = float(step_errors(simulator, values, states).sum()) / WRONG
+        if not 1 < excess < math.inf:
+            break
+        try:
+            simulator = focused(simulator, values, states, excess)
+        except DomainError:  # more steps than anyone can take
+            break
+    return problem.with_simulator(simulator)
 
 
 def _unwound(found: Fitted) -> Fitted:
