@@ -207,9 +207,16 @@ EXACT_Y = 1 + 2 * X
         pytest.param({"embedding": tc.embeddings.PolynomialChaos(order=0)}, EmbeddingError, id="no sd"),
         pytest.param({"order": 0}, DomainError, id="order 0"),
         pytest.param({"rule": "gauss"}, DomainError, id="rule in words"),
+        pytest.param({"rule": 1}, DomainError, id="one node for a line in ξ"),
+        pytest.param(
+            {"rule": 2, "embedding": tc.embeddings.PolynomialChaos(order=2)}, DomainError, id="two nodes for a parabola"
+        ),
         pytest.param({"likelihood": tc.likelihoods.ABC(epsilon=torch.ones(3))}, TorchcalError, id="epsilon"),
         pytest.param({"likelihood": tc.likelihoods.Marginal(floor=torch.ones(3))}, DomainError, id="floor"),
         pytest.param({"prior": lambda module: "flat"}, DomainError, id="prior of the wrong kind"),
+        pytest.param({"prior": torch.distributions.Normal}, DomainError, id="a distribution as prior"),
+        pytest.param({"prior": lambda module: tc.priors.Uniform(module, leading="a")}, DomainError, id="box in words"),
+        pytest.param({"prior": lambda module: tc.priors.Normal(module, loc="a")}, DomainError, id="mean in words"),
         pytest.param({"starts": torch.zeros(3, 4)}, ShapeError, id="shape of starts"),
         pytest.param({"calibrate": tc.calibrate_additive, "x": X[:2], "y": Y[:2]}, ImproperPosteriorError, id="N = d"),
     ],
@@ -377,3 +384,57 @@ def test_additive_with_known_noise_takes_as_many_data_as_bounded_parameters():
     free = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
     with pytest.raises(ImproperPosteriorError, match="without two bounds"):
         tc.calibrate_additive(free, tc.Recording(x=x, y=y, noise=0.1), num_samples=0, seed=0, progress=False)
+
+
+# --- pieces that users put together themselves ----------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        ({"fixed": ["a"]}, TorchcalError),
+        ({"scaling": 3}, DomainError),
+        ({"max_nodes": "a"}, DomainError),
+        ({"sd_floor": "a"}, DomainError),
+        ({"sd_floor": -1.0}, DomainError),
+        ({"trial_spread": "a"}, DomainError),
+        ({"trial_spread": -1}, DomainError),
+    ],
+)
+def test_propagations(options, error):
+    with pytest.raises(error, match="Expected"):
+        tc.NISP(tc.Simulator(line, AB), tc.embeddings.Gaussian(), X, **options)
+
+
+def test_other_slips_are_told_and_not_raised_by_what_lies_below():
+    module = tc.NISP(tc.Simulator(line, AB), tc.embeddings.Gaussian(), X)
+    with pytest.raises(DomainError, match="num to be a whole number"):
+        module.draw_germ(-1, seed=0)
+    with pytest.raises(EmbeddingError, match="triangular"):
+        tc.embeddings.PolynomialChaos(triangular="yes")
+    simulator, recording = tc.Simulator(line, AB), tc.Recording(x=X, y=Y)
+    baseline = tc.calibrate_additive(simulator, recording, num_samples=0, seed=0)
+    with pytest.raises(DomainError, match=r"Got AdditivePrediction \(give one of its parts, \.posterior or"):
+        tc.scores(Y, baseline.predict())
+    with pytest.raises(DomainError, match="Got int"):
+        tc.scores(Y, 3)
+    found = tc.calibrate(simulator, recording, num_samples=0, num_starts=4, seed=0)
+    with pytest.raises(ShapeError, match="points"):
+        found.parameter_density("a", kind="map")
+    with pytest.raises(DomainError, match=r"give what its predict\(\) returns"):
+        tc.plots.fit(found, recording)
+
+
+def test_a_file_that_cannot_be_written_is_told_before_anything_is_predicted(tmp_path, monkeypatch):
+    found = tc.calibrate(tc.Simulator(line, AB), tc.Recording(x=X, y=Y), num_samples=0, num_starts=4, seed=0)
+    monkeypatch.setattr(type(found), "to_datatree", lambda self: pytest.fail("the tree was built first"))
+    with pytest.raises(DomainError, match="nowhere"):
+        found.save(tmp_path / "nowhere" / "found.nc")
+
+
+@pytest.mark.filterwarnings("ignore:Only 1 of 4 starts")
+def test_what_is_small_beside_an_offset_is_not_drawn_from():
+    y = 1e13 + Y
+    recording = tc.Recording(x=X, y=y)
+    with pytest.raises(DomainError, match=r"told in torch\.float64.*large offset"):
+        tc.calibrate(tc.Simulator(line, AB), recording, num_samples=10, num_starts=4, seed=0, progress=False)

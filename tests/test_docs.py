@@ -8,9 +8,16 @@ import pytest
 
 DOCS = Path(__file__).parents[1] / "docs"
 GUIDES = sorted(path for path in (DOCS / "how_to").glob("*.md") if path.stem != "index")
-#: About finding what was left out: seconds each, or some more. The others sample for a minute or longer.
-QUICK = ("write_a_term", "what_is_noise", "hold_out")
-LONGER = ("diagnose_static", "diagnose_in_time", "read_a_diagnosis")
+#: Seconds each, and a quarter of a minute or longer.
+QUICK = (
+    "command_line", "diagnostics", "expensive", "hold_out", "noise_and_missing", "several_outputs", "what_is_noise",
+    "write_a_term",
+)  # fmt: skip
+LONGER = (
+    "diagnose_in_time", "diagnose_static", "epsilon_and_gamma", "pyro_model", "read_a_diagnosis", "samplers", "saving",
+)  # fmt: skip
+#: Begins workers of its own; see `test_executors`.
+ELSEWHERE = ("cluster",)
 
 
 def blocks(pattern: str, text: str) -> list[str]:
@@ -51,3 +58,4 @@ def test_every_page_is_in_the_table_of_contents(folder):
 
 def test_guides_show_python():
     assert all(code(page) for page in GUIDES)
+    assert sorted([*QUICK, *LONGER, *ELSEWHERE]) == [page.stem for page in GUIDES]

@@ -8,7 +8,7 @@ import torch
 from scipy import stats
 
 from torchcal import NISP, Parameter, Simulator, polychaos
-from torchcal.embeddings import Gaussian, IndependentGaussian, PolynomialChaos, Uniform
+from torchcal.embeddings import EXHAUSTED, Gaussian, IndependentGaussian, PolynomialChaos, Uniform
 from torchcal.errors import DomainError, EmbeddingError
 
 NAMES = ("a", "b", "c")
@@ -185,6 +185,23 @@ def test_flip_undoes_any_reversal(embedding):
     reference = draw(pattern.num_alpha)
     for _, signs in reversals(pattern):
         torch.testing.assert_close(pattern.flip(reference * signs, reference), reference, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_flip_gives_all_draws_of_a_density_the_same_signs_with_many_germs(order):
+    names = [f"p{i}" for i in range(EXHAUSTED + 1)]
+    pattern = PolynomialChaos(order=order).bind(names)
+    reference, alpha = draw(pattern.num_alpha, seed=5), draw(20, pattern.num_alpha, seed=6)
+    flipped = pattern.flip(alpha, reference)
+    odd = pattern.indices[pattern.columns] % 2
+    for seed in range(5):
+        germs = torch.randint(2, (len(names),), generator=torch.Generator().manual_seed(seed))
+        twin = alpha * (1 - 2 * ((odd * germs).sum(-1) % 2))
+        torch.testing.assert_close(pattern.flip(twin, reference), flipped, rtol=0, atol=0)
+    score = (flipped * reference).sum(-1)
+    for germ in range(len(names)):
+        other = (flipped * (1 - 2 * odd[:, germ]) * reference).sum(-1)
+        assert bool((other <= score + 1e-12).all())
 
 
 @pytest.mark.parametrize("embedding", EMBEDDINGS)

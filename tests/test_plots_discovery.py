@@ -875,3 +875,19 @@ def test_a_dollar_in_a_name_is_no_mathematics():
 @pytest.mark.parametrize("pair", [(discovery.BASE, discovery.ACCEPTED), (discovery.HELD_OUT, discovery.ACCEPTED)])
 def test_colours_differ_in_grey(pair):
     assert abs(grey(pair[0]) - grey(pair[1])) > 0.2
+
+
+@pytest.mark.parametrize(
+    ("draw", "told"),
+    [
+        (plots.missing_rate, "missing"),
+        (plots.needed_shift, "needed"),
+        (plots.held_out_scores, "before"),
+        (plots.ranking, "hypotheses"),
+        (plots.detection_limits, "limits"),
+    ],
+)
+@pytest.mark.parametrize("item", [3, ["a"]])
+def test_what_has_not_what_is_drawn_is_told(draw, told, item):
+    with pytest.raises(DomainError, match=rf"Expected (each of )?{told}: .* of a diagnosis.*Got (int|list|str)"):
+        draw(item)

@@ -1,5 +1,6 @@
 """Checks of arguments that every room makes."""
 
+import math
 import operator
 from typing import Any
 
@@ -7,7 +8,7 @@ import torch
 
 from torchcal.errors import DomainError
 
-__all__ = ["as_seed", "by_default_on_cpu", "outside_inference_mode", "whole"]
+__all__ = ["as_seed", "by_default_on_cpu", "outside_inference_mode", "positive", "whole"]
 
 #: The largest seed: generators take 32 bits, and chains add to it.
 LARGEST = 2**31 - 1
@@ -38,6 +39,21 @@ def outside_inference_mode() -> None:
             "Expected a call outside torch.inference_mode(), which takes no derivatives. Got one within "
             "(torch.no_grad() is allowed)."
         )
+
+
+def positive(name: str, value: Any) -> float:
+    """Return ``value`` as a ``float``.
+
+    Raises:
+        DomainError: If it is not a number above zero, or infinite.
+    """
+    try:
+        number = math.nan if isinstance(value, bool | str) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise DomainError(f"Expected {name} > 0 and finite. Got {value!r}.")
+    return number
 
 
 def whole(name: str, value: Any, minimum: int, *, also: str = "", advice: str = "") -> int:

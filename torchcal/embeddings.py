@@ -24,6 +24,9 @@ from torchcal.errors import EmbeddingError
 
 __all__ = ["Embedding", "Gaussian", "IndependentGaussian", "Pattern", "PolynomialChaos", "Uniform"]
 
+#: Germs of which all combinations of reversals are tried, 256; and how often more of them are gone through at most.
+EXHAUSTED, SWEEPS = 8, 100
+
 
 @dataclass(frozen=True)
 class Pattern:
@@ -87,7 +90,8 @@ class Pattern:
 
         Reversing a germ ξ_k changes the sign of every coefficient of odd degree in ξ_k and leaves the density of
         λ as it was. Of all combinations of reversals the one with the largest inner product with ``reference``
-        is taken.
+        is taken. Of more than `EXHAUSTED` germs it is the nearest such that no reversal of one germ makes it larger,
+        from where coefficients of the first order agree: the same one of all draws of a density.
 
         Args:
             alpha: Draws, ``(*batch, P)``.
@@ -99,10 +103,14 @@ class Pattern:
         if self.num_germs == 0:
             return alpha
         odd = (self.indices[self.columns] % 2).to(alpha)
-        if self.num_germs <= 8:
+        if self.num_germs <= EXHAUSTED:
             return _best_signs(alpha, reference, odd)
-        for germ in range(self.num_germs):
-            alpha = _best_signs(alpha, reference, odd[:, germ : germ + 1])
+        first = (self.indices[self.columns].sum(-1) == 1).to(alpha)
+        alpha = _germ_by_germ(alpha, reference * first, odd)
+        for _ in range(SWEEPS):
+            before, alpha = alpha, _germ_by_germ(alpha, reference, odd)
+            if torch.equal(alpha, before):
+                break
         return alpha
 
     def positive_last_row(self, alpha: Tensor) -> Tensor:
@@ -115,6 +123,12 @@ class Pattern:
         target = ((self.rows == row) & first_order).to(alpha)
         # A reference that is one on the last row and zero elsewhere asks for positive signs there alone.
         return self.flip(alpha, target)
+
+
+def _germ_by_germ(alpha: Tensor, reference: Tensor, odd: Tensor) -> Tensor:
+    for germ in range(odd.shape[1]):
+        alpha = _best_signs(alpha, reference, odd[:, germ : germ + 1])
+    return alpha
 
 
 def _best_signs(alpha: Tensor, reference: Tensor, odd: Tensor) -> Tensor:
@@ -270,4 +284,6 @@ class PolynomialChaos(Embedding):
     def __post_init__(self) -> None:
         super().__post_init__()
         object.__setattr__(self, "order", whole("order", self.order, 0))
+        if not isinstance(self.triangular, bool):
+            raise EmbeddingError(f"Expected triangular as True or False. Got {self.triangular!r}.")
         polychaos.get_basis(self.germ)

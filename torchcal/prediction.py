@@ -327,6 +327,10 @@ def scores(y: Any, moments: Moments | Prediction, *, noise: Any = None, level: f
     _check_plain(y, "y")
     _check_plain(noise, "noise")
     y, _ = to_tensor(y, "y", None)
+    if not isinstance(moments, Moments | Prediction):
+        parts = [name for name in ("posterior", "push_forward") if isinstance(getattr(moments, name, None), Moments)]
+        advice = f" (give one of its parts, .{' or .'.join(parts)})" if parts else ""
+        raise DomainError(f"Expected moments as a Prediction or Moments. Got {type(moments).__name__}{advice}.")
     if y.shape != moments.mean.shape:
         raise ShapeError(f"Expected y of shape {tuple(moments.mean.shape)}, as the mean. Got {tuple(y.shape)}.")
     if not 0 < level < 1:

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.distributions import biject_to, constraints, transform_to
 from torch.distributions.transforms import Transform
 
+from torchcal.checks import positive
 from torchcal.errors import DomainError, ShapeError
 from torchcal.propagation import NISP
 
@@ -240,14 +241,15 @@ class Uniform(CoefficientPrior):
 
     Args:
         propagate: The propagation whose α are meant.
-        leading: Half-width for means of parameters without two bounds, around 0, in scaled coordinates.
+        leading: Half-width for means of parameters without bounds, around 0, in scaled coordinates; with one bound
+            the box begins there, and reaches as far beyond 0, or is twice as wide as this if it would be narrower.
         spread: Half-width for all other coefficients, around 0, in scaled coordinates.
     """
 
     proper = True
 
     def __init__(self, propagate: NISP, *, leading: float = 10.0, spread: float = 2.0) -> None:
-        _check_positive(leading=leading, spread=spread)
+        leading, spread = positive("leading", leading), positive("spread", spread)
         low, high, center, scale = _layout(propagate)
         width = torch.where(propagate.pattern.leading.to(low.device), leading, spread).to(low)
         low = torch.where(torch.isfinite(low), low, torch.minimum(-width, high - 2 * width))
@@ -286,6 +288,8 @@ class Normal(CoefficientPrior):
                 f"Expected loc and scale as numbers or of shape {tuple(low.shape)}. Got "
                 f"{tuple(torch.as_tensor(loc).shape)} and {tuple(torch.as_tensor(scale).shape)}."
             ) from error
+        except (TypeError, ValueError) as error:
+            raise DomainError(f"Expected loc and scale as numbers or tensors. Got {loc!r} and {scale!r}.") from error
         if not bool(torch.isfinite(self.loc).all()):
             raise DomainError(f"Expected a finite loc. Got {loc!r}.")
         if not bool((torch.isfinite(self.scale) & (self.scale > 0)).all()):
@@ -311,9 +315,3 @@ class Normal(CoefficientPrior):
         z = (value - self.loc) / self.scale
         density = -0.5 * z.square() - self.scale.log() - 0.5 * math.log(2 * math.pi)
         return super().log_prob(value) + density.sum(-1)
-
-
-def _check_positive(**numbers: float) -> None:
-    for name, value in numbers.items():
-        if not (math.isfinite(value) and value > 0):
-            raise DomainError(f"Expected {name} > 0 and finite. Got {value!r}.")

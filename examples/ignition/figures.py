@@ -452,12 +452,10 @@ def before_and_after(two: Study, base: Calibration, improved: Calibration, names
         names: What was added.
     """
     figure, axes = _subplots(2, 2, (9.8, 6.8), sharey="col", width_ratios=(1.0, 1.35))
-    rows = (
-        ("Before: embedded error of the base", base, style.PUSH_FORWARD_BAND, style.ADDITIVE),
-        (f"After: with the {' and '.join(names)}", improved, style.MODEL_ERROR_BAND, style.POSTERIOR),
-    )
+    rows = (("Before: embedded error of the base", base), (f"After: with the {' and '.join(names)}", improved))
+    band, line = style.MODEL_ERROR_BAND, style.POSTERIOR
     value = float(two.recording.x["phi"].min())
-    for (left, right), (name, result, band, line) in zip(axes, rows, strict=True):
+    for (left, right), (name, result) in zip(axes, rows, strict=True):
         _draw_lean(left, two, result.predict(studies.grid(two, phi=value)).map, value, band, line)
         moments = result.predict().map
         _draw_misses(right, two, moments, band, line)

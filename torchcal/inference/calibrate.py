@@ -16,7 +16,15 @@ from torchcal.inference.draws import Draws
 from torchcal.inference.estimate import maximise
 from torchcal.inference.fitting import allowed_solver_error, least_squares
 from torchcal.inference.sampling import Plan, draw_unless_interrupted
-from torchcal.inference.setup import PriorMaker, check_dtype, check_inputs, check_run, embedded_problem, warn_of_tails
+from torchcal.inference.setup import (
+    PriorMaker,
+    check_dtype,
+    check_inputs,
+    check_rule,
+    check_run,
+    embedded_problem,
+    warn_of_tails,
+)
 from torchcal.inference.starts import check_starts
 from torchcal.inference.summary import (
     diagnose,
@@ -156,6 +164,7 @@ def calibrate(
             device=device,
         )
 
+    check_rule(rule, embedding.bind([parameter.name for parameter in free]))
     # Once with one node, which calls no simulator, so that what cannot work is told at once.
     trial = build(Scaling.from_parameters(free), 1 if rule is None else rule)
     check_starts(trial, starts)

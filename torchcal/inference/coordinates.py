@@ -102,12 +102,12 @@ class Whitened:
         return torch.where(torch.isfinite(value), value, torch.inf)
 
     def outer(self, z: Tensor) -> Tensor:
-        """U of z, ``(..., P)``."""
+        """The coordinates u of z, ``(..., P)``."""
         flat = z.reshape(-1, z.shape[-1])
         return torch.addmm(self.loc, self._bent(flat), self.scale_tril.T).reshape(z.shape)
 
     def inner(self, u: Tensor) -> Tensor:
-        """Z of u, ``(C, P)``."""
+        """The whitened coordinates z of u, ``(C, P)``."""
         z = torch.linalg.solve_triangular(self.scale_tril, (u - self.loc).T, upper=False).T
         return z if self.bend is None else z - self.bend.shift(z)  # no shift moves a driver
 

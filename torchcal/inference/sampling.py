@@ -1,7 +1,7 @@
 """Which sampler draws, from where, and how much."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Real
 from typing import Any
 
@@ -36,6 +36,9 @@ FELT, LOST = 0.2, 0.5
 _ROUNDINGS = 4
 """Of a sum of squares, in roundings of its value; measured on straight lines."""
 
+
+_ROUNDED = 9
+"""Points at which data are rounded anew."""
 
 _TRIED, _FAR = 64, 20.0
 """Points at which roundings are looked at, and log-density below the largest from which on a point plays no part."""
@@ -137,7 +140,9 @@ def draw(problem: Problem, estimate: Estimate, model: Any, plan: Plan) -> Draws:
     _check_rounding(plan.dtype, _ROUNDINGS * abs(estimate.posterior_objective) * torch.finfo(plan.dtype).eps)
     modes = modes_of(problem, estimate)
     cast = problem.cast(plan.dtype)
-    if cast is not problem:  # outputs that are small beside an offset are known less well than their squares
+    # Outputs that are small beside an offset are known less well than their squares.
+    _check_rounding(torch.float64, _rounding_of_data(problem, modes[0]))
+    if cast is not problem:
         _check_rounding(plan.dtype, _rounding(problem, cast, modes[0]))
     worth = [k for k, mode in enumerate(modes) if k == 0 or (mode.weight >= WORTH_CHAINS and plan.sampler != "pyro")]
     starts = [modes[k].to(plan.dtype) for k in worth]
@@ -262,7 +267,7 @@ def _check_rounding(dtype: torch.dtype, error: float) -> None:
 
     Where that is `FELT`, draws are distorted; where it is `LOST`, no step is short enough, and the warm-up hardly ends.
     """
-    instead = "a larger epsilon="
+    instead = "data and outputs without the large offset that they may have in common, or a larger epsilon="
     if dtype != torch.float64:
         instead = "dtype=torch.float64, or data that are not small beside an offset, or a larger epsilon="
     if error > LOST:
@@ -276,6 +281,21 @@ def _check_rounding(dtype: torch.dtype, error: float) -> None:
             f"{instead}.",
             ConvergenceWarning,
         )
+
+
+def _rounding_of_data(problem: Problem, mode: Laplace) -> float:
+    """Sd of what a log-density errs by where the posterior is, if every datum is rounded, as predictions of it are."""
+    random = torch.Generator().manual_seed(0)
+    z = torch.randn(_ROUNDED, len(mode.loc), generator=random, dtype=torch.float64).to(mode.loc)
+    last = torch.finfo(problem.y.dtype).eps * problem.y
+    errors = []
+    with torch.no_grad():
+        for alpha in problem.prior.transform.bound(mode.loc + z @ mode.scale_tril.T):
+            other = problem.y + last * torch.randn(len(last), generator=random, dtype=torch.float64).to(last)
+            errors.append(replace(problem, y=other).log_prob(alpha) - problem.log_prob(alpha))
+    error = torch.stack(errors)
+    error = error[error.isfinite()]
+    return 1.4826 * float(error.abs().median()) if len(error) else 0.0
 
 
 def _rounding(problem: Problem, cast: Problem, mode: Laplace) -> float:

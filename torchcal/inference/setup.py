@@ -8,7 +8,8 @@ import torch
 from torchcal import likelihoods
 from torchcal.checks import outside_inference_mode, whole
 from torchcal.data import Recording
-from torchcal.embeddings import Embedding
+from torchcal.display import raised
+from torchcal.embeddings import Embedding, Pattern
 from torchcal.errors import (
     DomainError,
     EmbeddingError,
@@ -16,6 +17,7 @@ from torchcal.errors import (
     ImproperPosteriorError,
     RecordingError,
     SimulatorError,
+    TorchcalError,
     TorchcalWarning,
     warn,
 )
@@ -25,7 +27,7 @@ from torchcal.priors import CoefficientPrior
 from torchcal.propagation import NISP, RuleChoice
 from torchcal.simulators import Parameter, Scaling, Simulator, Trajectories, check_slopes, free_parameters, workable
 
-__all__ = ["PriorMaker", "check_dtype", "check_inputs", "check_run", "embedded_problem", "warn_of_tails"]
+__all__ = ["PriorMaker", "check_dtype", "check_inputs", "check_rule", "check_run", "embedded_problem", "warn_of_tails"]
 
 PriorMaker = Callable[[NISP], CoefficientPrior]
 
@@ -106,6 +108,17 @@ def check_dtype(recording: Recording, dtype: torch.dtype) -> None:
                 f"there. Got a spread of {spread:.3g} and values up to {size:.3g}. Use other units, in which they are "
                 f"near 1{instead}."
             )
+
+
+def check_rule(rule: Any, pattern: Pattern) -> None:
+    """Raise for so few nodes that a user asks for that outputs do not tell all coefficients."""
+    least = pattern.order + 1
+    if pattern.num_germs and isinstance(rule, int) and 1 <= rule < least:
+        raise DomainError(
+            f"Expected rule= of at least {least} Gauss nodes a germ for an embedding of order {pattern.order}: with "
+            f"fewer the spread of outputs does not tell all coefficients. Got {rule} (leave it out, and enough are "
+            "found)."
+        )
 
 
 def check_run(num_starts: int, device: torch.device | str | None) -> int:
@@ -230,7 +243,15 @@ def embedded_problem(
             "Expected prior as a function from a NISP to a torchcal prior, such as torchcal.priors.Flat. "
             f"Got {prior!r}."
         )
-    distribution = prior(propagate)
+    try:
+        distribution = prior(propagate)
+    except TorchcalError:
+        raise
+    except Exception as error:
+        raise DomainError(
+            "Expected prior as a function from a NISP to a torchcal prior, such as torchcal.priors.Flat. Got one that "
+            f"raised {raised(error)}."
+        ) from error
     if not isinstance(distribution, CoefficientPrior):
         raise DomainError(
             "Expected prior as a function from a NISP to a torchcal prior, such as torchcal.priors.Flat. "

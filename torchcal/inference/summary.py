@@ -79,7 +79,7 @@ def diagnose(
             everything = {}
         loud = {name: q for name, q in everything.items() if not q.r_hat <= limit}
         if loud:
-            worst = max(loud, key=lambda name: loud[name].r_hat if loud[name].r_hat == loud[name].r_hat else 9e9)
+            worst = max(loud, key=lambda name: math.inf if math.isnan(loud[name].r_hat) else loud[name].r_hat)
             problems.append(
                 f"R-hat of {worst} is {loud[worst].r_hat:.4f} (threshold {limit:.4f}); {len(loud)} of "
                 f"{len(everything)} quantities are past it"

@@ -160,9 +160,8 @@ def additive_fit(
 def _expect(prediction: Any, kind: type, function: str) -> None:
     if not isinstance(prediction, kind):
         other = "additive_fit" if function == "fit" else "fit"
-        raise DomainError(
-            f"Expected prediction: {kind.__name__}. Got {type(prediction).__name__} (see also plots.{other})."
-        )
+        advice = "give what its predict() returns" if hasattr(prediction, "predict") else f"see also plots.{other}"
+        raise DomainError(f"Expected prediction: {kind.__name__}. Got {type(prediction).__name__} ({advice}).")
 
 
 def _multiple(multiple: float) -> float:

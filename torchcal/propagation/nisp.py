@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from torchcal import polychaos
-from torchcal.checks import as_seed, by_default_on_cpu, whole
+from torchcal.checks import as_seed, by_default_on_cpu, positive, whole
 from torchcal.data.conditions import checked
 from torchcal.embeddings import Embedding, Pattern
 from torchcal.errors import DomainError, EmbeddingError, ShapeError
@@ -102,20 +102,20 @@ class NISP(nn.Module):
         if not isinstance(embedding, Embedding):
             raise DomainError(f"Expected one of torchcal.embeddings, such as Gaussian(). Got {embedding!r}.")
         order = None if order is None else whole("order", order, 1, also="or None")
-        if sd_floor is not None and not (math.isfinite(sd_floor) and sd_floor > 0):
-            raise DomainError(f"Expected sd_floor > 0. Got {sd_floor!r}.")
+        if scaling is not None and not isinstance(scaling, Scaling):
+            raise DomainError(f"Expected scaling as a torchcal.simulators.Scaling or None. Got {scaling!r}.")
         self.simulator = simulator
         self.embedding = embedding
-        self.fixed = dict(fixed or {})
         self.free, self.held = free_parameters(simulator.parameters, fixed)
+        self.fixed = dict(fixed or {})
         self.pattern: Pattern = embedding.bind([parameter.name for parameter in self.free])
         self.scaling = scaling if scaling is not None else Scaling.from_parameters(self.free)
         self._check_finite_moments()
         self.outputs = None if outputs is None else tuple(outputs)
         self.order = order
-        self.max_nodes = max_nodes
-        self.trial_spread = trial_spread
-        self.sd_floor = None if sd_floor is None else float(sd_floor)
+        self.max_nodes = whole("max_nodes", max_nodes, 1)
+        self.trial_spread = positive("trial_spread", trial_spread)
+        self.sd_floor = None if sd_floor is None else positive("sd_floor", sd_floor)
         self.max_elements = None if max_elements is None else whole("max_elements", max_elements, 1)
         x = checked(x, tuple(x) if isinstance(x, Mapping) else None)
         # What it is made of its constructor says: no buffer is state that could be loaded into another one.
@@ -269,7 +269,7 @@ class NISP(nn.Module):
 
     def draw_germ(self, num: int, *, seed: int) -> Tensor:
         """Independent draws of ξ, ``(num, germs)``."""
-        generator = torch.Generator().manual_seed(as_seed(seed))
+        num, generator = whole("num", num, 0), torch.Generator().manual_seed(as_seed(seed))
         draws = self.pattern.basis.sample((num, self.pattern.num_germs), generator=generator)
         return draws.to(self.nodes)
 

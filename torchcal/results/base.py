@@ -11,6 +11,7 @@ from torch import Tensor
 from torchcal.checks import whole
 from torchcal.data import Recording
 from torchcal.data.conditions import checked
+from torchcal.files import check_target
 from torchcal.results import storage
 from torchcal.results.estimate import MapEstimate
 from torchcal.simulators import Conditions
@@ -48,6 +49,7 @@ class Result:
         Raises:
             DomainError: If the folder does not exist.
         """
+        check_target(path)  # before all draws are predicted
         storage.write(self.to_datatree(), path)
 
     def __repr__(self) -> str:

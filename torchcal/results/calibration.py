@@ -11,7 +11,7 @@ from torch import Tensor
 from torchcal.checks import as_seed, whole
 from torchcal.data import Recording
 from torchcal.embeddings import Embedding
-from torchcal.errors import DomainError
+from torchcal.errors import DomainError, ShapeError
 from torchcal.likelihoods import Likelihood
 from torchcal.prediction import (
     Prediction,
@@ -137,7 +137,11 @@ class Calibration(Result):
         alpha = self.map.alpha[None] if self._kind(kind) == "map" else thin(self.draws, max_draws)
         if alpha is None:
             raise DomainError("Expected draws. Got a calibration with none.")
-        return parameter_density(propagate, alpha, torch.as_tensor(points, dtype=torch.float64))
+        try:
+            points = torch.as_tensor(points, dtype=torch.float64)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise ShapeError(f"Expected points (M, d) as numbers. Got {points!r}.") from error
+        return parameter_density(propagate, alpha, points)
 
     def relabelled(self) -> "Calibration":
         """The same posterior with the paper's labels: positive coefficients of the last parameter.

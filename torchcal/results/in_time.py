@@ -193,7 +193,7 @@ def _times(x: Any, recording: Recording) -> dict[str, Tensor]:
         raise DomainError("Expected times as a dict with 'time' and 'run'. Got one array.")
     wrong = [float(r) for r in where["run"] if not (float(r).is_integer() and 0 <= r < len(runs))]
     if wrong:
-        raise DomainError(f"Expected runs from 0 to {len(runs) - 1}. Got {wrong[0]:g}.")
+        raise DomainError(f"Expected runs as whole numbers from 0 to {len(runs) - 1}. Got {wrong[0]:g}.")
     return dict(where)
 
 

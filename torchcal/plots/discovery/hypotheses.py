@@ -16,6 +16,7 @@ from torchcal.plots.discovery.pieces import (
     draw_key,
     finite,
     likeliest_with,
+    listed,
     signed,
     told_apart,
 )
@@ -55,11 +56,12 @@ def ranking(
         The axes.
 
     Raises:
-        DomainError: If there is no hypothesis, or ``value`` is another one.
+        DomainError: If there is no hypothesis, or one without these attributes, or ``value`` is another one.
     """
     if value not in ("log_evidence", "probability"):
         raise DomainError(f"Expected value: 'log_evidence' or 'probability'. Got {value!r}.")
-    rows = sorted(hypotheses, key=lambda item: (-finite(item.probability, -1.0), -finite(item.log_evidence, -math.inf)))
+    rows = listed("hypotheses", hypotheses, ("terms", "log_evidence", "probability", "physical"), ".ranking")
+    rows.sort(key=lambda item: (-finite(item.probability, -1.0), -finite(item.log_evidence, -math.inf)))
     if not rows:
         raise DomainError("Expected at least one hypothesis. Got none.")
     chosen = frozenset(accepted)

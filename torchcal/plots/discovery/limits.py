@@ -9,7 +9,7 @@ import numpy as np
 
 from torchcal.errors import DomainError
 from torchcal.plots import style
-from torchcal.plots.discovery.pieces import ACCEPTED, NOISE, beside, draw_key, finite, plain, told_apart
+from torchcal.plots.discovery.pieces import ACCEPTED, NOISE, beside, draw_key, finite, listed, plain, told_apart
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -31,11 +31,11 @@ def detection_limits(limits: Iterable[Any], *, most: int = 16, ax: "Axes | None"
         The axes, with \\|estimate\\| / smallest on a logarithmic abscissa.
 
     Raises:
-        DomainError: If there is no candidate.
+        DomainError: If there is no candidate, or one without these attributes.
     """
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    rows = list(limits)
+    rows = listed("limits", limits, ("term", "parameter", "smallest", "unit", "estimate"), ".detection_limit")
     if not rows:
         raise DomainError("Expected at least one candidate. Got none.")
 

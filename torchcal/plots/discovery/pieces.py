@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchcal.data import Recording
 from torchcal.display import DECADES
-from torchcal.errors import ShapeError
+from torchcal.errors import DomainError, ShapeError
 from torchcal.plots import style
 
 if TYPE_CHECKING:
@@ -216,6 +216,33 @@ def likeliest_with(ranking: Iterable[Any], terms: Iterable[str]) -> Any:
 def join_terms(terms: Iterable[str]) -> str:
     """A hypothesis by the names of its terms."""
     return plain(" + ".join(str(term) for term in terms), middle=True)
+
+
+def expect(what: str, item: Any, names: Sequence[str], found_in: str) -> None:
+    """Raise for something to draw that has not the attributes that are drawn.
+
+    Raises:
+        DomainError: If it has not.
+    """
+    if lacking := [name for name in names if not hasattr(item, name)]:
+        raise DomainError(
+            f"Expected {what}: {found_in} of a diagnosis, or anything with its attributes. Got {type(item).__name__}, "
+            f"which has no {lacking[0]!r}."
+        )
+
+
+def listed(what: str, items: Any, names: Sequence[str], found_in: str) -> list[Any]:
+    """Things to draw as a list, each with the attributes that are drawn.
+
+    Raises:
+        DomainError: If they are none.
+    """
+    if not isinstance(items, Iterable):
+        raise DomainError(f"Expected {what}: {found_in} of a diagnosis. Got {type(items).__name__}.")
+    found = list(items)
+    for item in found:
+        expect(f"each of {what}", item, names, f"a row of {found_in}")
+    return found
 
 
 def as_numbers(value: Any, what: str, length: int | None = None) -> np.ndarray:

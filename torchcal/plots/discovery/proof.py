@@ -18,6 +18,7 @@ from torchcal.plots.discovery.pieces import (
     Look,
     as_mask,
     draw_key,
+    expect,
     finite,
     places_of,
     plain,
@@ -103,8 +104,12 @@ def held_out_scores(before: Any, after: Any = None, *, ax: Any = None, unit: str
         The axes, ``(3,)``.
 
     Raises:
+        DomainError: If an attribute is not there.
         ShapeError: If ``ax`` are not three axes.
     """
+    for what, scores in (("before", before), ("after", after)):
+        if scores is not None or what == "before":
+            expect(what, scores, ("fitted", "held_out"), f".{what}")
     axes, _ = take_axes(ax, 3, (7.2, 2.0), one_row=True)
     if len(axes) != 3:
         raise ShapeError(f"Expected ax: three axes. Got {len(axes)} (plt.subplots(1, 3)[1]).")

@@ -7,7 +7,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from torchcal.plots import style
-from torchcal.plots.discovery.pieces import ACCEPTED, Look, as_numbers, draw_key, finish, finite, is_log, plain
+from torchcal.plots.discovery.pieces import (
+    ACCEPTED,
+    Look,
+    as_numbers,
+    draw_key,
+    expect,
+    finish,
+    finite,
+    is_log,
+    plain,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -40,8 +50,12 @@ def needed_shift(
         The axes. Stretches that say nearly nothing are drawn, but do not set the ordinate's range.
 
     Raises:
+        DomainError: If an attribute is not there.
         ShapeError: If values, shift and sd are not of one length.
     """
+    expect(
+        "needed", needed, ("parameter", "unit", "driver", "values", "shift", "sd", "correlation"), "one of .shifts"
+    )
     look = Look(units=units or {}, labels=labels or {})
     x = as_numbers(needed.values, "values")
     shift, sd = as_numbers(needed.shift, "shift", len(x)), as_numbers(needed.sd, "sd", len(x))
@@ -91,8 +105,10 @@ def missing_rate(
         The axes.
 
     Raises:
+        DomainError: If an attribute is not there.
         ShapeError: If values, rate and sd are not of one length.
     """
+    expect("missing", missing, ("kind", "target", "driver", "values", "rate", "sd", "unit"), ".missing")
     look = Look(units=units or {}, labels=labels or {})
     x = as_numbers(missing.values, "values")
     rate, sd = as_numbers(missing.rate, "rate", len(x)), as_numbers(missing.sd, "sd", len(x))
