@@ -35,6 +35,9 @@ __all__ = [
 DEFAULT_TOLERANCE = 0.01
 """ε as a share of the sd of the data, where none is given: a visible but small part of what there is to fit."""
 
+DRAWS = 256
+"""Germ draws of the likelihoods that estimate densities from samples."""
+
 SMOOTHING = 1e-3
 """δ as a share of ε. It rounds the kink of γ|μ − y| at a width far below the tolerance."""
 
@@ -270,7 +273,7 @@ class Marginal(Likelihood):
         floor: Smallest kernel sd, in the outputs' unit; None for 1e-6 of the data's sd. It cuts off the spikes.
     """
 
-    num_samples: int = 256
+    num_samples: int = DRAWS
     bandwidth: float | None = None
     floor: float | Tensor | None = None
 
@@ -314,7 +317,7 @@ class Full(Likelihood):
         floor: Smallest kernel sd, in the outputs' unit; None for 1e-6 of the data's sd.
     """
 
-    num_samples: int = 256
+    num_samples: int = DRAWS
     bandwidth: float | None = None
     floor: float | Tensor | None = None
 

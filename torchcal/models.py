@@ -10,7 +10,7 @@ import pyro
 import torch
 from torch import Tensor
 
-from torchcal.likelihoods import Additive, Likelihood
+from torchcal.likelihoods import DRAWS, Additive, Likelihood
 from torchcal.priors import CoefficientPrior
 from torchcal.propagation import NISP
 
@@ -120,7 +120,7 @@ def log_likelihood(
         return likelihood.log_prob(y, pick(propagate.mean(alpha)), None, noise)
     if likelihood.needs == "samples":
         if germ is None:
-            germ = propagate.draw_germ(getattr(likelihood, "num_samples", 256), seed=0)
+            germ = propagate.draw_germ(getattr(likelihood, "num_samples", DRAWS), seed=0)
         return likelihood.log_prob(y, pick(propagate.outputs_at(alpha, germ)), noise)
     mean, sd = propagate(alpha)
     return likelihood.log_prob(y, pick(mean), pick(sd), noise)

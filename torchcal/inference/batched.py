@@ -20,10 +20,10 @@ from torchcal.priors import Bounds
 
 __all__ = ["MOST_ELEMENTS", "run_batched"]
 
-TARGET = {"nuts": 0.65, "hmc": 0.8}
+TARGET = {"nuts": 0.65, "hmc": 0.8, "pyro": 0.8}
 """Mean acceptance that the first steps aim at. For No-U-Turn the cost of an effective draw is flat between 0.6 and 0.9
 (Betancourt, Byrne & Girolami 2014, arXiv:1411.6669); of the posteriors in ``benchmarks/sampling`` it is lowest at the
-lower end. Divergences raise it."""
+lower end. Divergences raise it. Pyro's own is its default."""
 
 _WARM_UP_CHAINS, _FEW_WARM_UP_CHAINS = 64, 16
 """Chains that adapt together: pooled draws make the covariance reliable after a few transitions each. The fewer where

@@ -27,7 +27,7 @@ def run_nuts(
     num_chains: int,
     num_warmup: int,
     seed: int,
-    target_accept: float = 0.8,
+    target_accept: float,
     max_tree_depth: int = 10,
     progress: bool = False,
 ) -> Draws:

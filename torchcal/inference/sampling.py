@@ -11,7 +11,7 @@ from torch import Tensor
 from torchcal import models
 from torchcal.checks import as_seed, whole
 from torchcal.errors import ConvergenceWarning, DomainError, ImproperPosteriorError, InterruptionWarning, warn
-from torchcal.inference.batched import MOST_ELEMENTS, run_batched
+from torchcal.inference.batched import MOST_ELEMENTS, TARGET, run_batched
 from torchcal.inference.by_hand import by_hand
 from torchcal.inference.coordinates import Laplace, dealt_out, slopes_of
 from torchcal.inference.diagnostics import Figures, figures
@@ -257,7 +257,7 @@ def _draw_with_pyro(problem: Problem, mode: Laplace, model: Any, plan: Plan) -> 
         num_chains=plan.chains(1),
         num_warmup=plan.warmup,
         seed=plan.seed,
-        target_accept=0.8 if plan.target_accept is None else plan.target_accept,
+        target_accept=TARGET["pyro"] if plan.target_accept is None else plan.target_accept,
         progress=plan.progress,
     )
 

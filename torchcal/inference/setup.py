@@ -279,7 +279,7 @@ def embedded_problem(
 
     germ = None
     if likelihood.needs == "samples":
-        germ = propagate.draw_germ(getattr(likelihood, "num_samples", 256), seed=0)
+        germ = propagate.draw_germ(getattr(likelihood, "num_samples", likelihoods.DRAWS), seed=0)
     return Problem(
         y=y.to(device=device),
         propagate=propagate,
