@@ -345,6 +345,7 @@ def test_nobody_elses_handler_is_replaced():
             assert signal.getsignal(signal.SIGINT) is other
 
 
+@pytest.mark.slow
 def test_windows_are_refitted_together_and_are_the_same_from_workers(monkeypatch):
     pytest.importorskip("cloudpickle")
     x = torch.linspace(0, 4, 80, dtype=F64)

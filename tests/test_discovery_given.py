@@ -90,6 +90,7 @@ def test_a_wrong_guess_adds_no_name_to_a_right_one():
     assert "(hold=) would do nearly as well without all or a part of it" in " ".join(str(d).split())
 
 
+@pytest.mark.slow
 def test_a_wrong_guess_in_one_of_two_runs_is_told_of_that_run():
     right, wrong = recording(0, "zero"), recording(1, "linear")
     both = tc.Recording(runs=[right.runs[0], wrong.runs[0]], noise=0.02)

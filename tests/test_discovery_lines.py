@@ -62,7 +62,7 @@ def test_a_ripple_is_no_noise_however_fast(samples, noise, uneven):
         assert d.noise.sd["x"] < 0.03  # of 0.02, and 0.045 with the ripple
 
 
-@pytest.mark.parametrize("uneven", [False, True])
+@pytest.mark.parametrize("uneven", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_white_noise_has_no_line(uneven):
     assert [diagnosed(*rippled(8, 0.0, seed=s, uneven=uneven), None).verdict for s in range(4)] == ["consistent"] * 4
 

@@ -400,6 +400,7 @@ def test_a_wild_sample_where_a_second_term_would_be_seen_stays_one(seed):
     assert d.set_aside.nonzero()[:, 0].tolist() == [23]
 
 
+@pytest.mark.slow
 def test_the_sd_of_a_name_rest_on_the_noise_beside_it():
     # That of the best single term had them five times as large, from three times the noise.
     seen = [resonant(seed, None) for seed in (1, 2)]

@@ -237,6 +237,7 @@ def test_two_terms_of_which_no_tangent_shows_anything_are_tried_together(noise):
         assert abs(known[name].value - 0.05**0.5) < 4 * known[name].sd
 
 
+@pytest.mark.slow
 def test_a_pair_listed_in_the_wrong_order_does_not_lose_to_one_that_looks_like_it():
     # A resistance thermometer: the current's effect comes before the shunt, which is listed first; what saturates, as a
     # shunt nearly makes it do, is listed last.

@@ -244,6 +244,7 @@ def test_an_interaction_is_no_shared_preparation(listed):
     assert not any("preparation" in row for row in d.symptoms)
 
 
+@pytest.mark.slow
 def test_a_wind_that_is_in_no_list_is_no_drift_of_a_camera():
     # Seen from the wind the ball flies as without it; launched backwards, and seen by a camera that moves.
     t, rng, runs = np.linspace(0, 3, 40), np.random.default_rng(0), []

@@ -109,6 +109,7 @@ def cell(drop, *, n=120, seed=0):
     return simulator, tc.Recording(runs=[run], noise=NOISE), terms
 
 
+@pytest.mark.slow
 def test_physics_of_an_output_may_act_in_a_part_of_the_time():
     d = diagnose(*cell(lambda t, v, i: np.where(t > 6.5, 0.15 * i * np.abs(i), 0.0)))
     assert d.terms == ["square drop"]
@@ -160,6 +161,7 @@ def test_opposite_terms_of_one_sign_each_are_no_aliases(binding):
     assert "unspecific binding" in notes
 
 
+@pytest.mark.slow
 def test_outliers_that_a_strong_local_effect_hid_are_set_aside(binding):
     # No smooth curve follows the step that the effect makes in the base's residual, so that nothing sticks out of it.
     rng = np.random.default_rng(5)

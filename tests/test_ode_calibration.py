@@ -575,6 +575,7 @@ def test_the_figure_of_a_fit_is_drawn_against_time(calibration: Calibration, rec
 # --- the whole way ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_missing_physics_added_shrinks_the_model_error(recording: tc.Recording, calibration: Calibration) -> None:
     improved = tc.terms.extend(body(), [drag()])
     after = tc.calibrate(improved, recording, num_samples=0, seed=0)

@@ -50,6 +50,7 @@ def test_a_reaction_order_is_one_law_for_runs_that_begin_elsewhere():
     torch.testing.assert_close(bound.at(further.x)(values), further.y, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_discharge_exponent_is_one_law_for_tanks_that_begin_elsewhere():
     rng, t = np.random.default_rng(1), np.linspace(0, 60, 41)
     runs = []

@@ -396,7 +396,7 @@ def chain(k2, planted=0.0, *, noise=0.02):
     [
         (0.18, ("autocatalysis", "constant source", "reaction order"), "named", ["autocatalysis"]),
         pytest.param(0.18, None, "named", ["autocatalysis"], marks=pytest.mark.slow),
-        (0.0, None, "consistent", []),
+        pytest.param(0.0, None, "consistent", [], marks=pytest.mark.slow),
     ],
 )
 def test_a_stiff_mechanism_is_diagnosed(planted, among, verdict, terms):
@@ -410,6 +410,7 @@ def test_a_stiff_mechanism_is_diagnosed(planted, among, verdict, terms):
         assert d.ranking[0].estimates[0].value == pytest.approx(planted, abs=4 * d.ranking[0].estimates[0].sd)
 
 
+@pytest.mark.slow
 def test_a_stiff_mechanism_is_calibrated_and_kept(tmp_path):
     base, recording = chain(1e4)
     found = tc.calibrate(base, recording, fixed={"k2": 1e4}, num_samples=0, seed=0)
