@@ -2,7 +2,7 @@
 
 Something that is in no list may act in a part of a range too, and in a short window many terms do much the same. A term
 is named for its own work there: a constant change in the same place, of a parameter of the base or of an output's gain,
-with the same ends to choose, must do worse.
+with the same ends to choose, must do worse. An instrument that errs beyond a value of its output is such a term too.
 A term whose window leaves something is tried in all others: from the base alone its best one is not seen.
 """
 
@@ -29,8 +29,10 @@ from torchcal.discovery.fits.local import (
     localised,
     multiplied,
 )
+from torchcal.discovery.fits.readings import threshold_of
 from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.hypotheses.own_noise import likeliest_alone
+from torchcal.discovery.hypotheses.screen import Window
 from torchcal.discovery.hypotheses.search import BETTER, Search
 from torchcal.discovery.misfit.channels import channels
 from torchcal.discovery.verdicts.verdict import PLAINLY_WHITE
@@ -44,6 +46,8 @@ __all__ = ["refit_nameless"]
 #: Log weight behind the leader down to which a term in a window is held against nameless changes, and of how many; and
 #: against how many changes elsewhere than where it acts.
 CLOSE, MOST, ELSEWHERE = 3.0, 3, 2
+#: Changes of parameters, each in a range of a driver, that an instrument with a threshold is held against.
+BEYOND = 4
 #: Terms that are tried in all windows of a driver, and places where these may begin or end.
 TRIED, CUTS = 4, 14
 #: Places within an open window where a nameless change may begin or end, and starts that are refitted with each width
@@ -55,6 +59,8 @@ MOVES = (0.0, -0.15, 0.15, -0.3, 0.3)
 FADED = 0.05
 #: What the name of a term that fades begins with.
 FADING = "a fading "
+#: Share of an output's data from which on a range of a driver is where an instrument errs.
+ALIKE = 0.9
 #: Relative difference up to which two effects are one, and relative size from which on two are independent.
 SAME, RANK = 1e-4, 1e-7
 
@@ -71,6 +77,8 @@ def refit_nameless(search: Search) -> None:
     if search.noise.open and lead.window is None:  # with the noise that each of them leaves, one in a window may lead
         lead = likeliest_alone(search) or lead
     if lead.window is None:
+        if beyond := _beyond(search, lead):
+            _Changes.of(search).hold_beyond(beyond)
         return
     changes = _Changes.of(search)
     changes.hold_against(lead)
@@ -116,7 +124,9 @@ class _Changes:
         search.constants = {i for i, own in listed.items() if _is_constant(search, alone[i], own)}
         # That of an instrument in a part of its range has no name.
         named = {_places(alone[i]) for i in search.constants if not alone[i].terms[0].outputs}
-        return cls(search, prior, named, _elsewhere(search, list(listed.values())))
+        # An instrument that does what a parameter does everywhere is none of it in a part of its range.
+        others = [own for i, own in listed.items() if not alone[i].terms[0].outputs]
+        return cls(search, prior, named, _elsewhere(search, others))
 
     def hold_against(self, lead: Model) -> None:
         """Refit changes beside the leading terms in windows: where these act, but no constants that the list names; and
@@ -143,9 +153,52 @@ class _Changes:
                     others.append((chi2, place, begun))
             for _, place, begun in sorted(others, key=lambda one: one[0])[:ELSEWHERE]:
                 wanted[place, window.driver] = begun
-        every = [one for each in wanted.values() for one in each]
-        refitted = map(long_enough, _refitted(search, every))
-        search.nameless += [one for one in refitted if one is not None and one.physical]
+        self._refit([one for each in wanted.values() for one in each])
+
+    def hold_beyond(self, models: Sequence[Model]) -> None:
+        """Refit changes of the base's parameters in the ranges in which an instrument errs."""
+        found = []
+        for model in models:
+            for place in self.elsewhere:
+                if place[0][0] == "shifts":
+                    begun, chi2 = _wanted(self.search, model, place, self.prior, self.named)
+                    found += [(chi2, begun)] if math.isfinite(chi2) else []
+        nearest = sorted(found, key=lambda one: one[0])[:BEYOND]
+        self._refit([one for _, begun in nearest for one in begun])
+
+    def _refit(self, wanted: Sequence[Hypothetical]) -> None:
+        refitted = map(long_enough, _refitted(self.search, wanted))
+        self.search.nameless += [one for one in refitted if one is not None and one.physical]
+
+
+def _beyond(search: Search, model: Model) -> list[Model]:
+    """An instrument of a model that errs beyond a value of its output, as one in each range of a driver in which that
+    is so on the calibrated base, where it begins: with the instrument true outputs are others than the recorded ones.
+    """
+    each = {i: threshold_of(search.candidates[i].terms, model.found.by_name) for i in model.numbers}
+    number, found = next(((i, one) for i, one in each.items() if one is not None), (0, None))
+    if found is None:
+        return []
+    output, value = found
+    problem = search.base.problem
+    outputs = problem.recording.outputs
+    here = problem.output_of == (outputs.index(output) if output in outputs else 0)  # what has no name is y
+    errs = search.base.y[here].abs() > value
+    models = []
+    for name, driver in search.drivers().items():
+        along, order = driver[problem.condition_of[here]].sort(stable=True)
+        right = 2 * errs[order].long() - 1
+        gain = right.flip(0).cumsum(0).flip(0)[1:] - right.cumsum(0)[:-1]  # of all above a cut, and not below
+        gain = gain.masked_fill(along[1:] <= along[:-1], 0).double()
+        if len(gain) and float(gain.abs().max()) >= (2 * ALIKE - 1) * len(errs):
+            k = int(gain.abs().argmax())
+            cut = 0.5 * float(along[k] + along[k + 1])
+            low, high = (cut, math.inf) if float(gain[k]) > 0 else (-math.inf, cut)
+            window = Window(number, name, low, high, math.nan, math.nan)
+            models.append(dataclasses.replace(
+                model, numbers=(number,), candidate=search.candidates[number], found=search.base, window=window
+            ))  # fmt: skip
+    return models
 
 
 def _elsewhere(search: Search, listed: list[Tensor]) -> dict[Places, Tensor]:

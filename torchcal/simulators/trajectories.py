@@ -282,15 +282,19 @@ class Trajectories(Simulator):
         jacobian = by_state @ moved + by_column  # (H, n, outputs, C)
         return y.detach(), jacobian.transpose(1, 2).flatten(1, 2)
 
-    def observation_slopes(self, values: Tensor, states: Tensor, outputs: Sequence[str]) -> Tensor:
-        """∂ output / ∂ state at every datum, ``(n_total, S)``; one row of values."""
+    def observation_slopes(
+        self, values: Tensor, states: Tensor, outputs: Sequence[str], columns: Sequence[int] = ()
+    ) -> tuple[Tensor, Tensor]:
+        """∂ output / ∂ state at every datum, ``(n_total, S)``, and by some parameters with the states as they are,
+        ``(n_total, len(columns))``; one row of values."""
         seen = states[:, self.grid.run_of, self.grid.node_of]
         with torch.enable_grad():
             begin = seen.detach().requires_grad_(True)
-            y = self._measure(self.layout.by_name(values, self.grid.run_of), begin, outputs)
+            leaves = self.layout.leaves(values, self.grid.run_of, columns)
+            y = self._measure(leaves, begin, outputs)
             parts = torch.stack(y.split(seen.shape[1], dim=-1), dim=-1)
-            by_state, _ = self.layout.derivatives(parts, begin, {}, self.grid.run_of, ())
-        return by_state[0].transpose(0, 1).flatten(0, 1)
+            by_state, by_column = self.layout.derivatives(parts, begin, leaves, self.grid.run_of, columns)
+        return by_state[0].transpose(0, 1).flatten(0, 1), by_column[0].transpose(0, 1).flatten(0, 1)
 
     def slopes(self, values: Tensor, start: Tensor) -> Tensor:
         """Rates of all states at the beginning of every run, ``(H, R, states)``, at states ``(H, R, states)``."""

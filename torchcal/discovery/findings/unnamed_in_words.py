@@ -143,6 +143,11 @@ def ambiguous(d: Any) -> list[str]:
         if unknown < LISTED:
             share = f"though its probability is {chance(unknown)}"
         parts.append(f"Nor can these data exclude something that is not in the library ({share}).")
+        if d.settings.get("pliant") and unknown < LISTED:
+            parts.append(
+                "What is tied acts in ranges, changes nothing but outputs, or is several terms together with none in "
+                "common: such may stand for what is in no list."
+            )
     else:
         parts += _unknown_too(unknown)
     if d.experiment is not None:

@@ -14,7 +14,7 @@ from torchcal.data import Recording
 from torchcal.errors import SimulatorError
 from torchcal.simulators import Parameter, Simulator, Solution, Trajectories, Values, check_slopes, limits
 
-__all__ = ["Problem", "Whitening", "breaks", "remembered"]
+__all__ = ["SWEEP", "Problem", "Whitening", "breaks", "remembered"]
 
 #: Combinations of all levels of all conditions, in the number of rows, up to which these are a grid; the levels of a
 #: condition up to which it switches between sweeps of another one; and the rows of a sweep, on average, at least.

@@ -1,6 +1,6 @@
 """What an instrument shows of true values, and whether a term is one."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,7 +11,22 @@ from torchcal.discovery.fits.problem import Problem
 from torchcal.simulators import Values
 from torchcal.terms import Term
 
-__all__ = ["Reading", "are_instruments"]
+__all__ = ["Reading", "are_instruments", "threshold_of"]
+
+
+def threshold_of(terms: Sequence[Term], values: Mapping[str, float]) -> tuple[str, float] | None:
+    """The output beyond a value of which an instrument among some terms errs, and that value, as of one that saturates;
+    None where there is no such instrument.
+
+    Args:
+        terms: The terms.
+        values: Of all parameters, by name.
+    """
+    for term in terms:
+        for own, output in term.scales.items() if term.is_sensor and not term.states else ():
+            if output in term.outputs:
+                return output, values[term.full(own)]
+    return None
 
 
 @dataclass(frozen=True, eq=False)

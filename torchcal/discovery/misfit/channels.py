@@ -86,7 +86,7 @@ def responses(problem: Problem, found: Fitted, forcing: Tensor) -> tuple[Tensor,
     states = bound.solve(values, found.warm)
     flow = bound.flow(values, states)[0]  # (R, K, S, S)
     size = flow.shape[-1]
-    rows = bound.observation_slopes(values, states, problem.recording.outputs)[problem.index]  # (n, S)
+    rows = bound.observation_slopes(values, states, problem.recording.outputs)[0][problem.index]  # (n, S)
     run_of, node_of = bound.grid.run_of[problem.condition_of], bound.grid.node_of[problem.condition_of]
     bins, count = _binning(bound)
     result = torch.zeros(problem.n, count, forcing.shape[-1], dtype=torch.float64)
@@ -188,6 +188,11 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
         forcing = torch.cat([kicks, by_parameter[0]], dim=-1)
         response, drivers, time = responses(problem, found, forcing)
         bins, count = _binning(bound)
+        _, seen = bound.observation_slopes(found.values[None], states, problem.recording.outputs, own)
+        # A datum at the end of a step sees a parameter of the instrument as it is then.
+        step = (bound.grid.node_of - 1).clamp_min(0)
+        at = bins[bound.grid.run_of, step][problem.condition_of]
+        response[torch.arange(problem.n), at, size:] += seen[problem.index]
         run = torch.arange(len(bins), dtype=torch.float64)[:, None].expand(bins.shape)
         drivers = _by_run(problem, drivers, _bin_means(bins, count, run))
         labels = [

@@ -30,6 +30,7 @@ class Decision:
         beside: Terms beside which that is likeliest to act; none where it would act alone.
         withdrawn: Why a name was withdrawn, in words.
         doubt: Why the best explanation is no name, though probable, in words.
+        pliant: Whether all that is tied bends to what is in no list: windows, instruments, several terms together.
         nearly: Whether what is left is not white, and the name rests on the share of the misfit that it removes.
     """
 
@@ -46,6 +47,7 @@ class Decision:
         self.beside: tuple[str, ...] = ()
         self.withdrawn = ""
         self.doubt = ""
+        self.pliant = False
         self.nearly = False
 
 

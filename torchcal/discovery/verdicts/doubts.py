@@ -11,6 +11,7 @@ from torch import Tensor
 from torchcal.discovery.fits.fitting import weighed
 from torchcal.discovery.fits.local import force, is_window
 from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.fits.readings import threshold_of
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.own_noise import beside
 from torchcal.discovery.hypotheses.search import Search
@@ -119,9 +120,12 @@ def _at_given_end(search: Search, model: Model, i: int) -> bool:
 
 
 def _no_better(search: Search, model: Model) -> str:
-    """Why a term in a window is hardly likelier than a constant change there; empty if it is clearly so."""
+    """Why a term in a window, or an instrument that errs beyond a value, is hardly likelier than a constant change
+    there; empty if it is clearly so."""
     rival = max(search.nameless, key=lambda one: one.weight, default=None)
-    if model.window is None or rival is None or rival.window is None or rival.weight < model.weight - CLEARLY:
+    if rival is None or rival.window is None or rival.weight < model.weight - CLEARLY:
+        return ""
+    if model.window is None and threshold_of(model.candidate.terms, model.found.by_name) is None:
         return ""
     if search.constants.intersection(model.numbers):  # which has no other shape to show
         return ""

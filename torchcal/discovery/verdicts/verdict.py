@@ -191,11 +191,11 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     )
     # Windows, instruments and several terms, of which they share none, bend to what no term of the list explains.
     shared = set(best.names).intersection(*(m.names for m in decision.tied_models))
-    pliant = all(
+    decision.pliant = all(
         m.window is not None or (len(m.names) > 1 and not shared) or only_instruments(m) for m in decision.tied_models
     )
     likely = decision.none > min(1 - UNKNOWN, _second(decision, ranked))
-    if len(decision.tied) < 2 or likely or local or pliant or decision.doubt:
+    if len(decision.tied) < 2 or likely or local or decision.pliant or decision.doubt:
         decision.tied.append(list(NONE))
     return decision
 

@@ -1,0 +1,140 @@
+"""What looks like an instrument and may be a change of the physics that has no name, and where that is located."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+import torchcal as tc
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.hypotheses.base import calibrate_base
+from torchcal.discovery.misfit.channels import channels
+from torchcal.display import NONE
+
+F64 = torch.float64
+
+
+def diagnose(model, recording, terms):
+    return tc.diagnose(model, recording, terms, seed=0, progress=False)
+
+
+# --- instruments that err beyond a value -----------------------------------------------------------------------------
+
+
+def rotor(seed, *, dragged=0.0, limit=math.inf, c=0.0, sd=0.28):
+    """Two rotors that run down, whose bearings drag more below 35 rad/s, or which are seen by an instrument that shows
+    but a part of what is above a limit."""
+    t = np.linspace(0, 30, 76)
+    rng = np.random.default_rng(seed)
+    runs = []
+    for begin in (80.0, 60.0):
+        w = solve_ivp(
+            lambda t, w: -0.06 * w * (1 + dragged * (w < 35)) - 3e-4 * w**2, (0, 30), [begin], t_eval=t, rtol=1e-9,
+            atol=1e-9, max_step=0.05,
+        ).y[0]  # fmt: skip
+        shown = w - c * np.maximum(w - limit, 0)
+        runs.append(tc.Run(t, {"w": shown + sd * rng.standard_normal(76)}))
+    model = tc.ODESimulator(
+        lambda t, s, p, u: {"w": -p["b"] * s["w"] - p["c"] * s["w"] ** 2},
+        {"w": "rad/s"},
+        [tc.Parameter("b", unit="1/s", low=0.0, initial=0.05), tc.Parameter("c", unit="1/rad", low=0.0, initial=2e-4)],
+    )
+    terms = [
+        tc.Term("cubic drag", equation="w", rate=lambda t, s, p, u: -p["c"] * s["w"] ** 3,
+                parameters=[tc.Parameter("c", low=0.0)]),
+        *tc.terms.sensor(outputs=("w",), units={"w": "rad/s"}, dynamic=False),
+    ]  # fmt: skip
+    return model, tc.Recording(runs=runs, noise=sd, units={"time": "s"}), terms
+
+
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_an_instrument_that_errs_where_the_physics_may_change_is_no_name(seed):
+    d = diagnose(*rotor(seed, dragged=0.25))
+    assert d.verdict in ("ambiguous", "unexplained")
+    assert d.verdict == "unexplained" or list(NONE) in d.tied
+    (row,) = [row for row in d.ranking if row.terms == NONE]
+    assert row.probability > 0.05
+    assert "a change of " in row.note or "would do nearly as well" in d.settings["doubt"]
+
+
+@pytest.mark.slow
+def test_an_instrument_with_a_hard_limit_is_one():
+    d = diagnose(*rotor(0, limit=50.0, c=1.0))
+    assert d.verdict == "named"
+    assert d.terms == ["saturation of w"]
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+def test_a_gain_error_in_a_range_is_no_name_where_a_parameter_does_the_same(seed):
+    rng = np.random.default_rng(seed)
+    x, load = (values.ravel() for values in np.meshgrid(np.linspace(-6, 6, 31), [1.0, 2.0, 3.0], indexing="ij"))
+    y = 1.3 * (1 - 0.06 * (abs(x) > 3.1)) * load * np.tanh(x / 2.2)
+    model = tc.Simulator(
+        lambda x, p: p["a"] * x["L"] * torch.tanh(x["x"] / p["b"]),
+        [tc.Parameter("a", low=0.0, initial=1.0), tc.Parameter("b", low=0.3, high=20.0, initial=2.0)],
+    )
+    recording = tc.Recording(x={"x": x, "L": load}, y=y + 0.015 * rng.standard_normal(len(y)), noise=0.015)
+    d = diagnose(model, recording, tc.terms.sensor(outputs=("y",), static=True))
+    assert d.verdict in ("ambiguous", "unexplained")
+    (row,) = [row for row in d.ranking if row.terms == NONE]
+    assert row.probability > 0.3
+    assert row.note.startswith("a change of a where")
+
+
+# --- parameters that are seen in outputs alone -----------------------------------------------------------------------
+
+
+def charged(loose=0.0):
+    """A capacitor behind a resistance, which its voltage shows beside the charge, and which may grow at t = 60."""
+    t = np.linspace(0, 120, 121)
+    current = np.where((t // 15) % 2 == 0, 1.0, -0.8)
+    held = np.repeat(current[:-1], 1)
+    v = 1.0 + np.concatenate([[0.0], np.cumsum(held * np.diff(t)) / 40])
+    noise = 0.005 * np.random.default_rng(0).standard_normal(len(t))
+    seen = v + 0.1 * (1 + loose * (t >= 60)) * current + noise
+    model = tc.ODESimulator(
+        lambda t, s, p, u: {"v": u["i"] / p["C"]},
+        {"v": "V"},
+        [tc.Parameter("C", unit="F", low=1.0, initial=30.0), tc.Parameter("R", unit="ohm", low=0.0, initial=0.2)],
+        observe={"V": lambda t, s, p, u: s["v"] + p["R"] * u["i"]},
+    )
+    return model, tc.Recording(runs=[tc.Run(t, {"V": seen}, inputs={"i": current}, hold="zero")], noise=0.005)
+
+
+def test_a_parameter_that_is_seen_in_an_output_alone_is_where_a_mismatch_sits():
+    d = diagnose(*charged(loose=0.5), [])
+    assert d.verdict == "unexplained"
+    assert (d.where[0].kind, d.where[0].target, d.where[0].driver) == ("parameter", "R", "t")
+    assert d.where[0].share > 0.9
+
+
+def test_changes_at_all_moments_together_are_one_of_the_parameter():
+    model, recording = charged()
+    base, _ = calibrate_base(Problem.of(model, recording), {}, 4, 0)
+    names = [q.name for q in base.problem.parameters]
+    found = {c.target: c for c in channels(base.problem, base) if c.kind == "parameter"}
+    assert set(found) == {"C", "R"}
+    for name, channel in found.items():
+        every = channel.response(torch.ones(channel.matrix.shape[1], 1, dtype=F64))[:, 0]
+        column = base.jacobian[:, base.free.index(names.index(name))]
+        torch.testing.assert_close(every, column, rtol=1e-6, atol=1e-9)
+
+
+# --- memory of noise where it is not sought --------------------------------------------------------------------------
+
+
+def test_what_is_correlated_along_the_rows_of_a_grid_is_told():
+    rng = np.random.default_rng(0)
+    x, load = (values.ravel() for values in np.meshgrid(np.linspace(-1, 1, 25), [1.0, 2.0, 3.0], indexing="ij"))
+    e = rng.standard_normal(len(x))
+    for k in range(1, len(e)):
+        e[k] = 0.8 * e[k - 1] + 0.6 * e[k]
+    model = tc.Simulator(lambda x, p: p["a"] + p["b"] * x["x"] * x["L"], [tc.Parameter("a"), tc.Parameter("b")])
+    d = diagnose(model, tc.Recording(x={"x": x, "L": load}, y=1 + x * load + 0.05 * e, noise=0.05), [])
+    assert d.verdict == "unexplained"
+    assert any("correlated from row to row" in row for row in d.symptoms)
+    shuffled = rng.permutation(len(x))  # the same in another order, which tells nothing
+    again = tc.Recording(x={"x": x[shuffled], "L": load[shuffled]}, y=(1 + x * load + 0.05 * e)[shuffled], noise=0.05)
+    assert not any("correlated from row to row" in row for row in diagnose(model, again, []).symptoms)
