@@ -13,7 +13,7 @@ from torchcal.discovery.findings.feasible import Feasible
 from torchcal.discovery.findings.limits import limits
 from torchcal.discovery.findings.ranking import ranking
 from torchcal.discovery.findings.result import Diagnosis
-from torchcal.discovery.findings.symptoms import along_rows, more_than_replicates, symptoms, unlike
+from torchcal.discovery.findings.symptoms import in_rows, more_than_replicates, symptoms, unlike
 from torchcal.discovery.findings.where import locate, missing_rate, needed_shifts, sharpened
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.hypotheses import verify
@@ -106,7 +106,7 @@ def conclude(
     any_unlike = bool(apart)
     if decision.verdict != "consistent":
         apart = [*unbounded(search), *begun_elsewhere(search), *more_than_replicates(search, left), *apart]
-        apart += along_rows(search, left)
+        apart += in_rows(search, left)
     if decision.verdict in ("ambiguous", "unexplained"):
         apart = [*held_otherwise(search), *apart]
     remaining, depends = 0.0 if decision.verdict == "consistent" else 1.0, ""

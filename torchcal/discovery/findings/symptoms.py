@@ -10,10 +10,11 @@ from torchcal.discovery.fits.problem import SWEEP, Problem, breaks, remembered
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.noise import GRID, decorrelated, estimate
+from torchcal.discovery.verdicts.doubts import ALONG, along_rows
 from torchcal.discovery.verdicts.explain import estimates, stated_sd
 from torchcal.display import with_unit
 
-__all__ = ["along_rows", "more_than_replicates", "symptoms", "unlike"]
+__all__ = ["in_rows", "more_than_replicates", "symptoms", "unlike"]
 
 #: A base parameter that moves by this many sd when a term is added was bent by it.
 BENT = 3.0
@@ -26,8 +27,6 @@ FAR_SMALLER = 0.15
 #: Data of a run or sweep from which on its noise is compared with that of others; the probability by chance below which
 #: and the ratio of sd from which on they are told to be unlike.
 COMPARED, UNLIKE, RATIO = 12, 0.01, 2.0
-#: Times 1/√n from which on the correlation of n successive rows is told.
-ALONG = 3.0
 #: Times what replicates tell of the noise that means of conditions scatter by, from which on that is told where these
 #: are in no order; levels of a condition that it takes; and how rarely chance may scatter them so.
 SCATTER, MEANS, RARELY = 1.5, 8, 0.005
@@ -162,26 +161,19 @@ def _by_memory(problem: Problem, places: Tensor, residual: Tensor) -> tuple[Tens
     return 0.5 * torch.log1p(-rho.square()).sum(0), decorrelated(residual[:, None], rho).square().sum(0)
 
 
-def along_rows(search: Search, found: Fitted) -> list[str]:
-    """Outputs of which a fit leaves what is correlated along the rows of a grid, in whose order no memory of the noise
-    is sought, in words."""
-    problem, rows = found.problem, list[str]()
-    if problem.in_time or problem.sweeps is not None or search.exact:
-        return rows
-    standard = found.residual / search.noise.sd[problem.index]
-    for number, name in enumerate(problem.recording.outputs):
-        recorded = [standard[places] for places in problem.recorded_of(number)]
-        total = sum(float(part @ part) for part in recorded)
-        count = sum(len(part) - 1 for part in recorded)
-        share = sum(float(part[1:] @ part[:-1]) for part in recorded) / max(total, 1e-300)
-        if count >= ENOUGH and share > ALONG / math.sqrt(count):
-            of = f" of {name}" if len(problem.recording.outputs) > 1 else ""
-            rows.append(
-                f"what is left{of} is correlated from row to row ({share:.2f}): noise with a memory looks like this, "
-                "and is not sought where the rows of a grid are in such an order (but along one condition, or in "
-                f"sweeps of {SWEEP} rows and more): all sd here are those of independent noise"
-            )
-    return rows
+def in_rows(search: Search, found: Fitted) -> list[str]:
+    """That a fit leaves what is correlated along the rows of a grid, in whose order no memory of the noise is sought,
+    in words."""
+    problem = found.problem
+    if problem.in_time or problem.sweeps is not None or search.exact or bool(found.met.all()):
+        return []
+    if along_rows(problem, search.noise.whitening(problem).vector(found.residual)) <= ALONG:
+        return []
+    return [
+        "what is left is correlated from row to row: noise with a memory looks like this, and is not sought where the "
+        f"rows of a grid are in such an order (but along one condition, or in sweeps of {SWEEP} rows and more): all sd "
+        "here are those of independent noise"
+    ]
 
 
 def more_than_replicates(search: Search, found: Fitted) -> list[str]:

@@ -24,7 +24,7 @@ from torchcal.errors import TorchcalError
 from torchcal.simulators import Trajectories
 from torchcal.terms import Term
 
-__all__ = ["by_hold", "distinct", "doubt", "in_common", "in_order", "left_open", "unfit"]
+__all__ = ["ALONG", "along_rows", "by_hold", "distinct", "doubt", "in_common", "in_order", "left_open", "unfit"]
 
 #: Correlation from sample to sample from which on noise of unknown size may be physics that a term has left.
 SLOWEST = 0.85
@@ -298,7 +298,7 @@ def in_order(search: Search, model: Model) -> str:
     if problem.sweeps is not None or bool(model.found.met.all()):
         return ""
     e = beside(search, model).whitening(problem).vector(model.found.residual)
-    if _along_rows(problem, e) <= ALONG:
+    if along_rows(problem, e) <= ALONG:
         return ""
     return (
         "What it leaves is correlated in the order of the recording, as noise or as physics: the same conditions in "
@@ -380,7 +380,7 @@ def _of_two_colours(search: Search, model: Model) -> str:
     return ""
 
 
-def _along_rows(problem: Problem, e: Tensor) -> float:
+def along_rows(problem: Problem, e: Tensor) -> float:
     """Correlation of what is left with the next datum of the recording, in its sd by chance; of the worst output."""
     worst = 0.0
     for k in problem.output_of.unique().tolist():
