@@ -555,7 +555,7 @@ def test_the_windows_of_a_base_are_no_parameters_that_change():
     problem = Problem.of(extend(base, [local]), recording)
     search = Search(problem, [], {}, 0, 4, 1, lambda text: None)
     search.calibrate_base()
-    shifted = {name for (kind, name), in _elsewhere(search, []) if kind == "shifts"}
+    shifted = {name for (kind, name), in _elsewhere(search, [], []) if kind == "shifts"}
     assert shifted == {"in", "k", "out", "second channel.k2"}
 
 

@@ -124,9 +124,8 @@ class _Changes:
         search.constants = {i for i, own in listed.items() if _is_constant(search, alone[i], own)}
         # That of an instrument in a part of its range has no name.
         named = {_places(alone[i]) for i in search.constants if not alone[i].terms[0].outputs}
-        # An instrument that does what a parameter does everywhere is none of it in a part of its range.
-        others = [own for i, own in listed.items() if not alone[i].terms[0].outputs]
-        return cls(search, prior, named, _elsewhere(search, others))
+        physics = [own for i, own in listed.items() if not alone[i].terms[0].outputs]
+        return cls(search, prior, named, _elsewhere(search, list(listed.values()), physics))
 
     def hold_against(self, lead: Model) -> None:
         """Refit changes beside the leading terms in windows: where these act, but no constants that the list names; and
@@ -201,9 +200,13 @@ def _beyond(search: Search, model: Model) -> list[Model]:
     return models
 
 
-def _elsewhere(search: Search, listed: list[Tensor]) -> dict[Places, Tensor]:
+def _elsewhere(search: Search, listed: list[Tensor], physics: list[Tensor]) -> dict[Places, Tensor]:
     """Every calibrated parameter of the base that is no window's, and the gain of every output, with its effect
-    ``(n, 1)``; but what is the same as another or as an effect of the list."""
+    ``(n, 1)``; but what is the same as another or as an effect of the list.
+
+    An instrument of the list that does what a parameter does everywhere has no better claim to a part of the range: of
+    a parameter what counts is the list's ``physics`` alone.
+    """
     problem = search.base.problem
     simulator = problem.simulator
     declared = simulator.ode.parameters if isinstance(simulator, Trajectories) else problem.parameters
@@ -212,7 +215,8 @@ def _elsewhere(search: Search, listed: list[Tensor]) -> dict[Places, Tensor]:
     found: dict[Places, Tensor] = {}
     for place in [("shifts", name) for name in names] + [("gains", name) for name in search.problem.recording.outputs]:
         own = _effect(search, _constant((place,), search.problem.in_time))
-        if own is not None and own.norm() > 0 and not any(_within(own, other) for other in (*listed, *found.values())):
+        same = (*(physics if place[0] == "shifts" else listed), *found.values())
+        if own is not None and own.norm() > 0 and not any(_within(own, other) for other in same):
             found[(place,)] = own
     return found
 
