@@ -208,6 +208,8 @@ EXACT_Y = 1 + 2 * X
         pytest.param({"order": 0}, DomainError, id="order 0"),
         pytest.param({"rule": "gauss"}, DomainError, id="rule in words"),
         pytest.param({"rule": 1}, DomainError, id="one node for a line in ξ"),
+        pytest.param({"rule": np.int64(1)}, DomainError, id="one node of NumPy's"),
+        pytest.param({"rule": True}, DomainError, id="rule as a bool"),
         pytest.param(
             {"rule": 2, "embedding": tc.embeddings.PolynomialChaos(order=2)}, DomainError, id="two nodes for a parabola"
         ),

@@ -5,6 +5,7 @@ import math
 import re
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
@@ -407,6 +408,8 @@ def _begun(recording, x):
         ({"x": 3.0}, r"'x': \(low, high\).*Got 3.0"),
         ({"x": ("a", None)}, r"'x': \(low, high\)"),
         ({"x": (math.nan, 1)}, r"'x': \(low, high\)"),
+        ({"x": (0, 10**400)}, r"'x': \(low, high\)"),
+        ({"x": {0: 1, 2: 3}}, r"'x': \(low, high\)"),
         ([("x", (0, 1))], r"feasible=\{name"),
     ],
 )
@@ -414,6 +417,49 @@ def test_what_is_feasible_is_told_in_ranges_of_what_can_be_chosen(given, told):
     model = driven({"x": 0.5, "v": 0.0})
     with pytest.raises(tc.errors.DomainError, match=told):
         tc.diagnose(model.problem.simulator.ode, model.problem.recording, feasible=given, progress=False)
+
+
+def test_numbers_of_any_kind_are_ends():
+    model = driven({"x": 0.5, "v": 0.0})
+    given = {"x": torch.tensor([0.0, 1.0]), "v": [np.float32(-1), None], "f": (torch.tensor(0.5), 2)}
+    found = Feasible.of(given, model.problem.simulator.ode, model.problem.recording)
+    assert found == {"x": (0.0, 1.0), "v": (-1.0, math.inf), "f": (0.5, 2.0)}
+
+
+def test_a_state_that_the_simulator_begins_itself_is_none_to_choose():
+    model = driven({"x": 0.5, "v": 0.0})
+    ode = tc.ODESimulator(
+        lambda t, s, p, u: {"x": -p["k"] * s["x"]}, {"x": "m"}, [tc.Parameter("k")], initial={"x": lambda s, p: 2.0}
+    )
+    with pytest.raises(tc.errors.DomainError, match=r"some of \['t', 'f'\]"):
+        Feasible.of({"x": (0, 1)}, ode, model.problem.recording)
+
+
+def test_experiments_begin_where_that_is_feasible_and_end_in_time():
+    model = driven({"x": 0.5, "v": 0.0})
+    feasible = Feasible.of({"x": (0.7, 1.0), "t": (0, 4.0)}, model.problem.simulator.ode, model.problem.recording)
+    options = [*conditions.simple(model, feasible), *conditions.bolder(model, feasible)]
+    texts = [text for text, _, _ in options]
+    assert "the first run again, but from x = 0.7, until t = 4" in texts
+    assert "a run with 2 times the inputs of the first, but from x = 0.7, until t = 4" in texts
+    assert not [text for text in texts if "three times as long" in text]
+    for _, new, chosen in options:
+        assert 0.7 <= chosen["initial"]["x"] <= 1.0
+        assert new.runs[0].time[-1] <= 4.0
+        assert len(chosen["inputs"]["f"]) == len(chosen["time"]) == len(new.runs[0].time)
+
+
+def test_conditions_that_are_feasible_beside_or_within_the_recorded_ones_are_tried():
+    x = torch.linspace(10, 20, 30, dtype=F64)
+    recording = tc.Recording(x={"T": x, "L": x.flip(0)}, y=torch.zeros(30, dtype=F64))
+    model = SimpleNamespace(problem=SimpleNamespace(in_time=False, recording=recording))
+    for low, high in ((12.0, 13.0), (2.0, 3.0), (25.0, 30.0)):
+        feasible = Feasible.of({"T": (low, high)}, None, recording)
+        options = {text: chosen["x"]["T"] for text, _, chosen in conditions.simple(model, feasible)}
+        there = options[f"conditions with T between {low:g} and {high:g}"]
+        assert [float(there.min()), float(there.max())] == pytest.approx([low, high])
+        assert all(low <= float(T.min()) <= float(T.max()) <= high for T in options.values())
+        assert "the same conditions again" not in options
 
 
 def test_a_diagnosis_proposes_what_is_feasible():

@@ -169,6 +169,7 @@ def conclude(
             "depends": depends,
             "unknown_beside": decision.beside,
             "pliant": decision.pliant,
+            "feasible": dict(asked.feasible),
             "nearly": decision.nearly,
             "lost": lost,
             "unlike": any_unlike,

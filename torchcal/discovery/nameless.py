@@ -46,8 +46,9 @@ __all__ = ["refit_nameless"]
 #: Log weight behind the leader down to which a term in a window is held against nameless changes, and of how many; and
 #: against how many changes elsewhere than where it acts.
 CLOSE, MOST, ELSEWHERE = 3.0, 3, 2
-#: Changes of parameters, each in a range of a driver, that an instrument with a threshold is held against.
-BEYOND = 4
+#: Changes of parameters, each in a range of a driver, that an instrument with a threshold is held against; and log
+#: weight behind it from which on one of them is tried in other shapes than a step.
+BEYOND, NEAR = 4, 20.0
 #: Terms that are tried in all windows of a driver, and places where these may begin or end.
 TRIED, CUTS = 4, 14
 #: Places within an open window where a nameless change may begin or end, and starts that are refitted with each width
@@ -78,7 +79,7 @@ def refit_nameless(search: Search) -> None:
         lead = likeliest_alone(search) or lead
     if lead.window is None:
         if beyond := _beyond(search, lead):
-            _Changes.of(search).hold_beyond(beyond)
+            _Changes.of(search).hold_beyond(beyond, lead)
         return
     changes = _Changes.of(search)
     changes.hold_against(lead)
@@ -154,20 +155,24 @@ class _Changes:
                 wanted[place, window.driver] = begun
         self._refit([one for each in wanted.values() for one in each])
 
-    def hold_beyond(self, models: Sequence[Model]) -> None:
-        """Refit changes of the base's parameters in the ranges in which an instrument errs."""
+    def hold_beyond(self, models: Sequence[Model], lead: Model) -> None:
+        """Refit changes of the base's parameters in the ranges in which an instrument of the leader errs: a step each,
+        and in other shapes what comes near."""
         found = []
         for model in models:
             for place in self.elsewhere:
                 if place[0][0] == "shifts":
                     begun, chi2 = _wanted(self.search, model, place, self.prior, self.named)
                     found += [(chi2, begun)] if math.isfinite(chi2) else []
-        nearest = sorted(found, key=lambda one: one[0])[:BEYOND]
-        self._refit([one for _, begun in nearest for one in begun])
+        nearest = [begun for _, begun in sorted(found, key=lambda one: one[0])[:BEYOND] if begun]
+        steps = self._refit([begun[0] for begun in nearest])
+        near = [one is not None and one.weight > lead.weight - NEAR for one in steps]
+        self._refit([one for begun, is_near in zip(nearest, near, strict=True) if is_near for one in begun[1:]])
 
-    def _refit(self, wanted: Sequence[Hypothetical]) -> None:
-        refitted = map(long_enough, _refitted(self.search, wanted))
-        self.search.nameless += [one for one in refitted if one is not None and one.physical]
+    def _refit(self, wanted: Sequence[Hypothetical]) -> list[Model | None]:
+        found = [long_enough(one) for one in _refitted(self.search, wanted)]
+        self.search.nameless += [one for one in found if one is not None and one.physical]
+        return found
 
 
 def _beyond(search: Search, model: Model) -> list[Model]:

@@ -23,6 +23,7 @@ from torchcal.errors import (
 )
 from torchcal.inference.fitting import allowed_solver_error
 from torchcal.models import Problem
+from torchcal.polychaos import Rule
 from torchcal.priors import CoefficientPrior
 from torchcal.propagation import NISP, RuleChoice
 from torchcal.simulators import Parameter, Scaling, Simulator, Trajectories, check_slopes, free_parameters, workable
@@ -113,7 +114,9 @@ def check_dtype(recording: Recording, dtype: torch.dtype) -> None:
 def check_rule(rule: Any, pattern: Pattern) -> None:
     """Raise for so few nodes that a user asks for that outputs do not tell all coefficients."""
     least = pattern.order + 1
-    if pattern.num_germs and isinstance(rule, int) and 1 <= rule < least:
+    if rule is None or isinstance(rule, Rule) or not pattern.num_germs:
+        return
+    if whole("rule", rule, 1, also="a torchcal.polychaos.Rule or None") < least:
         raise DomainError(
             f"Expected rule= of at least {least} Gauss nodes a germ for an embedding of order {pattern.order}: with "
             f"fewer the spread of outputs does not tell all coefficients. Got {rule} (leave it out, and enough are "

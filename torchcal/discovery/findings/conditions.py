@@ -29,6 +29,8 @@ MULTIPLES, BOLD, ALONE = (2.0, 0.5, 3.0), (5.0,), 3.0
 BEYOND, FAR_BEYOND = 0.5, 1.5
 #: Bolder experiments on a static recording at most, those that move one condition first.
 MOST = 60
+#: Samples of a run at least that is cut where time is not feasible any more.
+SHORTEST = 5
 #: Share of its largest value up to which a state begins at nothing, of which a multiple is nothing too.
 NOTHING = 0.01
 
@@ -48,12 +50,14 @@ class _Begin:
         zero: What multiples of it are counted from: 0, of a temperature the lowest in any run.
         largest: Its value farthest from there in any run.
         mirrored: Whether all of them may be mirrored.
+        elsewhere: Where that is not, as it is not feasible, in words.
     """
 
     values: dict[str, float]
     zero: dict[str, float]
     largest: dict[str, float]
     mirrored: bool
+    elsewhere: str
 
     @property
     def moves(self) -> bool:
@@ -87,9 +91,9 @@ def simple(model: Fitted, feasible: Feasible = ANYWHERE) -> list[Option]:
     """
     recording = model.problem.recording
     if not model.problem.in_time:
-        return _allowed(_static(recording, feasible), feasible)
-    begin = _states(model)
-    ask = _ask(recording, begin.values)
+        return _allowed(recording, _static(recording, feasible), feasible)
+    begin = _states(model, feasible)
+    ask = _ask(recording, begin.values) + begin.elsewhere
     options = [_run(recording, "the first run again" + ask, begin.values)]
     options += _elsewhere(recording, begin, (*MULTIPLES, -1.0) if begin.mirrored else MULTIPLES)
     options += _stronger(recording, begin, ask, MULTIPLES)
@@ -97,7 +101,7 @@ def simple(model: Fitted, feasible: Feasible = ANYWHERE) -> list[Option]:
     if begin.moves:
         text = f"a run that starts from 2 times the initial states{begin.counted} and is twice as long"
         options.append(_run(recording, text, begin.times(2.0), copies=2))
-    return _allowed([*options, *_at_ends(recording, begin, ask, feasible)], feasible)
+    return _allowed(recording, [*options, *_at_ends(recording, begin, ask, feasible)], feasible)
 
 
 def bolder(model: Fitted, feasible: Feasible = ANYWHERE) -> list[Option]:
@@ -108,9 +112,9 @@ def bolder(model: Fitted, feasible: Feasible = ANYWHERE) -> list[Option]:
     """
     recording = model.problem.recording
     if not model.problem.in_time:
-        return _allowed(_static_bolder(recording, feasible), feasible)
-    begin = _states(model)
-    values, ask = begin.values, _ask(recording, begin.values)
+        return _allowed(recording, _static_bolder(recording, feasible), feasible)
+    begin = _states(model, feasible)
+    values, ask = begin.values, _ask(recording, begin.values) + begin.elsewhere
     options = _elsewhere(recording, begin, BOLD)
     for name, value in values.items():
         others = _ask(recording, [one for one in values if one != name])
@@ -133,7 +137,7 @@ def bolder(model: Fitted, feasible: Feasible = ANYWHERE) -> list[Option]:
         options.append(_run(recording, f"a run with the inputs held at their largest{ask}", values, change=steady))
         for factor, text in ((2.0, "twice as slowly"), (0.5, "twice as fast")):
             options.append(_run(recording, f"a run with the inputs of the first {text}{ask}", values, slower=factor))
-    return _allowed(options, feasible)
+    return _allowed(recording, options, feasible)
 
 
 def denser(option: Option, recording: Recording, times: int) -> Option:
@@ -151,8 +155,27 @@ def denser(option: Option, recording: Recording, times: int) -> Option:
     return text, Recording(runs=[_blank_run(recording, dense)]), dense
 
 
-def _allowed(options: Sequence[Option], feasible: Feasible) -> list[Option]:
-    return [option for option in options if feasible.allows(option[1])]
+def _allowed(recording: Recording, options: Sequence[Option], feasible: Feasible) -> list[Option]:
+    """Those that are feasible, runs for as long as that is."""
+    return [option for option in (_cut(recording, one, feasible) for one in options) if feasible.allows(option[1])]
+
+
+def _cut(recording: Recording, option: Option, feasible: Feasible) -> Option:
+    """A run until the last time that is feasible; as it is where no more than the first would be left of a longer one.
+    """
+    text, _, chosen = option
+    last = feasible.get("t", (math.inf,))[-1]
+    if recording.runs is None or float(chosen["time"][-1]) <= last:
+        return option
+    first = float(recording.runs[0].time[-1])
+    if last <= first < float(chosen["time"][-1]):
+        return option
+    kept = chosen["time"] <= last
+    if int(kept.sum()) < SHORTEST:
+        return option
+    inputs = {name: values[kept] for name, values in chosen["inputs"].items()}
+    chosen = {**chosen, "time": chosen["time"][kept], "inputs": inputs}
+    return f"{text}, until t = {last:.4g}", Recording(runs=[_blank_run(recording, chosen)]), chosen
 
 
 def _at_ends(recording: Recording, begin: _Begin, ask: str, feasible: Feasible) -> list[Option]:
@@ -177,11 +200,11 @@ def _runs(recording: Recording) -> tuple[Run, ...]:
     return tuple(recording.runs or ())
 
 
-def _states(model: Fitted) -> _Begin:
+def _states(model: Fitted, feasible: Feasible) -> _Begin:
     """Of every state that an experiment may choose."""
     bound = model.problem.simulator
     if not isinstance(bound, Trajectories):
-        return _Begin({}, {}, {}, False)
+        return _Begin({}, {}, {}, False, "")
     states = bound.solve(model.values[None], model.warm)[0]
     places = {name: i for i, name in enumerate(bound.ode.states) if name not in bound.ode.initial}
     begin = {name: float(states[0, 0, i]) for name, i in places.items()}
@@ -190,7 +213,10 @@ def _states(model: Fitted) -> _Begin:
     largest = {name: float(values[int((values - zero[name]).abs().argmax())]) for name, values in along.items()}
     # Only what has had either sign is mirrored: an absolute temperature or an amount cannot be.
     mirrored = bool(along) and all(bool((v < 0).any() and (v > 0).any()) for v in along.values())
-    return _Begin(begin, zero, largest, mirrored and not any(zero.values()))
+    moved = {name: feasible.clipped(name, value) for name, value in begin.items()}
+    told = [f"{name} = {moved[name]:.4g}" for name, value in begin.items() if moved[name] != value]
+    elsewhere = f", but from {' and '.join(told)}" if told else ""
+    return _Begin(moved, zero, largest, mirrored and not any(zero.values()), elsewhere)
 
 
 def _zero(values: Tensor, unit: str | None) -> float:
@@ -273,15 +299,19 @@ def _conditions(recording: Recording) -> dict[str, Tensor]:
 
 def _static(recording: Recording, feasible: Feasible) -> list[Option]:
     x = _conditions(recording)
-    found = [_moved(recording, "the same conditions again", {})]
+    again = _moved(recording, "the same conditions again", {}, feasible)
+    found = [again] if all(torch.equal(again[2]["x"][name], values) for name, values in x.items()) else []
     for name, values in x.items():
         cuts = values.quantile(torch.tensor([0.0, 1 / 3, 2 / 3, 1.0], dtype=values.dtype)).tolist()
-        thirds = [(a, b) for a, b in itertools.pairwise(cuts) if b > a]
+        ranges = [feasible.within(name, a, b) for a, b in itertools.pairwise(cuts) if b > a]
+        if len(feasible.ends(name)) > 1:
+            ranges.append(feasible.within(name, *feasible[name]))
+        thirds = [ends for ends in dict.fromkeys(ranges) if ends is not None]
         for text, ends in zip(between(thirds, "and"), thirds, strict=True):
-            found.append(_moved(recording, f"conditions with {name} between {text}", {name: ends}))
+            found.append(_moved(recording, f"conditions with {name} between {text}", {name: ends}, feasible))
     for name in x:
         for text, ends in _outside(recording, name, BEYOND, feasible):
-            found.append(_moved(recording, f"conditions with {name} {text}", {name: ends}))
+            found.append(_moved(recording, f"conditions with {name} {text}", {name: ends}, feasible))
     return found
 
 
@@ -290,12 +320,12 @@ def _static_bolder(recording: Recording, feasible: Feasible) -> list[Option]:
     names = list(_conditions(recording))
     for name in names:
         for text, ends in _outside(recording, name, FAR_BEYOND, feasible):
-            found.append(_moved(recording, f"conditions with {name} {text}", {name: ends}))
+            found.append(_moved(recording, f"conditions with {name} {text}", {name: ends}, feasible))
     for one, other in itertools.combinations(names, 2):
         corners = itertools.product(*(_outside(recording, name, BEYOND, feasible) for name in (one, other)))
         for (first, ends), (second, others) in corners:
             text = f"conditions with {one} {first}, and {other} {second}"
-            found.append(_moved(recording, text, {one: ends, other: others}))
+            found.append(_moved(recording, text, {one: ends, other: others}, feasible))
     return found[:MOST]
 
 
@@ -318,9 +348,15 @@ def _outside(
     return found
 
 
-def _moved(recording: Recording, text: str, ranges: Mapping[str, tuple[float, float]]) -> Option:
-    """As many conditions, those named evenly over new ranges, the second of two in an order that crosses the first."""
-    x = {name: values.clone() for name, values in _conditions(recording).items()}
+def _moved(
+    recording: Recording, text: str, ranges: Mapping[str, tuple[float, float]], feasible: Feasible
+) -> Option:
+    """As many conditions, those named evenly over new ranges, the second of two in an order that crosses the first; the
+    others as they are, or as near to that as is feasible."""
+    x = {
+        name: values.clamp(feasible.clipped(name, -math.inf), feasible.clipped(name, math.inf))
+        for name, values in _conditions(recording).items()
+    }
     for k, (name, (first, last)) in enumerate(ranges.items()):
         along = torch.linspace(first, last, recording.n, dtype=torch.float64)
         x[name] = along if k == 0 else along[_crossed(recording.n)]

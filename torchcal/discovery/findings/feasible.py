@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping
-from numbers import Real
 from typing import Any
 
 from torchcal.data import Recording
@@ -29,7 +28,7 @@ class Feasible(dict[str, tuple[float, float]]):
             return cls()
         if isinstance(simulator, ODESimulator):
             inputs = recording.runs[0].inputs if recording.runs else {}
-            known = ["t", *simulator.states, *inputs]
+            known = ["t", *(name for name in simulator.states if name not in simulator.initial), *inputs]
         else:
             known = list(recording.x) if isinstance(recording.x, dict) else ["x"]
         if not isinstance(given, Mapping):
@@ -41,16 +40,24 @@ class Feasible(dict[str, tuple[float, float]]):
                     f"Expected feasible= for some of {known}, which an experiment may choose. Got {name!r}."
                 )
             try:
+                if isinstance(ends, Mapping | str):
+                    raise TypeError(ends)
                 low, high = ends
-            except (TypeError, ValueError):
+                low, high = _end(low, -math.inf), _end(high, math.inf)
+            except (TypeError, ValueError, OverflowError):
                 low = high = math.nan
-            low, high = (open_end if end is None else end for end, open_end in ((low, -math.inf), (high, math.inf)))
-            if not (all(isinstance(end, Real) and not isinstance(end, bool) for end in (low, high)) and low <= high):
+            if not low <= high:
                 raise DomainError(
-                    f"Expected feasible={{{name!r}: (low, high)}} with low <= high, None for an open end. Got {ends!r}."
+                    f"Expected feasible={{{name!r}: (low, high)}}, two numbers with low <= high, None for an open end. "
+                    f"Got {ends!r}."
                 )
-            found[name] = float(low), float(high)
+            found[name] = low, high
         return found
+
+    def within(self, name: str, low: float, high: float) -> tuple[float, float] | None:
+        """The part of a range that is feasible; None where that is none."""
+        low, high = max(low, self.get(name, (-math.inf,))[0]), min(high, self.get(name, (math.inf,))[-1])
+        return (low, high) if low < high else None
 
     def clipped(self, name: str, value: float) -> float:
         """The nearest value that is feasible."""
@@ -78,3 +85,11 @@ class Feasible(dict[str, tuple[float, float]]):
         low, high = self.get(name, (-math.inf, math.inf))
         room = 1e-9 * max([abs(end) for end in self.ends(name)], default=0.0)
         return all(low - room <= value <= high + room for value in values)
+
+
+def _end(given: Any, infinite: float) -> float:
+    if given is None:
+        return infinite
+    if isinstance(given, bool | str):
+        raise ValueError(given)
+    return float(given)

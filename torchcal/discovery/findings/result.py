@@ -69,6 +69,7 @@ class Diagnosis:
             empty), ``depends`` (which estimate rests on what acts beside it, in words, or empty), ``pliant`` (whether
             all that is tied may stand for what is in no list), ``nearly`` (whether the name rests on the share of the
             misfit removed), ``set_aside`` (terms that may explain the outliers),
+            ``feasible`` (as given),
             ``unknown_beside`` (terms beside which something unknown is likelier than alone),
             ``interrupted`` (what had not been refitted then, in words, or empty), ``region`` of a named local term;
             and ``seed`` and ``solver``.

@@ -153,7 +153,8 @@ def ambiguous(d: Any) -> list[str]:
     if d.experiment is not None:
         parts += experiment_told(d)
     elif sum(any(row.refitted and set(row.terms) == set(tied) for row in d.ranking) for tied in known) > 1:
-        parts.append("None of the experiments that were tried in thought would tell them apart.")
+        which = " that are feasible and" if d.settings.get("feasible") else " that"
+        parts.append(f"None of the experiments{which} were tried in thought would tell them apart.")
     return parts
 
 

@@ -84,9 +84,10 @@ def check_measured(problem: Problem, term: Term) -> None:
     for name, given in term.constants.items():
         drivers[name] = (given,) if isinstance(given, str) else given if isinstance(given, tuple) else ()
     for name, several in drivers.items():
-        if unknown := [driver for driver in several if driver not in known]:
+        among = known if len(several) == 1 else conditions  # vectors are made of what varies along the data
+        if unknown := [driver for driver in several if driver not in among]:
             raise DomainError(
-                f"Expected the term {term.name!r} to measure {name!r} on the scale of some of {known}. Got "
+                f"Expected the term {term.name!r} to measure {name!r} on the scale of some of {among}. Got "
                 f"{unknown[0]!r}."
             )
 

@@ -108,7 +108,8 @@ def missing_rate(
         DomainError: If an attribute is not there.
         ShapeError: If values, rate and sd are not of one length.
     """
-    expect("missing", missing, ("kind", "target", "driver", "values", "rate", "sd", "unit"), ".missing")
+    in_time = ("time", "along") if getattr(missing, "driver", None) == "t" else ()
+    expect("missing", missing, ("kind", "target", "driver", "values", "rate", "sd", "unit", *in_time), ".missing")
     look = Look(units=units or {}, labels=labels or {})
     x = as_numbers(missing.values, "values")
     rate, sd = as_numbers(missing.rate, "rate", len(x)), as_numbers(missing.sd, "sd", len(x))
