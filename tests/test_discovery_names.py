@@ -269,10 +269,10 @@ def test_noise_along_the_rows_of_a_grid_is_given_no_name():
         assert diagnose(base, recording, terms).verdict != "named"
     problem = Problem.of(base, recordings[0])
     assert problem.sweeps is None  # of four rows each
-    slow = [doubts._along_rows(problem, correlated(60, seed, 0.6)) for seed in range(6)]
+    slow = [doubts.along_rows(problem, correlated(60, seed, 0.6)) for seed in range(6)]
     assert min(slow) > 2.0
     assert max(slow) > doubts.ALONG
-    white = [doubts._along_rows(problem, normal(60, seed)) for seed in range(200)]
+    white = [doubts.along_rows(problem, normal(60, seed)) for seed in range(200)]
     assert sum(found > doubts.ALONG for found in white) <= 2  # 1 in 2000 by chance
 
 

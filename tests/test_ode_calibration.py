@@ -383,7 +383,7 @@ def test_predictions_that_cannot_be_made(calibration: Calibration) -> None:
         calibration.predict([1.0, 5.5])
     with pytest.raises(DomainError, match="times from 0 on in run 0"):
         calibration.predict([-0.1, 1.0])
-    with pytest.raises(DomainError, match=r"runs from 0 to 0. Got 1"):
+    with pytest.raises(DomainError, match=r"runs as whole numbers from 0 to 0. Got 1"):
         calibration.predict({"time": [1.0], "run": [1.0]})
     with pytest.raises(DomainError, match="Got a static recording"):
         calibration.predict(tc.Recording(x=[0.0, 1.0], y=[0.0, 1.0]))

@@ -226,7 +226,7 @@ def test_a_failure_leaves_the_old_page(tmp_path, monkeypatch):
             report.write(cooling(), path)
     d = cooling()
     d.ranking = [SimpleNamespace(terms=("broken",))]
-    with pytest.raises(AttributeError):
+    with pytest.raises(DomainError, match="no 'log_evidence'"):
         report.write(d, path)
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
