@@ -47,7 +47,7 @@ __all__ = ["refit_nameless"]
 #: against how many changes elsewhere than where it acts.
 CLOSE, MOST, ELSEWHERE = 3.0, 3, 2
 #: Changes of parameters, each in a range of a driver, that an instrument with a threshold is held against; and log
-#: weight behind it from which on one of them is tried in other shapes than a step.
+#: weight behind it from which on the best of them is tried with other edges than a step's.
 BEYOND, NEAR = 4, 20.0
 #: Terms that are tried in all windows of a driver, and places where these may begin or end.
 TRIED, CUTS = 4, 14
@@ -157,7 +157,7 @@ class _Changes:
 
     def hold_beyond(self, models: Sequence[Model], lead: Model) -> None:
         """Refit changes of the base's parameters in the ranges in which an instrument of the leader errs: a step each,
-        and in other shapes what comes near."""
+        and the best of them with edges to fit where it comes near."""
         found = []
         for model in models:
             for place in self.elsewhere:
@@ -166,8 +166,9 @@ class _Changes:
                     found += [(chi2, begun)] if math.isfinite(chi2) else []
         nearest = [begun for _, begun in sorted(found, key=lambda one: one[0])[:BEYOND] if begun]
         steps = self._refit([begun[0] for begun in nearest])
-        near = [one is not None and one.weight > lead.weight - NEAR for one in steps]
-        self._refit([one for begun, is_near in zip(nearest, near, strict=True) if is_near for one in begun[1:]])
+        weights = [-math.inf if one is None else one.weight for one in steps]
+        if weights and max(weights) > lead.weight - NEAR:
+            self._refit(nearest[weights.index(max(weights))][1:2])
 
     def _refit(self, wanted: Sequence[Hypothetical]) -> list[Model | None]:
         found = [long_enough(one) for one in _refitted(self.search, wanted)]
