@@ -190,16 +190,21 @@ def fading(simulator: Trajectories, values: Tensor, states: Tensor) -> bool:
     else implicit steps would have to be as short. Where the solution is not finite anything may."""
     if not bool(torch.isfinite(states).all()):
         return True
-    t, h, u = simulator.grid.flat
-    slopes = simulator.steps.slopes_at(values, states[:, :, :-1], t, {name: table[0] for name, table in u.items()})
-    possible = slopes.abs().sum(-1).amax(-1) * h > FADING
+    slopes, h = _slopes_begun(simulator, values, states)
     if not bool(slopes.isfinite().all()):
         return True
+    possible = slopes.abs().sum(-1).amax(-1) * h > FADING
     if not bool(possible.any()):
         return False
     z = torch.linalg.eigvals(slopes[possible]) * h.expand(possible.shape)[possible][:, None]
     fastest = torch.where(z.real < 0, z.abs(), torch.zeros_like(z.real)).amax(-1)
     return bool(((fastest > FADING) & (fastest > FADES_FASTER * z.real.amax(-1))).any())
+
+
+def _slopes_begun(simulator: Trajectories, values: Tensor, states: Tensor) -> tuple[Tensor, Tensor]:
+    """Slopes of the rates where steps begin, ``(H, M, S, S)``, and the lengths of the steps, ``(M,)``."""
+    t, h, u = simulator.grid.flat
+    return simulator.steps.slopes_at(values, states[:, :, :-1], t, {name: table[0] for name, table in u.items()}), h
 
 
 def outgrown(simulator: Trajectories, values: Tensor, states: Tensor) -> bool:
@@ -294,8 +299,7 @@ def _magnifying(simulator: Trajectories, values: Tensor, states: Tensor) -> floa
         return 0.0
     few = torch.linspace(0, len(values) - 1, min(LOOKED_AT, len(values))).long()
     values, states = values[few], states[few]
-    t, h, u = simulator.grid.flat
-    slopes = simulator.steps.slopes_at(values, states[:, :, :-1], t, {name: table[0] for name, table in u.items()})
+    slopes, h = _slopes_begun(simulator, values, states)
     growth, size = (torch.zeros(slopes.shape[:2], dtype=slopes.dtype) for _ in range(2))
     slopes = FASTER * slopes
     possible = (slopes.abs().sum(-1).amax(-1) * h > UNSTABLE) & slopes.isfinite().flatten(2).all(-1)

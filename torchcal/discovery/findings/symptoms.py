@@ -10,7 +10,7 @@ from torchcal.discovery.fits.problem import SWEEP, Problem, breaks, remembered
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.noise import GRID, decorrelated, estimate
-from torchcal.discovery.verdicts.doubts import ALONG, along_rows
+from torchcal.discovery.verdicts.doubts import goes_on
 from torchcal.discovery.verdicts.explain import estimates, stated_sd
 from torchcal.display import with_unit
 
@@ -164,10 +164,7 @@ def _by_memory(problem: Problem, places: Tensor, residual: Tensor) -> tuple[Tens
 def in_rows(search: Search, found: Fitted) -> list[str]:
     """That a fit leaves what is correlated along the rows of a grid, in whose order no memory of the noise is sought,
     in words."""
-    problem = found.problem
-    if problem.in_time or problem.sweeps is not None or search.exact or bool(found.met.all()):
-        return []
-    if along_rows(problem, search.noise.whitening(problem).vector(found.residual)) <= ALONG:
+    if search.exact or not goes_on(found, search.noise):
         return []
     return [
         "what is left is correlated from row to row: noise with a memory looks like this, and is not sought where the "

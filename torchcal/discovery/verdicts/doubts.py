@@ -8,14 +8,14 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from torchcal.discovery.fits.fitting import weighed
+from torchcal.discovery.fits.fitting import Fitted, weighed
 from torchcal.discovery.fits.local import force, is_window
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.readings import threshold_of
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.own_noise import beside
 from torchcal.discovery.hypotheses.search import Search
-from torchcal.discovery.misfit.noise import GRID, LEAST, log_prior
+from torchcal.discovery.misfit.noise import GRID, LEAST, Noise, log_prior
 from torchcal.discovery.verdicts.explain import misfit_size, stated_sd
 from torchcal.discovery.verdicts.given import as_good
 from torchcal.discovery.verdicts.instruments import no_instrument, unnatural
@@ -24,7 +24,8 @@ from torchcal.errors import TorchcalError
 from torchcal.simulators import Trajectories
 from torchcal.terms import Term
 
-__all__ = ["ALONG", "along_rows", "by_hold", "distinct", "doubt", "in_common", "in_order", "left_open", "unfit"]
+__all__ = ["ALONG", "along_rows", "by_hold", "distinct", "doubt", "goes_on", "in_common", "in_order", "left_open",
+           "unfit"]  # fmt: skip
 
 #: Correlation from sample to sample from which on noise of unknown size may be physics that a term has left.
 SLOWEST = 0.85
@@ -294,16 +295,20 @@ def _noise_or_physics(search: Search, model: Model) -> str:
 
 def in_order(search: Search, model: Model) -> str:
     """Whether what a model leaves goes on from row to row though rows are in no order, in a sentence; empty if not."""
-    problem = model.found.problem
-    if problem.sweeps is not None or bool(model.found.met.all()):
-        return ""
-    e = beside(search, model).whitening(problem).vector(model.found.residual)
-    if along_rows(problem, e) <= ALONG:
+    if not goes_on(model.found, beside(search, model)):
         return ""
     return (
         "What it leaves is correlated in the order of the recording, as noise or as physics: the same conditions in "
         "another order would tell."
     )
+
+
+def goes_on(found: Fitted, noise: Noise) -> bool:
+    """Whether what a fit leaves goes on from row to row of a grid, in whose order no memory of the noise is sought."""
+    problem = found.problem
+    if problem.sweeps is not None or bool(found.met.all()):
+        return False
+    return along_rows(problem, noise.whitening(problem).vector(found.residual)) > ALONG
 
 
 def _evenness(e: Tensor) -> float:
