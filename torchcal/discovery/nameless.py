@@ -9,22 +9,21 @@ A term whose window leaves something is tried in all others: from the base alone
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchcal.discovery.fits.candidates import Candidate, prepare
+from torchcal.discovery.fits.changes import Places, constant_change, distance, fading_to, places_of
 from torchcal.discovery.fits.local import (
     EDGE,
     ENDS,
     WIDTH_OF_EDGE,
     WIDTHS,
     Span,
-    driver_at,
     is_window,
     localised,
     multiplied,
@@ -38,7 +37,7 @@ from torchcal.discovery.misfit.channels import channels
 from torchcal.discovery.verdicts.verdict import PLAINLY_WHITE
 from torchcal.discovery.windows import long_enough, stepped
 from torchcal.errors import DomainError, SimulatorError
-from torchcal.simulators import Parameter, Trajectories, is_value_of
+from torchcal.simulators import Trajectories, is_value_of
 from torchcal.terms import Term
 
 __all__ = ["refit_nameless"]
@@ -56,17 +55,12 @@ TRIED, CUTS = 4, 14
 INSIDE, STARTS = 10, 2
 #: Shares of a window by which its ends are moved for other starts; not at all first.
 MOVES = (0.0, -0.15, 0.15, -0.3, 0.3)
-#: Share that is left of a fading change at the end of its window.
-FADED = 0.05
 #: What the name of a term that fades begins with.
 FADING = "a fading "
 #: Share of an output's data from which on a range of a driver is where an instrument errs.
 ALIKE = 0.9
 #: Relative difference up to which two effects are one, and relative size from which on two are independent.
 SAME, RANK = 1e-4, 1e-7
-
-#: Kinds and names of what a constant is added to, or of the outputs that are multiplied ("gains").
-Places = tuple[tuple[str, str], ...]
 
 
 def refit_nameless(search: Search) -> None:
@@ -124,7 +118,7 @@ class _Changes:
         listed = {i: own for i, c in alone.items() if (own := _effect(search, c.terms[0])) is not None}
         search.constants = {i for i, own in listed.items() if _is_constant(search, alone[i], own)}
         # That of an instrument in a part of its range has no name.
-        named = {_places(alone[i]) for i in search.constants if not alone[i].terms[0].outputs}
+        named = {places_of(alone[i]) for i in search.constants if not alone[i].terms[0].outputs}
         physics = [own for i, own in listed.items() if not alone[i].terms[0].outputs]
         return cls(search, prior, named, _elsewhere(search, list(listed.values()), physics))
 
@@ -135,11 +129,11 @@ class _Changes:
         near = [m for m in search.models if m.physical and m.window is not None and m.weight > lead.weight - CLOSE]
         wanted: dict[tuple[Places, str], list[Hypothetical]] = {}
         for model in sorted(near, key=lambda m: -m.weight)[:MOST]:
-            where, window = _places(model.candidate), model.window
+            where, window = places_of(model.candidate), model.window
             if where is None or window is None:
                 continue
             others = []
-            mine = _effect(search, _constant(where, search.problem.in_time))
+            mine = _effect(search, constant_change(where, search.problem.in_time))
             fresh = [k for k, own in self.elsewhere.items() if mine is None or not _within(own, mine)]
             for place in dict.fromkeys([where, *fresh]):
                 key = (place, window.driver, window.low, window.high)
@@ -220,7 +214,7 @@ def _elsewhere(search: Search, listed: list[Tensor], physics: list[Tensor]) -> d
     names = [q.name for q in declared if not is_window(q.name) and any(is_value_of(one, q.name) for one in free)]
     found: dict[Places, Tensor] = {}
     for place in [("shifts", name) for name in names] + [("gains", name) for name in search.problem.recording.outputs]:
-        own = _effect(search, _constant((place,), search.problem.in_time))
+        own = _effect(search, constant_change((place,), search.problem.in_time))
         same = (*(physics if place[0] == "shifts" else listed), *found.values())
         if own is not None and own.norm() > 0 and not any(_within(own, other) for other in same):
             found[(place,)] = own
@@ -271,19 +265,11 @@ def _rivals(search: Search, lead: Model) -> list[Model]:
     return list(best.values())[:TRIED]
 
 
-def _places(candidate: Candidate) -> Places | None:
-    """The equations, outputs or parameters that a term acts on; None where it has states of its own or frees what is
-    held."""
-    (term,) = candidate.terms
-    places = tuple((kind, name) for kind in ("rates", "outputs", "shifts") for name in getattr(term, kind))
-    return places if places and not term.states and not term.frees else None
-
-
 def _is_constant(search: Search, candidate: Candidate, own: Tensor) -> bool:
     """Whether a candidate with an effect ``(n, 1)`` is a constant change."""
-    where = _places(candidate)
-    constant = None if where is None else _effect(search, _constant(where, search.problem.in_time))
-    return constant is not None and own.shape[1] == 1 and _within(own, constant)
+    where = places_of(candidate)
+    still = None if where is None else _effect(search, constant_change(where, search.problem.in_time))
+    return still is not None and own.shape[1] == 1 and _within(own, still)
 
 
 def _wanted(
@@ -306,16 +292,16 @@ def _wanted(
         last = w.low if math.isfinite(w.low) else w.high  # the end that it has, which need not be one of the data
         cuts = sorted({*cuts[1:], last}) if math.isfinite(w.low) else sorted({*cuts[:-1], last})
         ends += [list(itertools.combinations(cuts, 2))] if len(cuts) > 1 else []
-    still = _constant(where, search.problem.in_time)
+    still = constant_change(where, search.problem.in_time)
     shapes = [(still, chosen, edge) for chosen in ends for edge in (False, True)] if where not in named else []
     if len(ends) > 1:
         in_time, end = search.problem.in_time, ENDS["from" if math.isfinite(w.low) else "to"]
-        grows = _distance(w.driver, end, span, in_time)
-        shapes.append((_constant(where, in_time, grows), ends[0], False))
-        fading = _fading(w.driver, end, span, in_time)
-        shapes.append((_constant(where, in_time, fading), ends[0], False))
+        grows = distance(w.driver, end, span, in_time)
+        shapes.append((constant_change(where, in_time, grows), ends[0], False))
+        fading = fading_to(w.driver, end, span, in_time)
+        shapes.append((constant_change(where, in_time, fading), ends[0], False))
         term = search.candidates[model.numbers[0]].terms[0]
-        if where == _places(model.candidate) and not term.elapsed:  # whose t is not the window's
+        if where == places_of(model.candidate) and not term.elapsed:  # whose t is not the window's
             shapes.append((multiplied(term, f"{FADING}{term.name}", fading), ends[0], False))
     found, least = [], math.inf
     for change, chosen, edge in shapes:
@@ -351,54 +337,6 @@ def _anywhere(search: Search, model: Model) -> Hypothetical | None:
         return None
     window = dataclasses.replace(w, low=cuts[0], high=cuts[-1], span=span)
     return Hypothetical(model.numbers, candidate, begin, model.log_prior, window)
-
-
-def _distance(driver: str, end: str, span: Span, in_time: bool) -> Callable[..., Any]:
-    """How far a driver is beyond an end of a window, in its range; of what a term's functions are given."""
-    at = driver_at(driver, static=not in_time)
-    return lambda *given: span.distance(at(*given), given[2 if in_time else 1][end]) / span.size
-
-
-def _fading(driver: str, end: str, span: Span, in_time: bool) -> Callable[..., Any]:
-    """What decays from the open side of a window to `FADED` at its end; of what a term's functions are given."""
-    at = driver_at(driver, static=not in_time)
-    edge = span.low if end == ENDS["to"] else span.high
-
-    def share(*given: Any) -> Any:
-        last = given[2 if in_time else 1][end]
-        length = span.distance(last, edge)
-        length = torch.where(length.abs() > SAME * span.size, length, SAME * span.size)
-        return FADED ** (span.distance(at(*given), edge) / length).clamp(0.0, 1.0)
-
-    return share
-
-
-def _constant(where: Places, in_time: bool, grows: Callable[..., Any] | None = None) -> Term:
-    """A constant change of its own in every one of some places, or one that grows in proportion to something."""
-    number = itertools.count(1)
-
-    def added() -> Callable[..., Any]:
-        name = f"c{next(number)}"
-        constant = lambda *given: given[2 if in_time else 1][name]  # noqa: E731
-        return constant if grows is None else lambda *given: constant(*given) * grows(*given)
-
-    def shown() -> Callable[..., Any]:
-        own = added()
-        return lambda *given: given[-1] + own(*given)
-
-    def scaled() -> Callable[..., Any]:
-        own = added()
-        return lambda *given: given[-1] * (1 + own(*given))
-
-    how = {"rates": ("rates", added), "outputs": ("outputs", shown), "shifts": ("shifts", added),
-           "gains": ("outputs", scaled)}  # fmt: skip
-    kinds: dict[str, Any] = {}
-    for kind, name in where:
-        place, change = how[kind]
-        kinds.setdefault(place, {})[name] = change()
-    of = {"shifts": "a change of {}", "gains": "a change of the gain of {}"}
-    what = " and ".join(of[kind].format(name) for kind, name in where if kind in of)
-    return Term(what or "something unknown", **kinds, parameters=[Parameter(f"c{i}") for i in range(1, next(number))])
 
 
 def _begin(
