@@ -159,6 +159,14 @@ def test_a_small_share_of_short_runs_is_held_out():
     assert int(verify.choose(recording, 0.2, 1).sum()) == 6
 
 
+def test_what_is_held_out_may_be_a_column_of_a_table():
+    pandas = pytest.importorskip("pandas")
+    table = pandas.DataFrame({"x": np.linspace(0, 1, 20), "y": np.zeros(20)})
+    recording = tc.Recording(x=table.x, y=table.y)
+    last = table.x > 0.7  # whose numbers pandas does not let be written
+    assert verify.choose(recording, last, 2).tolist() == last.tolist()
+
+
 @pytest.mark.parametrize("each", [1, 3, 4])
 def test_replicates_are_held_out_together(each):
     x = torch.linspace(0, 1, 14, dtype=F64).repeat(each)

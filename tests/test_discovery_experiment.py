@@ -232,6 +232,15 @@ def test_bolder_runs_are_what_their_texts_say():
     assert torch.equal(slow["inputs"]["f"], first.inputs["f"])
 
 
+def test_milder_multiples_are_tried_first():
+    # Where twice the initial states is more than a model bears (a pendulum's past the top) half as much more may do.
+    chosen = {text: conditions for text, _, conditions in conditions.simple(driven({"x": 0.5, "v": 0.0}))}
+    milder = chosen["a run that starts from 1.5 times the initial states of the first"]
+    assert milder["initial"] == {"x": 0.75, "v": 0.0}
+    texts = [text for text in chosen if "times the initial states of the first" in text]
+    assert texts.index(texts[0].replace("1.5", "2")) > texts.index(texts[0])
+
+
 def test_multiples_of_a_state_of_rest_are_no_experiments():
     model = driven({"x": 0.0, "v": 0.0})
     texts = [text for text, _, _ in (*conditions.simple(model), *conditions.bolder(model))]

@@ -215,7 +215,7 @@ def array(value: Any, what: str, ndim: int | Sequence[int]) -> np.ndarray:
         raise ShapeError(f"Expected {what}: an array of real numbers. Got None{why}.")
     allowed = (ndim,) if isinstance(ndim, int) else tuple(ndim)
     try:
-        given = value if isinstance(value, Tensor) else torch.as_tensor(np.asarray(value))
+        given = value if isinstance(value, Tensor) else torch.as_tensor(np.array(value))
         if given.is_complex():
             raise TypeError("complex numbers")
         numbers = given.detach().to(device="cpu", dtype=torch.float64).numpy()

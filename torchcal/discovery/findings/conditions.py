@@ -24,7 +24,7 @@ ABSOLUTE_ZERO = {
     "degF": -459.67, "°F": -459.67, "fahrenheit": -459.67, "degree_Fahrenheit": -459.67,
 }  # fmt: skip
 #: Multiples of initial states and inputs, those that are bolder, and that of one state alone.
-MULTIPLES, BOLD, ALONE = (2.0, 0.5, 3.0), (5.0,), 3.0
+MULTIPLES, BOLD, ALONE = (1.5, 2.0, 0.5, 3.0), (5.0,), 3.0
 #: How far beyond its range a condition goes, in the width of that, and how far in a bolder experiment.
 BEYOND, FAR_BEYOND = 0.5, 1.5
 #: Bolder experiments on a static recording at most, those that move one condition first.

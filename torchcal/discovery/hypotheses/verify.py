@@ -47,7 +47,7 @@ def choose(recording: Recording, holdout: Any, parameters: int) -> Tensor | None
         holdout = float(holdout)
     if holdout is not None and not isinstance(holdout, float):
         try:
-            mask = holdout if isinstance(holdout, Tensor) else torch.as_tensor(np.asarray(holdout))
+            mask = holdout if isinstance(holdout, Tensor) else torch.as_tensor(np.array(holdout))
         except (TypeError, ValueError) as error:
             got = repr(holdout) if isinstance(holdout, str | int) else type(holdout).__name__
             raise DomainError(f"Expected holdout as None, False, a share or a bool array. Got {got}.") from error
