@@ -9,7 +9,7 @@ A term whose window leaves something is tried in all others: from the base alone
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
@@ -31,7 +31,7 @@ from torchcal.discovery.fits.local import (
 from torchcal.discovery.fits.readings import threshold_of
 from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.hypotheses.own_noise import likeliest_alone
-from torchcal.discovery.hypotheses.screen import Window
+from torchcal.discovery.hypotheses.screen import Window, windows_of
 from torchcal.discovery.hypotheses.search import BETTER, Search
 from torchcal.discovery.misfit.channels import channels
 from torchcal.discovery.verdicts.verdict import PLAINLY_WHITE
@@ -45,9 +45,12 @@ __all__ = ["refit_nameless"]
 #: Log weight behind the leader down to which a term in a window is held against nameless changes, and of how many; and
 #: against how many changes elsewhere than where it acts.
 CLOSE, MOST, ELSEWHERE = 3.0, 3, 2
-#: Changes of parameters, each in a range of a driver, that an instrument with a threshold is held against; and log
-#: weight behind it from which on the best of them is tried with other edges than a step's.
-BEYOND, NEAR = 4, 20.0
+#: Changes, each in a range of a driver, that a term without a window is held against; and log weight behind it from
+#: which on the best of them is tried with other edges than a step's.
+IN_RANGES, NEAR = 4, 20.0
+#: Shares and χ² by which a change in a range may remove less than the leading term, and still be tried: its effect is
+#: taken for linear, and its edges from a coarse grid.
+LACKING, LESS = 0.35, 10.0
 #: Terms that are tried in all windows of a driver, and places where these may begin or end.
 TRIED, CUTS = 4, 14
 #: Places within an open window where a nameless change may begin or end, and starts that are refitted with each width
@@ -71,11 +74,10 @@ def refit_nameless(search: Search) -> None:
         return
     if search.noise.open and lead.window is None:  # with the noise that each of them leaves, one in a window may lead
         lead = likeliest_alone(search) or lead
-    if lead.window is None:
-        if beyond := _beyond(search, lead):
-            _Changes.of(search).hold_beyond(beyond, lead)
-        return
     changes = _Changes.of(search)
+    if lead.window is None:
+        changes.hold_in_ranges(lead)
+        return
     changes.hold_against(lead)
     outdone = any(one.weight > lead.weight for one in search.nameless)
     if outdone or search.examine(lead).p_value < PLAINLY_WHITE:  # its window may not be the best that the term has
@@ -149,20 +151,36 @@ class _Changes:
                 wanted[place, window.driver] = begun
         self._refit([one for each in wanted.values() for one in each])
 
-    def hold_beyond(self, models: Sequence[Model], lead: Model) -> None:
-        """Refit changes of the base's parameters in the ranges in which an instrument of the leader errs: a step each,
-        and the best of them with edges to fit where it comes near."""
-        found = []
-        for model in models:
-            for place in self.elsewhere:
-                if place[0][0] == "shifts":
-                    begun, chi2 = _wanted(self.search, model, place, self.prior, self.named)
-                    found += [(chi2, begun)] if math.isfinite(chi2) else []
-        nearest = [begun for _, begun in sorted(found, key=lambda one: one[0])[:BEYOND] if begun]
-        steps = self._refit([begun[0] for begun in nearest])
-        weights = [-math.inf if one is None else one.weight for one in steps]
-        if weights and max(weights) > lead.weight - NEAR:
-            self._refit(nearest[weights.index(max(weights))][1:2])
+    def hold_in_ranges(self, lead: Model) -> None:
+        """Refit changes of the base in ranges of drivers beside a leader that acts everywhere: a step of a parameter
+        each, where that promises nearly as much, and the best of them with edges to fit where it comes near.
+
+        An instrument that errs beyond a value is held against what happens there, which may grow from there, as its
+        error does.
+        """
+        search = self.search
+        in_time, removed = search.problem.in_time, 2.0 * (lead.log_evidence - lead.price)
+        physics = [place for place in self.elsewhere if place[0][0] == "shifts"]
+        if errs := _beyond(search, lead):
+            # Of what is not in time the physics may be any function of the conditions, as the output is.
+            still = [] if in_time else [(("outputs", name),) for name in search.problem.recording.outputs]
+            there = [(model, place) for model in errs for place in (*physics, *still)]
+        else:
+            there = _promising(search, lead, physics, removed - max(LESS, LACKING * removed))
+        begun = []
+        for kind in ("step", "grown") if errs and not in_time else ("step",):
+            for model, place in there:
+                each, chi2 = self._begun(model, place, kind)
+                begun += [(chi2, model, place, each[0])] if each and math.isfinite(chi2) else []
+        begun = sorted(begun, key=lambda one: one[0])[:IN_RANGES]
+        weights = [-math.inf if one is None else one.weight for one in self._refit([one for *_, one in begun])]
+        if weights and max(weights) > lead.weight - max(NEAR, 0.5 * LACKING * removed):
+            _, model, place, _ = begun[weights.index(max(weights))]
+            kinds = ("edge", "grown") if errs and in_time else ("edge",)
+            self._refit([one for kind in kinds for one in self._begun(model, place, kind)[0][:1]])
+
+    def _begun(self, model: Model, place: Places, kind: str) -> tuple[list[Hypothetical], float]:
+        return _wanted(self.search, model, place, self.prior, self.named, (kind,))
 
     def _refit(self, wanted: Sequence[Hypothetical]) -> list[Model | None]:
         found = [long_enough(one) for one in _refitted(self.search, wanted)]
@@ -198,6 +216,26 @@ def _beyond(search: Search, model: Model) -> list[Model]:
                 model, numbers=(number,), candidate=search.candidates[number], found=search.base, window=window
             ))  # fmt: skip
     return models
+
+
+def _promising(
+    search: Search, lead: Model, physics: Sequence[Places], least: float
+) -> list[tuple[Model, Places]]:
+    """The leader as one in a window, and what of the base changes there instead: of each parameter the best window in
+    every driver, where that removes at least so much of the misfit, for linear."""
+    drivers, found = search.drivers(), []
+    places = {place[0][1]: place for place in physics}
+    there = dataclasses.replace(
+        lead, numbers=lead.numbers[:1], candidate=search.candidates[lead.numbers[0]], found=search.base
+    )
+    for channel in channels(search.base.problem, search.base):
+        name = next((one for one in places if is_value_of(channel.target, one)), None)
+        if channel.kind != "parameter" or name is None:
+            continue
+        for w in windows_of(lead.numbers[0], search.residual, channel.matrix, channel.drivers, 0)[0]:
+            if w.driver in drivers and w.z**2 > least:
+                found.append((dataclasses.replace(there, window=w), places[name]))
+    return found
 
 
 def _elsewhere(search: Search, listed: list[Tensor], physics: list[Tensor]) -> dict[Places, Tensor]:
@@ -273,11 +311,16 @@ def _is_constant(search: Search, candidate: Candidate, own: Tensor) -> bool:
 
 
 def _wanted(
-    search: Search, model: Model, where: Places, prior: float, named: set[Places | None]
+    search: Search,
+    model: Model,
+    where: Places,
+    prior: float,
+    named: set[Places | None],
+    only: Collection[str] = ("step", "edge", "grown", "faded"),
 ) -> tuple[list[Hypothetical], float]:
     """A constant in a model's window, with steep edges and with edges to fit; an open window closed as well, with a
-    change that grows from its end, and with one that fades towards it. And the least χ² of all their beginnings, for
-    linear."""
+    change that grows from its end, and with one that fades towards it; or ``only`` some of these. And the least χ² of
+    all their beginnings, for linear."""
     w = model.window
     if w is None:
         return [], math.inf
@@ -293,23 +336,26 @@ def _wanted(
         cuts = sorted({*cuts[1:], last}) if math.isfinite(w.low) else sorted({*cuts[:-1], last})
         ends += [list(itertools.combinations(cuts, 2))] if len(cuts) > 1 else []
     still = constant_change(where, search.problem.in_time)
-    shapes = [(still, chosen, edge) for chosen in ends for edge in (False, True)] if where not in named else []
+    edges = {"step": False, "edge": True}
+    shapes = [(kind, still, chosen) for chosen in ends for kind in edges] if where not in named else []
     if len(ends) > 1:
         in_time, end = search.problem.in_time, ENDS["from" if math.isfinite(w.low) else "to"]
         grows = distance(w.driver, end, span, in_time)
-        shapes.append((constant_change(where, in_time, grows), ends[0], False))
+        shapes.append(("grown", constant_change(where, in_time, grows), ends[0]))
         fading = fading_to(w.driver, end, span, in_time)
-        shapes.append((constant_change(where, in_time, fading), ends[0], False))
+        shapes.append(("faded", constant_change(where, in_time, fading), ends[0]))
         term = search.candidates[model.numbers[0]].terms[0]
         if where == places_of(model.candidate) and not term.elapsed:  # whose t is not the window's
-            shapes.append((multiplied(term, f"{FADING}{term.name}", fading), ends[0], False))
+            shapes.append(("faded", multiplied(term, f"{FADING}{term.name}", fading), ends[0]))
     found, least = [], math.inf
-    for change, chosen, edge in shapes:
+    for kind, change, chosen in shapes:
+        if kind not in only:
+            continue
         low, high = chosen[0]
         near = span.edged(low, high)
         local = localised(
             change, w.driver, low, high, near,
-            static=not search.problem.in_time, edge=edge,
+            static=not search.problem.in_time, edge=edges.get(kind, False),
         )  # fmt: skip
         try:
             candidate = prepare(search.base.problem, search.base, [local], search.fixed)

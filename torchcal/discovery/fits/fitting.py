@@ -12,7 +12,7 @@ from torchcal.simulators import Solution, Trajectories
 __all__ = ["Fitted", "fit", "follow_slopes", "refit", "starts", "weighed"]
 
 #: Relative change of χ² below which a fit has converged.
-TOLERANCE = 1e-7
+TOLERANCE = 1e-5
 MAX_STEPS = 60
 #: Change of χ², in the residual's variance but at most in that of the noise, below which so many steps lead nowhere, of
 #: which so many at least were not taken back.

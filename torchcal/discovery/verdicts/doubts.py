@@ -121,12 +121,15 @@ def _at_given_end(search: Search, model: Model, i: int) -> bool:
 
 
 def _no_better(search: Search, model: Model) -> str:
-    """Why a term in a window, or an instrument that errs beyond a value, is hardly likelier than a constant change
-    there; empty if it is clearly so."""
-    rival = max(search.nameless, key=lambda one: one.weight, default=None)
-    if rival is None or rival.window is None or rival.weight < model.weight - CLEARLY:
-        return ""
-    if model.window is None and threshold_of(model.candidate.terms, model.found.by_name) is None:
+    """Why a term is hardly likelier than a change in a range that has no name; empty if it is clearly so.
+
+    An instrument that errs beyond a value is a function of what changes there: it has to fit better.
+    """
+    errs = model.window is None and threshold_of(model.candidate.terms, model.found.by_name) is not None
+    lead = {id(one): (one.log_evidence - model.log_evidence) if errs else (one.weight - model.weight)
+            for one in search.nameless}  # fmt: skip
+    rival = max(search.nameless, key=lambda one: lead[id(one)], default=None)
+    if rival is None or rival.window is None or lead[id(rival)] < -CLEARLY:
         return ""
     if search.constants.intersection(model.numbers):  # which has no other shape to show
         return ""
