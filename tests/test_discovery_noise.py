@@ -553,6 +553,21 @@ def test_noise_of_uneven_runs_forgets_with_time_or_with_every_sample(by_sample):
     assert 0.013 < sum(one[2] for one in seen) / seeds < 0.022
 
 
+def test_two_samples_at_nearly_one_time_are_no_sign_of_a_memory():
+    # Smooth curves of ranks told the two apart, and what is left of them counted for nothing where noise remembers.
+    rng = np.random.default_rng(0)
+    model = tc.ODESimulator(lambda t, s, p, u: {"A": -p["k"] * s["A"]}, {"A": "M"}, [tc.Parameter("k", low=0.0)])
+    runs = []
+    for _ in range(2):
+        t = np.cumsum(rng.exponential(0.4, 40))
+        t[20] = t[19] + 4e-4
+        runs.append(tc.Run(t - t[0], {"A": 2 * np.exp(-0.5 * (t - t[0])) + 0.02 * rng.standard_normal(40)}))
+    base, noise = calibrate_base(Problem.of(model, tc.Recording(runs=runs, noise=0.02)), {}, 4, 0)
+    assert noise.correlation.tolist() == [0.0]
+    assert noise.posterior[0, 0] > 0.99
+    assert base.chi2 < 80 + 4 * math.sqrt(160)
+
+
 @pytest.mark.parametrize("by_sample", [True, False])
 def test_correlated_noise_of_uneven_runs_is_nothing_missing(by_sample):
     term = tc.Term(

@@ -696,6 +696,22 @@ def test_another_range_that_is_nearly_as_likely_is_told_beside_the_named_one():
     assert called.with_region(d, "saturation") == "saturation, where T < 1796 (or, nearly as likely, tau < 11.8)"
     d.ranking = [rows[0], rows[2]]
     assert called.with_region(d, "saturation") == "saturation, where T < 1796"
+    d.ranking = [rows[0], row(["saturation"], 0.2)]
+    assert called.with_region(d, "saturation") == "saturation, where T < 1796 (or, nearly as likely, everywhere)"
+
+
+def test_all_that_is_tied_is_printed_with_the_best():
+    rows = [row([f"term {k}"], 0.1) for k in range(9)] + [row(["late"], 0.02, region="x > 2"), row(["late"], 0.01)]
+    d = SimpleNamespace(ranking=rows, tied=[["term 0"], ["late"]])
+    assert words.listed(d) == rows[:8] + rows[9:10]
+    d.tied = []
+    assert words.listed(d) == rows[:8]
+
+
+def test_evidence_that_was_not_worked_out_is_no_number():
+    unfitted = dataclasses.replace(row(["a"], 0.0), log_evidence=-math.inf)
+    table = Table([unfitted], ("terms", "log_evidence", "probability"))
+    assert str(table).splitlines()[1].split() == ["a", "-", "0"]
 
 
 @pytest.mark.parametrize(("low", "verdict"), [(5.0, "ambiguous"), (4.05, "named")])

@@ -72,7 +72,7 @@ def _text(value: Any, extent: float | None = None) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):
-        return f"{value:.4g}"
+        return "-" if value == -math.inf else f"{value:.4g}"  # nothing was worked out
     if isinstance(value, tuple) and value and all(isinstance(item, tuple) for item in value):
         return ", ".join(between(value, "to", extent))
     if isinstance(value, tuple | list):

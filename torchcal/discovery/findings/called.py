@@ -26,7 +26,7 @@ LITTLE = 0.005
 #: Probability from which on the base, or something unknown, is told beside what is named or tied.
 LISTED = 0.05
 #: Probability of another range of what is named, in that of the named one, from which on it is told too.
-NEARLY = 0.5
+NEARLY = 1 / 3
 #: Pairs of hypotheses that an experiment leaves, of which the paragraph lists so many.
 UNTOLD = 3
 

@@ -19,8 +19,8 @@ from torchcal.display import NONE
 
 __all__ = ["paragraph"]
 
-#: Hypotheses in the first line.
-HEADLINE = 5
+#: Hypotheses in the first line, and rows of the ranking that are printed.
+HEADLINE, BEST = 5, 8
 
 
 def paragraph(d: Any) -> str:
@@ -41,9 +41,16 @@ def paragraph(d: Any) -> str:
             for row in rows:
                 lines += textwrap.wrap(row, 100, initial_indent="  ", subsequent_indent="    ")
     columns = ("terms", "region", "log_evidence", "probability", "misfit_removed", "physical", "note")
-    shown = type(d.ranking)(d.ranking[:8], columns)
+    shown = type(d.ranking)(listed(d), columns)
     lines += ["", "Hypotheses, the best first:", textwrap.indent(str(shown), "  ")]
     return "\n".join(lines)
+
+
+def listed(d: Any) -> list[Any]:
+    """The rows of the ranking that are printed: the best, and the best of everything that is tied."""
+    tied = [tuple(names) for names in d.tied]
+    best = {names: k for k, row in reversed(list(enumerate(d.ranking))) if (names := tuple(row.terms)) in tied}
+    return [row for k, row in enumerate(d.ranking) if k < BEST or k in best.values()]
 
 
 def _headline(d: Any) -> str:

@@ -14,6 +14,8 @@ SMOOTH_SHARE, MOST_CURVES = 1.0 / 6.0, 256
 #: Levels of a condition up to which they are no row; the ratio of the last to the first from which on a geometric one
 #: is uneven; and how much unlike its steps may be in logarithms, as those of 1, 2, 5, 10 are.
 FEW, WIDE, EVENLY = 4, 10.0, 1.5
+#: Share of the usual gap from which on neighbours in time are a step of their ranks apart: no curve tells closer ones.
+CLOSE = 0.1
 
 
 def smooth_columns(problem: Problem, places: Tensor, *, ends: bool = False, ranks: bool = False) -> Tensor:
@@ -26,11 +28,15 @@ def smooth_columns(problem: Problem, places: Tensor, *, ends: bool = False, rank
     count = min(int(n * SMOOTH_SHARE), MOST_CURVES)
     if problem.order is not None:
         at = problem.order[problem.condition_of[places]]
-        rank = torch.linspace(0, 1, n, dtype=torch.float64)
-        span = float(at.max() - at.min())
+        gaps, span = at.diff(), float(at.max() - at.min())
         # Equal steps where sampling is even; ranks where it is not, so that curves bend where there are data.
-        uneven = float(at.diff().max()) > 3 * float(at.diff().median()) if n > 2 else False
-        along = rank if uneven or span <= 0 else (at - at.min()) / span
+        uneven = float(gaps.max()) > 3 * float(gaps.median()) if n > 2 else False
+        along = (at - at.min()) / span if span > 0 else torch.linspace(0, 1, n, dtype=torch.float64)
+        if uneven:
+            least = float(gaps.median()) * CLOSE
+            ordered = least > 0 and float(gaps.min()) >= 0
+            steps = (gaps / least).clamp_max(1.0) if ordered else torch.ones_like(gaps)
+            along = torch.cat([steps.new_zeros(1), steps.cumsum(0)]) / steps.sum()
         waves = torch.cos(math.pi * along[:, None] * torch.arange(count, dtype=torch.float64))
         return torch.cat([waves, along[:, None], along[:, None].square()], dim=1) if ends else waves
     given = problem.recording.columns[problem.condition_of[places]].unbind(-1)

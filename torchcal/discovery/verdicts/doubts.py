@@ -61,7 +61,7 @@ UNSEEN = 1e-7
 
 def doubt(search: Search, model: Model) -> str:
     """Why a model is no name, however probable, in a sentence; empty if it may be one."""
-    found = _no_better(search, model) or unfit(search, model) or by_hold(search, model) or only_together(search, model)
+    found = unfit(search, model) or _no_better(search, model) or by_hold(search, model) or only_together(search, model)
     if found or search.exact:
         return found
     return _noise_or_physics(search, model) or in_common(search, model) or _of_two_colours(search, model)

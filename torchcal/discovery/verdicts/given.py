@@ -30,6 +30,8 @@ SMALLEST = 1e-12
 #: than that; and noise sd up to which an initial value that is
 #: found free is the one that was given: of one given as the first value recorded, and of any other.
 NOISE, HARDLY, CONFIRMED, ELSEWHERE = 0.05, 0.01, 0.2, 1.0
+#: Samples of a run below which its initial values explain whatever it shows; initial values that are told one by one.
+FEWEST, MOST_TOLD = 5, 3
 #: Change of an input from sample to sample, in its sd, from which on it matters how it goes on between them.
 FAR = 0.5
 #: How inputs may go on that go on in a way that can be mistaken for it.
@@ -96,7 +98,8 @@ def begun_elsewhere(search: Search) -> list[str]:
         return []
     shown = [
         {state: output for output, state in bound.ode.reads.items()
-         if state in run.initial and state not in bound.ode.initial and output in run.outputs}
+         if state in run.initial and state not in bound.ode.initial and output in run.outputs
+         and len(run.time) >= FEWEST}
         for run in runs
     ]  # fmt: skip
     first = [
@@ -109,11 +112,14 @@ def begun_elsewhere(search: Search) -> list[str]:
             f"{', '.join(moved)} {was} given as the first value recorded, noise and all: with {it} unknown (left out "
             "of initial=) the base leaves no more than noise"
         ]
-    return [
+    moved = {} if first == shown else _moved(search, shown, ELSEWHERE)
+    told = [
         f"{full} was given as {placed(given, abs(found - given))} and is {placed(found, abs(found - given))} where it "
-        "is unknown (left out of initial=): the base leaves no more than noise then"
-        for full, (given, found) in ({} if first == shown else _moved(search, shown, ELSEWHERE)).items()
-    ]
+        "is unknown (left out of initial=)" for full, (given, found) in moved.items()
+    ]  # fmt: skip
+    if len(told) > MOST_TOLD:
+        told = [f"{told[0]}, and {len(told) - 1} others are others than they were given, too"]
+    return [f"{one}: the base leaves no more than noise then" for one in told]
 
 
 def _moved(search: Search, shown: Sequence[Mapping[str, str]], least: float) -> dict[str, tuple[float, float]]:
