@@ -83,6 +83,59 @@ def test_a_gain_error_in_a_range_is_no_name_where_a_parameter_does_the_same(seed
     assert row.note.startswith("a change of a where")
 
 
+def thermistor(seed, kind):
+    """Whose logarithm falls below 273 K, or which is read by an instrument that shows less of what is above 10.2."""
+    T = np.repeat(np.linspace(250, 330, 30), 2)
+    y = 9 + 3500 * (1 / T - 1 / 298.15)
+    y = y - (0.15 * np.maximum(273 - T, 0) / 20 if kind == "wet" else 0.2 * np.maximum(y - 10.2, 0))
+    model = tc.Simulator(
+        lambda x, p: p["a"] + 1000 * p["B"] * (1 / x - 1 / 298.15),
+        [tc.Parameter("a", initial=9.0), tc.Parameter("B", low=0.1, initial=3.0)],
+    )
+    return model, tc.Recording(x=T, y=y + 0.01 * np.random.default_rng(seed).standard_normal(len(T)), noise=0.01)
+
+
+@pytest.mark.parametrize("kind", ["wet", "bent reading"])
+def test_what_bends_along_the_only_condition_may_be_the_instrument_or_not(kind):
+    d = diagnose(*thermistor(0, kind), tc.terms.sensor(outputs=("y",), static=True))
+    assert d.verdict == "ambiguous"
+    assert ["saturation of y"] in d.tied
+    assert list(NONE) in d.tied
+
+
+def hot_rod(noise, *, painted=1.0, uneven=0.0):
+    """A rod of 0.2 m at three temperatures of its end, which loses more heat beyond 0.12 m, or the more the farther."""
+    x, hot = (v.ravel() for v in np.meshgrid(np.linspace(0, 0.2, 15), [60.0, 120.0, 200.0]))
+    m, far, end, length = 12 * (1 + uneven * x / 0.2), 12 * math.sqrt(painted), 0.12, 0.2
+    # Values and slopes of both parts meet at the edge of the paint; none flows out of the end.
+    t = far * math.tanh(far * (length - end))
+    c = -(12 * math.sinh(12 * end) + t * math.cosh(12 * end)) / (12 * math.cosh(12 * end) + t * math.sinh(12 * end))
+    edge = (math.cosh(12 * end) + c * math.sinh(12 * end)) / math.cosh(far * (length - end))
+    part = np.where(x < end, np.cosh(12 * x) + c * np.sinh(12 * x), edge * np.cosh(far * (length - x)))
+    shape = np.cosh(m * (length - x)) / np.cosh(m * length) if uneven else part
+    y = 25 + (hot - 25) * shape + noise * np.random.default_rng(1).standard_normal(45)
+    model = tc.Simulator(
+        lambda x, p: p["Ta"]
+        + (x["hot"] - p["Ta"]) * torch.cosh(p["m"] * (0.2 - x["x"])) / torch.cosh(p["m"] * 0.2),
+        [tc.Parameter("m", low=1.0, high=50.0, initial=10.0), tc.Parameter("Ta", low=0.0, high=50.0, initial=20.0)],
+    )
+    term = tc.Term("uneven film", shifts={"m": lambda x, p: p["m"] * p["w"] * x["x"] / 0.2},
+                   parameters=[tc.Parameter("w", low=-0.9, high=5.0)])  # fmt: skip
+    return model, tc.Recording(x={"x": x, "hot": hot}, y=y), [term]
+
+
+@pytest.mark.parametrize("noise", [0.5, 0.8])
+def test_a_smooth_change_is_no_name_where_a_parameter_may_change_at_one_place(noise):
+    d = diagnose(*hot_rod(noise, painted=1.5))
+    assert d.verdict in ("ambiguous", "unexplained")
+    assert d.verdict == "unexplained" or list(NONE) in d.tied
+    (row,) = [row for row in d.ranking if row.terms == NONE]
+    assert row.note.startswith("a change of m where x")
+    d = diagnose(*hot_rod(noise, uneven=0.3))
+    assert d.verdict == "named"
+    assert d.terms == ["uneven film"]
+
+
 # --- parameters that are seen in outputs alone -----------------------------------------------------------------------
 
 

@@ -724,7 +724,7 @@ def test_a_shape_at_a_given_bound_along_which_the_size_is_open_is_no_name(low, v
         outputs={"y": lambda x, p, y: y - p["b"] * torch.log1p(-x / p["il"])},
         parameters=[tc.Parameter("b", low=0.0), tc.Parameter("il", low=low, high=50.0)],
     )
-    recording = tc.Recording(x=x, y=1.2 + 0.3 * x + 0.15 * (x / 4) ** 4 + noise, noise=0.03)
+    recording = tc.Recording(x=x, y=1.2 + 0.3 * x - 0.25 * torch.log1p(-x / 4.4) + noise, noise=0.03)
     d = tc.diagnose(base, recording, [term], seed=0, progress=False)
     assert d.verdict == verdict
     assert ("ends at a bound of overpotential.il" in d.settings["doubt"]) == (verdict == "ambiguous")

@@ -159,6 +159,8 @@ class _Changes:
         error does.
         """
         search = self.search
+        if lead.weight < math.log(PRIOR["base"]) + CLOSE:  # that is no name
+            return
         in_time, removed = search.problem.in_time, 2.0 * (lead.log_evidence - lead.price)
         physics = [place for place in self.elsewhere if place[0][0] == "shifts"]
         if errs := _beyond(search, lead):
