@@ -436,6 +436,7 @@ def test_an_output_without_noise_is_not_judged_by_its_rounding():
     assert (d.terms, d.remaining) == (["bend"], 0.0)
 
 
+@pytest.mark.slow
 def test_two_terms_that_bend_to_a_fast_process_are_no_name():
     """A fast relaxation that no term has: a slow one, stretched and saturated, comes near it."""
     grid = np.meshgrid([20.0, 40.0, 60.0], np.geomspace(0.1, 1e4, 20), indexing="ij")
@@ -491,6 +492,7 @@ def test_what_is_wrong_with_arguments_is_told():
         diagnose(decay, tc.Recording(runs=[run]), [inflow])
 
 
+@pytest.mark.slow
 def test_look_alikes_of_both_terms_of_a_pair_are_tried():
     """A Langmuir probe whose leakage and series resistance were left out: other terms do nearly what either does."""
     v = torch.cat([torch.linspace(-60, -15, 30, dtype=F64), torch.linspace(-14, 6, 45, dtype=F64)])

@@ -469,20 +469,21 @@ def test_a_blank_at_the_start_is_no_surer_than_what_is_known(seed):
     assert 0.3 < ratio.min() < ratio.max() < 4.0
 
 
-def test_replicates_tell_noise_that_grows():
-    """As many false alarms at 1 % as a binomial of 20 allows, where small values looked too well fitted before."""
+@pytest.mark.parametrize("seeds", [8, pytest.param(20, marks=pytest.mark.slow)])
+def test_replicates_tell_noise_that_grows(seeds):
+    """As many false alarms at 1 % as a binomial allows, where small values looked too well fitted before."""
     x = np.tile(np.geomspace(0.2, 20, 20), 2)
     parameters = [tc.Parameter("a", low=0.0), tc.Parameter("b", low=0.0)]
     base = tc.Simulator(lambda x, p: p["a"] * x / (p["b"] + x), parameters)
     terms = [tc.Term("leak", outputs={"y": lambda x, p, y: y + p["g"] * x}, parameters=[tc.Parameter("g")]),
              *tc.terms.sensor(("y",), static=True)]  # fmt: skip
     alarms = 0
-    for seed in range(20):
+    for seed in range(seeds):
         y = 12 * x / (1.5 + x) * (1 + 0.05 * np.random.default_rng(seed).standard_normal(40))
         d = tc.diagnose(base, tc.Recording(x=x, y=y), terms, seed=0, progress=False)
         alarms += d.verdict != "consistent"
         assert d.noise.source == "replicates"
-    assert alarms <= 2
+    assert alarms <= most(seeds, 0.01, tail=3e-3)
 
 
 @pytest.mark.parametrize(("size", "verdict"), [(0.2, "named"), (4.0, "ambiguous")])
@@ -568,7 +569,7 @@ def test_two_samples_at_nearly_one_time_are_no_sign_of_a_memory():
     assert base.chi2 < 80 + 4 * math.sqrt(160)
 
 
-@pytest.mark.parametrize("by_sample", [True, False])
+@pytest.mark.parametrize("by_sample", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_correlated_noise_of_uneven_runs_is_nothing_missing(by_sample):
     term = tc.Term(
         "second order", equation="n", rate=lambda t, s, p, u: -p["a"] * s["n"] ** 2,
@@ -602,7 +603,7 @@ def test_what_acts_in_one_of_several_sweeps_is_told_where_it_was_taken_for_slow_
         assert "if the symptoms below are noise" in str(d)
 
 
-@pytest.mark.parametrize("phi", [0.0, 0.7])
+@pytest.mark.parametrize("phi", [pytest.param(0.0, marks=pytest.mark.slow), 0.7])
 def test_noise_that_is_alike_in_all_sweeps_is_not_told_to_differ(phi):
     found = [swept(seed, 0.0, phi=phi) for seed in range(10)]
     assert sum(any("not alike" in row for row in d.symptoms) for d in found) <= most(10, 0.01)

@@ -87,6 +87,7 @@ def conductivities(viscosity, seed, **options):
     return tc.diagnose(base, recording, candidates, seed=0, progress=False)
 
 
+@pytest.mark.slow
 def test_an_offset_that_the_base_can_do_alone_makes_no_name_of_what_it_stands_beside():
     named = []
     for seed in range(1000, 1003):

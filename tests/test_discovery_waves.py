@@ -56,6 +56,7 @@ def relative(found: torch.Tensor, wanted: torch.Tensor) -> float:
     return float((found - wanted).norm() / wanted.norm())
 
 
+@pytest.mark.slow
 def test_a_rate_constant_that_cycles_in_several_runs_is_a_wave_of_that_parameter():
     d = tc.diagnose(
         reaction(),

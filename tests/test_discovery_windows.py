@@ -533,6 +533,7 @@ def reaction():
     return searched(*reactor())
 
 
+@pytest.mark.slow
 def test_a_term_of_two_equations_is_held_against_a_change_of_both(reaction):
     d, search = reaction
     rivals = search.nameless
