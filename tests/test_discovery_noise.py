@@ -14,6 +14,7 @@ from torchcal.discovery.fits.fitting import fit
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.base import calibrate_base
 from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.misfit.curves import orthonormal, smooth_columns
 from torchcal.discovery.misfit.noise import Noise, estimate
 from torchcal.discovery.misfit.outliers import lone, spikes
 
@@ -567,6 +568,17 @@ def test_two_samples_at_nearly_one_time_are_no_sign_of_a_memory():
     assert noise.correlation.tolist() == [0.0]
     assert noise.posterior[0, 0] > 0.99
     assert base.chi2 < 80 + 4 * math.sqrt(160)
+
+
+@pytest.mark.parametrize("place", [0.1, 0.3, 0.8])
+def test_curves_bend_where_there_are_data_of_a_geometric_row(place):
+    t = torch.logspace(-3, 3, 60, dtype=F64)
+    model = tc.ODESimulator(lambda t, s, p, u: {"A": -p["k"] * s["A"]}, {"A": "M"}, [tc.Parameter("k", low=0.0)])
+    problem = Problem.of(model, tc.Recording(runs=[tc.Run(t, {"A": torch.ones(60, dtype=F64)})], noise=0.02))
+    along = torch.linspace(0, 1, 60, dtype=F64)
+    bump = torch.exp(-0.5 * ((along - place) / 0.08) ** 2)
+    basis = orthonormal(smooth_columns(problem, problem.sequences[0]))
+    assert float((bump - basis @ (basis.T @ bump)).norm() / bump.norm()) < 0.15
 
 
 @pytest.mark.parametrize("by_sample", [True, pytest.param(False, marks=pytest.mark.slow)])

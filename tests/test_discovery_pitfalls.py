@@ -188,7 +188,7 @@ def test_an_experiment_asks_for_the_initial_states_that_were_not_given(given):
     asks = [text for text in texts if text.endswith("with initial x known from elsewhere")]
     same = [text for text in texts if "the first run again" in text or "the inputs of the first" in text
             or "as long as the first" in text]  # fmt: skip
-    assert len(same) == 5
+    assert len(same) == 6
     assert asks == ([] if given else same)
 
 

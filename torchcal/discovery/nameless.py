@@ -48,6 +48,8 @@ CLOSE, MOST, ELSEWHERE = 3.0, 3, 2
 #: Changes, each in a range of a driver, that a term without a window is held against; and log weight behind it from
 #: which on the best of them is tried with other edges than a step's.
 IN_RANGES, NEAR = 4, 20.0
+#: How many changes are looked at that promise most where no instrument says in which ranges.
+PROMISING = 3
 #: Shares and χ² by which a change in a range may remove less than the leading term, and still be tried: its effect is
 #: taken for linear, and its edges from a coarse grid.
 LACKING, LESS = 0.35, 10.0
@@ -172,6 +174,8 @@ class _Changes:
         begun = []
         for kind in ("step", "grown") if errs and not in_time else ("step",):
             for model, place in there:
+                if search.stop.is_set():
+                    return
                 each, chi2 = self._begun(model, place, kind)
                 begun += [(chi2, model, place, each[0])] if each and math.isfinite(chi2) else []
         begun = sorted(begun, key=lambda one: one[0])[:IN_RANGES]
@@ -236,8 +240,9 @@ def _promising(
             continue
         for w in windows_of(lead.numbers[0], search.residual, channel.matrix, channel.drivers, 0)[0]:
             if w.driver in drivers and w.z**2 > least:
-                found.append((dataclasses.replace(there, window=w), places[name]))
-    return found
+                found.append((w, places[name]))
+    best = sorted(found, key=lambda one: -one[0].z)[:PROMISING]
+    return [(dataclasses.replace(there, window=w), place) for w, place in best]
 
 
 def _elsewhere(search: Search, listed: list[Tensor], physics: list[Tensor]) -> dict[Places, Tensor]:

@@ -11,13 +11,8 @@ from torchcal.simulators import Solution, Trajectories
 
 __all__ = ["Fitted", "fit", "follow_slopes", "refit", "starts", "weighed"]
 
-#: Relative change of χ² by a step below which a fit has converged; along a bent valley a step is short, too.
+#: Relative change of χ² below which a fit has converged.
 TOLERANCE = 1e-7
-#: Change of χ² that is left to gain, for linear, below which a fit has converged, too; in the residual's variance but
-#: at most in that of the noise.
-NEAR = 1e-3
-#: Singular value, in the largest, up to which a direction does nothing.
-NOTHING = 1e-7
 MAX_STEPS = 60
 #: Change of χ², in the residual's variance but at most in that of the noise, below which so many steps lead nowhere, of
 #: which so many at least were not taken back.
@@ -294,7 +289,6 @@ def fit(
             wall = free_move.clamp(low, high)
             held = torch.where(over, torch.where(log, (wall / now).log(), wall - now), held)
             stuck = stuck | over
-        whole = torch.where(s > NOTHING * s[:, :1], along, torch.zeros_like(along)).square().sum(-1)
         if bend:
             change = torch.where(log, change.clamp(-2, 2), change)
             ahead = values.clone()
@@ -326,7 +320,6 @@ def fit(
         better = (chi2_new < chi2) & ~done
         small = predicted.abs() <= TOLERANCE * (chi2 + 1e-3 * problem.n)
         done = done | (small & ~(chi2_new < chi2 * (1 - TOLERANCE))) | (~better & (damping > 1e10))
-        done = done | (whole <= NEAR * (chi2 / problem.n).clamp_max(1.0))
         for old, new in (
             (values, trial),
             (y, y_new),

@@ -20,7 +20,7 @@ from torchcal.simulators import (
     step_errors,
 )
 
-__all__ = ["SOLVER_SHARE", "accurate", "sharpen"]
+__all__ = ["SOLVER_SHARE", "accurate", "halved", "sharpen"]
 
 #: Solver error, in noise sd, up to which it is none.
 SOLVER_SHARE = 0.05
@@ -46,6 +46,19 @@ def accurate(found: Fitted, sd: Tensor) -> bool:
     return float(errors.sum()) <= SOLVER_SHARE * least
 
 
+def halved(found: Fitted) -> Tensor:
+    """What a fit in time shows at the used data ``(n,)`` with time steps half as long.
+
+    Raises:
+        DomainError: Where that is more steps than anyone can take.
+    """
+    simulator = found.problem.simulator
+    if not isinstance(simulator, Trajectories):
+        return found.y
+    finer = simulator.refined(2)
+    return finer.outputs_of(found.values[None], finer.solve(found.values[None]))[0, found.problem.index]
+
+
 def sharpen(
     found: Fitted, allowed: Callable[[Fitted], Tensor], *, rounds: int, patient: bool = True
 ) -> tuple[Fitted, float]:
@@ -69,10 +82,9 @@ def sharpen(
         if not isinstance(simulator, Trajectories) or not may_change(simulator):
             return found, 0.0
         try:
-            finer = simulator.refined(2)
+            y = halved(found)
         except DomainError:  # more steps than anyone can take
             break
-        y = finer.outputs_of(found.values[None], finer.solve(found.values[None]))[0, found.problem.index]
         error, most = (y - found.y).abs(), allowed(found)
         states = simulator.solve(found.values[None], found.warm)
         branch = outgrown(simulator, found.values[None], states)  # of the solution may be another one
@@ -87,8 +99,8 @@ def sharpen(
         if number == rounds or (slow and not patient):
             break
         try:
-            if math.isfinite(share):
-                finer = focused(simulator, found.values, states, 2.0 * share)
+            finite = math.isfinite(share)
+            finer = focused(simulator, found.values, states, 2.0 * share) if finite else simulator.refined(2)
         except DomainError:  # more steps than anyone can take
             break
         problem = dataclasses.replace(found.problem, simulator=finer)

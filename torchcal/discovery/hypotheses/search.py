@@ -15,7 +15,7 @@ from torchcal.discovery.fits.local import Span
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.ranges import drivers_scale
 from torchcal.discovery.fits.refits import Refit, refit_all
-from torchcal.discovery.fits.sharpen import SOLVER_SHARE, accurate, sharpen
+from torchcal.discovery.fits.sharpen import SOLVER_SHARE, accurate, halved, sharpen
 from torchcal.discovery.fits.stop import Stop
 from torchcal.discovery.hypotheses.base import calibrate_base
 from torchcal.discovery.hypotheses.beginnings import larger_effects, within_bounds
@@ -38,6 +38,8 @@ __all__ = ["BETTER", "Search", "alike"]
 WORTH, NEAR, ROUNDS = 3.0, 20.0, 3
 #: χ² above the base's from which on a refit, which holds the base, has gone astray.
 ASTRAY = 1.0
+#: How many times the error of its steps a fit is away from what is wanted of it where shorter ones do not lead there.
+SURELY = 3.0
 #: Log evidence by which something unknown must explain the base's residual better than any noise, to be there.
 CLEARLY = 5.0
 #: Share of the best log evidence below which a model is not fitted again when the noise estimate has changed, nor on to
@@ -266,7 +268,7 @@ class Search:
                 continue
             least = max(WORTH, HOPELESS * best - NEAR if len(one.numbers) == 1 else best - NEAR)
             if one.window is None and self.gain(fitted.chi2) >= least:  # an edge within a step would only move
-                fitted = self._in_short_steps(fitted)
+                fitted = self._in_short_steps(fitted, self.base.chi2 - 2 * (best - NEAR))
             models.append(self._model(one, fitted))
         return self._with_room(models)
 
@@ -314,12 +316,18 @@ class Search:
         best = max((model.log_evidence for model in self.models if model.physical), default=0.0)
         return math.inf if self.exact or best <= 0 else self.base.chi2 - 2 * (HOPELESS * best - NEAR)
 
-    def _in_short_steps(self, found: Fitted) -> Fitted:
-        """A fit with time steps that are short enough for it: what a term brings may be faster than the base."""
+    def _in_short_steps(self, found: Fitted, wanted: float = math.inf) -> Fitted:
+        """A fit with time steps that are short enough for it: what a term brings may be faster than the base.
+
+        One whose steps err by much less than it is away from a χ² that is ``wanted`` stays as it is.
+        """
         sd = self.noise.sd[found.problem.index]
         if self.exact or accurate(found, sd):
             return found
+        away = math.sqrt(found.chi2) - math.sqrt(max(wanted, 0.0))
         try:
+            if away > 0 and away > SURELY * float(found.whitening.vector(halved(found) - found.y).norm()):
+                return found
             return sharpen(found, lambda now: SOLVER_SHARE * sd, rounds=ROUNDS, patient=False)[0]
         except (SimulatorError, DomainError):  # with steps so short, or with too many of them
             return found

@@ -14,7 +14,8 @@ SMOOTH_SHARE, MOST_CURVES = 1.0 / 6.0, 256
 #: Levels of a condition up to which they are no row; the ratio of the last to the first from which on a geometric one
 #: is uneven; and how much unlike its steps may be in logarithms, as those of 1, 2, 5, 10 are.
 FEW, WIDE, EVENLY = 4, 10.0, 1.5
-#: Share of the usual gap from which on neighbours in time are a step of their ranks apart: no curve tells closer ones.
+#: Share of the gaps beside it from which on neighbours in time are a step of their ranks apart: no curve tells closer
+#: ones.
 CLOSE = 0.1
 
 
@@ -33,9 +34,10 @@ def smooth_columns(problem: Problem, places: Tensor, *, ends: bool = False, rank
         uneven = float(gaps.max()) > 3 * float(gaps.median()) if n > 2 else False
         along = (at - at.min()) / span if span > 0 else torch.linspace(0, 1, n, dtype=torch.float64)
         if uneven:
-            least = float(gaps.median()) * CLOSE
-            ordered = least > 0 and float(gaps.min()) >= 0
-            steps = (gaps / least).clamp_max(1.0) if ordered else torch.ones_like(gaps)
+            # Of the gaps beside it, so that those of a geometric row are ranks.
+            beside = torch.maximum(torch.cat([gaps[1:], gaps[-2:-1]]), torch.cat([gaps[1:2], gaps[:-1]])) * CLOSE
+            ordered = float(gaps.min()) >= 0
+            steps = (gaps / beside.clamp_min(1e-300)).clamp_max(1.0) if ordered else torch.ones_like(gaps)
             along = torch.cat([steps.new_zeros(1), steps.cumsum(0)]) / steps.sum()
         waves = torch.cos(math.pi * along[:, None] * torch.arange(count, dtype=torch.float64))
         return torch.cat([waves, along[:, None], along[:, None].square()], dim=1) if ends else waves

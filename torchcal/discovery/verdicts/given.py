@@ -99,7 +99,7 @@ def begun_elsewhere(search: Search) -> list[str]:
     shown = [
         {state: output for output, state in bound.ode.reads.items()
          if state in run.initial and state not in bound.ode.initial and output in run.outputs
-         and len(run.time) >= FEWEST}
+         and int(run.outputs[output].isfinite().sum()) >= FEWEST}
         for run in runs
     ]  # fmt: skip
     first = [
@@ -108,8 +108,11 @@ def begun_elsewhere(search: Search) -> list[str]:
     ]
     if moved := _moved(search, first, CONFIRMED):
         it, was = ("it", "was") if len(moved) == 1 else ("them", "were")
+        names = list(moved)
+        if len(names) > MOST_TOLD + 1:
+            names = [*names[:MOST_TOLD], f"{len(names) - MOST_TOLD} others"]
         return [
-            f"{', '.join(moved)} {was} given as the first value recorded, noise and all: with {it} unknown (left out "
+            f"{', '.join(names)} {was} given as the first value recorded, noise and all: with {it} unknown (left out "
             "of initial=) the base leaves no more than noise"
         ]
     moved = {} if first == shown else _moved(search, shown, ELSEWHERE)
@@ -118,7 +121,7 @@ def begun_elsewhere(search: Search) -> list[str]:
         "is unknown (left out of initial=)" for full, (given, found) in moved.items()
     ]  # fmt: skip
     if len(told) > MOST_TOLD:
-        told = [f"{told[0]}, and {len(told) - 1} others are others than they were given, too"]
+        told = [f"{told[0]}; so are {len(told) - 1} other initial values elsewhere than given"]
     return [f"{one}: the base leaves no more than noise then" for one in told]
 
 
