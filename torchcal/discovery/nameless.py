@@ -49,7 +49,7 @@ CLOSE, MOST, ELSEWHERE = 3.0, 3, 2
 #: which on the best of them is tried with other edges than a step's.
 IN_RANGES, NEAR = 4, 20.0
 #: How many changes are looked at that promise most where no instrument says in which ranges.
-PROMISING = 3
+PROMISING = 2
 #: Shares and χ² by which a change in a range may remove less than the leading term, and still be tried: its effect is
 #: taken for linear, and its edges from a coarse grid.
 LACKING, LESS = 0.35, 10.0
@@ -157,8 +157,8 @@ class _Changes:
         """Refit changes of the base in ranges of drivers beside a leader that acts everywhere: a step of a parameter
         each, where that promises nearly as much, and the best of them with edges to fit where it comes near.
 
-        An instrument that errs beyond a value is held against what happens there, which may grow from there, as its
-        error does.
+        An instrument that errs beyond a value is held against what happens there; where nothing depends on time,
+        against what grows from there, too, as its error does.
         """
         search = self.search
         if lead.weight < math.log(PRIOR["base"]) + CLOSE:  # that is no name
@@ -182,8 +182,7 @@ class _Changes:
         weights = [-math.inf if one is None else one.weight for one in self._refit([one for *_, one in begun])]
         if weights and max(weights) > lead.weight - max(NEAR, 0.5 * LACKING * removed):
             _, model, place, _ = begun[weights.index(max(weights))]
-            kinds = ("edge", "grown") if errs and in_time else ("edge",)
-            self._refit([one for kind in kinds for one in self._begun(model, place, kind)[0][:1]])
+            self._refit(self._begun(model, place, "edge")[0][:1])
 
     def _begun(self, model: Model, place: Places, kind: str) -> tuple[list[Hypothetical], float]:
         return _wanted(self.search, model, place, self.prior, self.named, (kind,))

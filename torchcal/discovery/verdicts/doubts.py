@@ -123,9 +123,11 @@ def _at_given_end(search: Search, model: Model, i: int) -> bool:
 def _no_better(search: Search, model: Model) -> str:
     """Why a term is hardly likelier than a change in a range that has no name; empty if it is clearly so.
 
-    An instrument that errs beyond a value is a function of what changes there: it has to fit better.
+    Where nothing depends on time an instrument that errs beyond a value is a function of the conditions as any other:
+    it has to fit better.
     """
-    errs = model.window is None and threshold_of(model.candidate.terms, model.found.by_name) is not None
+    alone = model.window is None and not model.found.problem.in_time
+    errs = alone and threshold_of(model.candidate.terms, model.found.by_name) is not None
     lead = {id(one): (one.log_evidence - model.log_evidence) if errs else (one.weight - model.weight)
             for one in search.nameless}  # fmt: skip
     rival = max(search.nameless, key=lambda one: lead[id(one)], default=None)
