@@ -101,7 +101,7 @@ def residual_map(
         edges: Values of the driver at which a constant change begins or ends, drawn as vertical lines.
         period: Of an oscillation, in the driver's unit: the means are then finer than it, or left out where the data
             are too few for that.
-        share: Share of the misfit that sits there.
+        share: Share of the misfit that a change along the driver explains.
         noise: Noise sd of the output, in its unit, a number or one for each condition ``(n,)``; or anything with a
             dict ``sd`` of them by output; where it is known, and by default, the recording's. Drawn as a band of ±2 sd.
         set_aside: Mask ``(n_total,)`` of data that were taken for outliers: crosses, which no mean counts.
@@ -144,7 +144,8 @@ def residual_map(
     x = as_numbers(values, "values", recording.n)
     part = places_of(recording, output)
     ax = style.new_axes(ax)
-    located = f"mismatch located here ({100 * share:.0f} % of it)" if share is not None else "mismatch located here"
+    goes = "" if share is None else f" ({100 * share:.0f} % of it goes with {look.shown(driver)})"
+    located = f"mismatch largest here{goes}"
     seen = np.isfinite(y[part]) & np.isfinite(x)
     aside = np.zeros_like(seen) if mask is None else mask[part] & seen
     shown = seen & ~aside
@@ -186,7 +187,7 @@ def residual_map(
         residual = (y[part] - fit.values[part]) / unit_of
         for rows, level, shade in groups if i == 0 else [(dots, "", 1.0)]:
             color = tuple(shade * part for part in to_rgb(fit.color))
-            name = f"{fit.name}, {level}" if level else "_points" if bins else fit.name
+            name = f"{fit.name}, {level}" if level else "_points" if bins or rows is not dots else fit.name
             ax.plot(
                 x[rows], residual[rows], fit.marker, ms=3.0 if many else 4.5, mfc=color if many else fit.face,
                 mec="none" if many else color, mew=0.9, alpha=(OPAQUE / max(len(dots), OPAQUE)) ** 0.5,
