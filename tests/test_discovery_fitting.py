@@ -11,6 +11,7 @@ from torch.autograd import forward_ad
 import torchcal as tc
 from torchcal.discovery.fits.fitting import fit, refit, starts
 from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.hypotheses import search
 from torchcal.discovery.hypotheses.base import calibrate_base
 from torchcal.discovery.misfit.noise import GRID, Noise
 from torchcal.discovery.misfit.residual import Residual, _noise_draws
@@ -519,3 +520,19 @@ def test_what_is_named_is_told_at_its_lowest_minimum():
     assert astray.found.chi2 > right.found.chi2 + 100
     assert deeper(search(), right) is None
     assert deeper(search(), astray).chi2 == pytest.approx(right.found.chi2, abs=1e-3)
+
+
+@pytest.mark.parametrize(("error", "looked"), [(0.1, False), (2.0, True)])
+def test_what_shorter_steps_cannot_bring_to_the_best_is_not_refitted_with_them(monkeypatch, error, looked):
+    """Of 40 data with residuals of 3 sd each, where another model leaves those of 1 sd."""
+    line = tc.Simulator(lambda x, p: p["a"] * x, [tc.Parameter("a")])
+    problem = Problem.of(line, tc.Recording(x=torch.linspace(0, 1, 40, dtype=F64), y=torch.zeros(40), noise=1.0))
+    whitening = white(problem, 1.0)
+    coarse = SimpleNamespace(chi2=360.0, y=problem.y, problem=problem, whitening=whitening)
+    searched = SimpleNamespace(exact=False, noise=SimpleNamespace(sd=torch.ones(40, dtype=F64)))
+    monkeypatch.setattr(search, "accurate", lambda found, sd: False)
+    monkeypatch.setattr(search, "halved", lambda found: found.y + error)
+    monkeypatch.setattr(search, "sharpen", lambda *given, **options: ("finer", 0.0))
+    found = search.Search._in_short_steps(searched, coarse, 40.0)
+    assert (found == "finer") is looked
+    assert search.Search._in_short_steps(searched, coarse) == "finer"

@@ -197,6 +197,25 @@ def test_an_initial_value_that_is_wrong_is_told():
     assert abs(float(rows[0].split()[7]) - 1.0) < 0.06
 
 
+def test_a_run_of_few_data_says_nothing_of_its_initial_value():
+    # One free value for each datum leaves no more than noise, whatever is missing.
+    rng = np.random.default_rng(0)
+    runs = []
+    for begin in np.linspace(0.3, 2, 12):
+        t = rng.uniform(0.5, 3)
+        left = np.exp(-0.6 * t)
+        end = begin * left / (1 + 0.5 * begin * (1 - left) / 0.6)
+        runs.append(tc.Run([0.0, t], {"c": [np.nan, end + 0.01 * rng.standard_normal()]}, initial={"c": begin}))
+    model = tc.ODESimulator(
+        lambda t, s, p, u: {"c": -p["k"] * s["c"]}, {"c": "M"}, [tc.Parameter("k", low=0.0, initial=0.5)]
+    )
+    term = tc.Term("second order", equation="c", rate=lambda t, s, p, u: -p["q"] * s["c"] ** 2,
+                   parameters=[tc.Parameter("q", low=0.0)])  # fmt: skip
+    d = diagnose(model, tc.Recording(runs=runs, noise=0.01, missing=True), [term])
+    assert ["second order"] in [d.terms, *d.tied]
+    assert not [row for row in d.symptoms if row.startswith("c(0)")]
+
+
 def test_an_exact_initial_value_is_not_blamed_for_what_is_missing():
     t = np.linspace(0.0, 5.0, 60)
     n = solve_ivp(lambda _, n: -0.3 * n - 0.4 * n**2, (0, 5), [1.0], t_eval=t, rtol=1e-9, atol=1e-12).y[0]
