@@ -42,8 +42,8 @@ from torchcal.terms import Term
 
 __all__ = ["refit_nameless"]
 
-#: Log weight behind the leader down to which a term in a window is held against nameless changes, and of how many; and
-#: against how many changes elsewhere than where it acts.
+#: Log weight behind the leader down to which a term in a window is held against nameless changes, or before the base
+#: from which on one that acts everywhere is; of how many; and against how many changes elsewhere than where it acts.
 CLOSE, MOST, ELSEWHERE = 3.0, 3, 2
 #: Changes, each in a range of a driver, that a term without a window is held against; and log weight behind it from
 #: which on the best of them is tried with other edges than a step's.
@@ -70,16 +70,18 @@ SAME, RANK = 1e-4, 1e-7
 
 def refit_nameless(search: Search) -> None:
     """Constant changes in the windows of the leading terms, where a term in a window leads; and these terms in other
-    windows, where their own leave something or do worse."""
+    windows, where their own leave something or do worse. Steps of the base's parameters where a term leads that acts
+    everywhere, and is clearly likelier than the base: else it is no name."""
     lead = search.physical_leader
     if search.exact or search.stop.is_set() or lead is None:
         return
     if search.noise.open and lead.window is None:  # with the noise that each of them leaves, one in a window may lead
         lead = likeliest_alone(search) or lead
-    changes = _Changes.of(search)
     if lead.window is None:
-        changes.hold_in_ranges(lead)
+        if lead.weight >= math.log(PRIOR["base"]) + CLOSE:
+            _Changes.of(search).hold_in_ranges(lead)
         return
+    changes = _Changes.of(search)
     changes.hold_against(lead)
     outdone = any(one.weight > lead.weight for one in search.nameless)
     if outdone or search.examine(lead).p_value < PLAINLY_WHITE:  # its window may not be the best that the term has
@@ -161,8 +163,6 @@ class _Changes:
         against what grows from there, too, as its error does.
         """
         search = self.search
-        if lead.weight < math.log(PRIOR["base"]) + CLOSE:  # that is no name
-            return
         in_time, removed = search.problem.in_time, 2.0 * (lead.log_evidence - lead.price)
         physics = [place for place in self.elsewhere if place[0][0] == "shifts"]
         if errs := _beyond(search, lead):
@@ -226,8 +226,8 @@ def _beyond(search: Search, model: Model) -> list[Model]:
 def _promising(
     search: Search, lead: Model, physics: Sequence[Places], least: float
 ) -> list[tuple[Model, Places]]:
-    """The leader as one in a window, and what of the base changes there instead: of each parameter the best window in
-    every driver, where that removes at least so much of the misfit, for linear."""
+    """The leader as one in a window, and what of the base changes there instead: of the best windows of each parameter
+    in every driver the few that remove most of the misfit, and at least so much, for linear."""
     drivers, found = search.drivers(), []
     places = {place[0][1]: place for place in physics}
     there = dataclasses.replace(
