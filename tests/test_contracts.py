@@ -175,6 +175,7 @@ def test_a_lag_of_an_output_that_depends_on_time_is_refused():
         extend(base, [sensor("lag of y", signal)]).bind(recording).at(recording.x)(tensor(0.01, 1.0, 2.0))
 
 
+@pytest.mark.slow
 def test_an_upper_bound_is_no_neutral_value_however_small():
     size = 1e-9
     torch.manual_seed(0)

@@ -496,6 +496,7 @@ def test_two_missing_terms_are_both_named():
     assert estimate_of(d, "position-dependent damping.c").value == pytest.approx(0.5, abs=0.1)
 
 
+@pytest.mark.slow
 def test_one_term_at_most_where_asked():
     library = named(tc.terms.mechanics(), "bias force", "position-dependent damping")
     body, _, x = spring(named(library, "bias force", "position-dependent damping"), noise=0.01,

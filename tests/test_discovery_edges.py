@@ -303,7 +303,7 @@ def test_a_sound_derivative_is_not_refused(name):
     assert diagnose(tc.Simulator(function, parameters), recording).verdict == "consistent"
 
 
-@pytest.mark.parametrize("given", [None, 8.0])
+@pytest.mark.parametrize("given", [pytest.param(None, marks=pytest.mark.slow), 8.0])
 def test_a_shape_may_lie_beyond_the_range_that_was_recorded_unless_a_bound_was_given(given):
     x = torch.linspace(0.05, 10, 80, dtype=F64)
     y = 2 * x / (x + 0.3) + 1.5 * x / (x + 20) + 0.01 * noise(80, 2)
@@ -327,6 +327,7 @@ def test_a_shape_may_lie_beyond_the_range_that_was_recorded_unless_a_bound_was_g
         assert any(row.note == "at its bound: second site.far" for row in d.ranking)
 
 
+@pytest.mark.slow
 def test_a_jump_that_is_tried_at_a_datum_is_no_lost_derivative():
     jump = tc.Term(
         "jump", outputs={"y": lambda x, p, y: y + p["h"] * torch.sign(x - p["x0"])},
@@ -412,7 +413,7 @@ def test_two_terms_that_only_show_together_are_seen_in_few_data(size, verdict):
 
 def test_noise_in_few_data_is_no_pair():
     x = torch.linspace(-1, 1, 11, dtype=F64)
-    found = [diagnose(LINE, tc.Recording(x=x, y=2 + x + noise(11, seed)), [SQUARE, CUBE]) for seed in range(40)]
+    found = [diagnose(LINE, tc.Recording(x=x, y=2 + x + noise(11, seed)), [SQUARE, CUBE]) for seed in range(15)]
     # Each is an alarm with a probability of 0.01 at most: three of 40 by chance with one of 0.8 %.
     assert sum(d.verdict != "consistent" for d in found) < 3
 

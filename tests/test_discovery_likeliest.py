@@ -55,7 +55,9 @@ def test_log_likelihood_is_the_normal_one_but_for_a_constant():
     assert log_likelihood(found, noise, tangents) == pytest.approx(expected, abs=1e-8)
 
 
-@pytest.mark.parametrize("rho", [0.0, 0.5, 0.8])
+@pytest.mark.parametrize(
+    "rho", [pytest.param(0.0, marks=pytest.mark.slow), 0.5, pytest.param(0.8, marks=pytest.mark.slow)]
+)
 def test_the_likeliest_noise_of_a_right_model_is_the_true_one(rho):
     found, size = [], []
     for seed in range(20):
@@ -90,7 +92,7 @@ def test_noise_alone_is_not_taken_for_something_unknown(size):
     # A Bayes factor above e^4.6 has a probability of at most 1 % by noise alone: 3 or more of 40, one of 1000. Without
     # the determinant of what is calibrated, eight coefficients would make it a quarter at ρ = 0.9.
     odds = []
-    for seed in range(40):
+    for seed in range(24):
         rng = np.random.default_rng(100 + seed)
         found, noise, tangents = curve(2 + 0.3 * correlated(rng, 90, (0.0, 0.9, 0.7, 0.9)[seed % 4]), size)
         odds.append(with_unknown(found, None, tangents, noise.unit)[1] - settled(found, noise, tangents)[1])

@@ -66,7 +66,8 @@ def test_an_instrument_with_a_hard_limit_is_one():
     assert d.terms == ["saturation of w"]
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_gain_error_in_a_range_is_no_name_where_a_parameter_does_the_same(seed):
     rng = np.random.default_rng(seed)
     x, load = (values.ravel() for values in np.meshgrid(np.linspace(-6, 6, 31), [1.0, 2.0, 3.0], indexing="ij"))

@@ -58,7 +58,7 @@ def noise_of(x, y, given=None, simulator=LINE) -> Noise:
 @pytest.mark.parametrize(("phi", "tolerance"), [(0.0, 0.03), (0.3, 0.07), (0.6, 0.13)])
 def test_size_and_correlation_of_the_noise(phi, tolerance, misfit):
     # A smooth misfit of five noise sd must not pass for noise.
-    n, seeds = 200, 30
+    n, seeds = 200, 15
     x = torch.linspace(0, 1, n, dtype=F64)
     found = [noise_of(x, 1 + 2 * x + misfit * torch.sin(7 * x) + draw(n, 0.1, seed, phi)) for seed in range(seeds)]
     size = np.array([float(noise.sd[0]) for noise in found]) / 0.1
@@ -318,8 +318,8 @@ def nulls(name, seeds):
 
 @pytest.mark.parametrize("name", NULLS)
 def test_false_alarms_are_rare(name):
-    found = nulls(name, range(20))
-    assert sum(d.verdict != "consistent" for d in found) <= most(20, 0.02)
+    found = nulls(name, range(8))
+    assert sum(d.verdict != "consistent" for d in found) <= most(8, 0.02)
     for d in found:
         if d.verdict == "consistent":
             assert (d.terms, d.tied, d.remaining, d.after) == ([], [], 0.0, None)
@@ -338,7 +338,7 @@ def test_false_alarms_are_rare_over_many_seeds(name):
     assert (p < 0.05).sum() <= most(seeds, 0.05)
 
 
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("known", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_the_probability_of_a_misfit_is_uniform_without_one(known):
     # Below 40 samples no correlation is sought, and nothing makes the test cautious.
     stats = pytest.importorskip("scipy.stats")
@@ -358,7 +358,7 @@ def search_of(recording, seed=0):
 
 def test_screening_scores_are_normal_without_a_misfit():
     stats = pytest.importorskip("scipy.stats")
-    seeds = 60
+    seeds = 40
     z = []
     for seed in range(seeds):
         search = search_of(decay(38, 2000 + seed, known=True), seed)
@@ -375,7 +375,7 @@ def test_screening_scores_are_normal_without_a_misfit():
 
 def test_a_planted_effect_moves_its_score_by_its_size():
     # E z = b ‖s⊥‖ for an offset b, to first order exactly for a linear output.
-    seeds = 25
+    seeds = 15
     z = []
     for seed in range(seeds):
         search = search_of(decay(38, 3000 + seed, known=True, offset=0.05), seed)
@@ -389,7 +389,7 @@ def test_the_stated_limit_is_where_detection_begins():
     limit = diagnosed(decay(60, 1, known=True)).detection_limit[0]
     assert limit.term == "offset"
     assert limit.power == 0.95
-    seeds = 12
+    seeds = 6
     seen = {
         factor: sum(
             diagnosed(decay(60, 4000 + s, known=True, offset=factor * limit.smallest), max_terms=1).verdict
@@ -503,7 +503,7 @@ def test_an_instrument_that_adds_more_than_it_measures_is_no_name(size, verdict)
 @pytest.mark.parametrize(
     ("offset", "gain", "told"),
     [
-        (2.0, -0.3, None),
+        pytest.param(2.0, -0.3, None, marks=pytest.mark.slow),
         (0.0, -0.8, None),
         (10.0, -0.8, "shows less than 40% of what the true value varies by"),
     ],
@@ -539,7 +539,7 @@ def uneven(seed, by_sample, phi=0.75, sd=0.02):
     return tc.Recording(runs=runs)
 
 
-@pytest.mark.parametrize("by_sample", [True, False])
+@pytest.mark.parametrize("by_sample", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_noise_of_uneven_runs_forgets_with_time_or_with_every_sample(by_sample):
     # What forgets with every sample was something missing: close samples do not agree as they would have to.
     seeds, seen = 12, []
@@ -587,7 +587,7 @@ def test_correlated_noise_of_uneven_runs_is_nothing_missing(by_sample):
         "second order", equation="n", rate=lambda t, s, p, u: -p["a"] * s["n"] ** 2,
         parameters=[tc.Parameter("a", low=0.0)],
     )  # fmt: skip
-    found = [tc.diagnose(LOSS, uneven(seed, by_sample), [term], seed=0, progress=False) for seed in range(4, 10)]
+    found = [tc.diagnose(LOSS, uneven(seed, by_sample), [term], seed=0, progress=False) for seed in range(4, 7)]
     assert sum(d.verdict != "consistent" for d in found) <= 1
 
 
@@ -617,11 +617,11 @@ def test_what_acts_in_one_of_several_sweeps_is_told_where_it_was_taken_for_slow_
 
 @pytest.mark.parametrize("phi", [pytest.param(0.0, marks=pytest.mark.slow), 0.7])
 def test_noise_that_is_alike_in_all_sweeps_is_not_told_to_differ(phi):
-    found = [swept(seed, 0.0, phi=phi) for seed in range(10)]
-    assert sum(any("not alike" in row for row in d.symptoms) for d in found) <= most(10, 0.01)
+    found = [swept(seed, 0.0, phi=phi) for seed in range(5)]
+    assert sum(any("not alike" in row for row in d.symptoms) for d in found) <= most(5, 0.01)
 
 
-@pytest.mark.parametrize("counts", [False, True])
+@pytest.mark.parametrize("counts", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_noise_that_is_given_as_a_share_of_what_was_read_is_no_misfit(counts):
     """An error bar of 5 % of each reading, or of the root of each count: what is left beyond smooth curves in units of
     the noise had been nothing, as a constant and a tangent of the output are that noise."""

@@ -382,9 +382,8 @@ def resonant(seed, noise, *, height=2.0, spike=0.0):
     return diagnose(base, tc.Recording(x=x, y=y, noise=noise), terms)
 
 
-@pytest.mark.parametrize(
-    "seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_what_sticks_out_of_the_best_term_may_be_what_a_second_one_is_seen_by(seed):
     d = resonant(seed, 0.1)  # of the curve alone the three samples of the resonance stick out
     assert set(d.terms) == {"quadratic", "resonance"}
@@ -416,7 +415,7 @@ def test_the_sd_of_a_name_rest_on_the_noise_beside_it():
 @pytest.mark.parametrize(
     ("seed", "noise"),
     [
-        (0, 0.1),
+        pytest.param(0, 0.1, marks=pytest.mark.slow),
         pytest.param(0, None, marks=pytest.mark.slow),
         pytest.param(1, 0.1, marks=pytest.mark.slow),
         (1, None),
@@ -520,7 +519,10 @@ def adsorbed(seed, datum):
     return model, tc.Recording(x=x, y=q), [henry, *tc.terms.sensor(("y",), static=True)]
 
 
-@pytest.mark.parametrize(("seed", "datum"), [(0, 15), (0, 31), (2, 31)])
+@pytest.mark.parametrize(
+    ("seed", "datum"),
+    [(0, 15), pytest.param(0, 31, marks=pytest.mark.slow), pytest.param(2, 31, marks=pytest.mark.slow)],
+)
 def test_a_wrong_datum_at_the_end_of_a_geometric_row_is_no_physics(seed, datum):
     d = tc.diagnose(*adsorbed(seed, datum), seed=0, progress=False)
     assert d.verdict == "consistent"

@@ -265,6 +265,7 @@ def test_a_pair_listed_in_the_wrong_order_does_not_lose_to_one_that_looks_like_i
     assert abs(chi2[0] - chi2[1]) < 0.1
 
 
+@pytest.mark.slow
 def test_the_order_of_the_list_does_not_decide_where_nothing_else_fits():
     # By the first order the pair is far behind; and what clips comes before what is not read from the output.
     x = torch.linspace(0.1, 4, 80, dtype=F64)

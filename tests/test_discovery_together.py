@@ -99,6 +99,7 @@ def test_an_offset_that_the_base_can_do_alone_makes_no_name_of_what_it_stands_be
     assert not named
 
 
+@pytest.mark.slow
 def test_what_all_likely_hypotheses_share_is_no_name_where_the_best_of_them_is_none():
     for seed in range(2000, 2003):
         d = conductivities(0.108, seed)

@@ -148,9 +148,8 @@ def test_a_loss_that_ends_is_named():
     assert d.terms == ["shunt"]
 
 
-@pytest.mark.parametrize(
-    "seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_an_initial_value_that_is_the_first_sample_is_told(seed):
     t = np.linspace(0.0, 5.0, 60)
     model = tc.ODESimulator(
@@ -547,7 +546,10 @@ def test_what_is_left_in_the_order_of_rows_may_be_noise_or_physics():
         assert ("the same conditions in another order would tell" in " ".join(str(d).split())) == bool(tied)
 
 
-@pytest.mark.parametrize(("gain", "rho"), [(0.3, 0.75), (0.3, 0.0), (0.0, 0.75)])
+@pytest.mark.parametrize(
+    ("gain", "rho"),
+    [(0.3, 0.75), pytest.param(0.3, 0.0, marks=pytest.mark.slow), pytest.param(0.0, 0.75, marks=pytest.mark.slow)],
+)
 def test_noise_of_two_colours_may_be_physics_where_the_evidence_comes_from_one_output(gain, rho):
     t, k, m, source = torch.linspace(0, 10, 80, dtype=F64), 0.5, 0.25, 0.0 if gain else 0.05
     decay, fade = torch.exp(-k * t), torch.exp(-m * t)

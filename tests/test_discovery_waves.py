@@ -161,7 +161,11 @@ def test_a_wave_larger_than_the_base_s_own_rate_is_none_of_that_rate():
 
 @pytest.mark.parametrize(
     ("effect", "largest"),
-    [(lambda p: 1.0 * (p > 3), (3.6, 10.0)), (lambda p: 1.0 * (p < 0.3), (0.1, 0.3)), (lambda p: p / 10, (4.6, 10.0))],
+    [
+        (lambda p: 1.0 * (p > 3), (3.6, 10.0)),
+        pytest.param(lambda p: 1.0 * (p < 0.3), (0.1, 0.3), marks=pytest.mark.slow),
+        pytest.param(lambda p: p / 10, (4.6, 10.0), marks=pytest.mark.slow),
+    ],
     ids=["above", "below", "growing"],
 )
 def test_what_is_missing_is_told_beside_what_the_base_makes_up_for(effect, largest):

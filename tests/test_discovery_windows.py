@@ -120,6 +120,7 @@ def test_physics_of_an_output_may_act_in_a_part_of_the_time():
     assert abs(a.value - 0.15) < 4 * a.sd
 
 
+@pytest.mark.slow
 def test_an_instrument_has_no_window_in_time():
     simulator, recording, terms = cell(lambda t, v, i: np.where(t > 6.5, 0.15 * i * np.abs(i), 0.0))
     d = diagnose(simulator, recording, [one for one in terms if one.is_sensor and one.name != "square drop"])
@@ -299,7 +300,7 @@ def test_what_begins_somewhere_and_is_in_no_list_is_not_named_by_a_window():
         assert d.verdict == "unexplained" or ["none of these"] in d.tied
 
 
-@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("side", [1, pytest.param(-1, marks=pytest.mark.slow)])
 def test_what_the_base_has_everywhere_acts_where_there_are_fewer_data(side):
     """A slope that changes at 0.3 is as well another slope below as above: of the two sides the smaller is told."""
     generator = torch.Generator().manual_seed(1)
@@ -349,9 +350,8 @@ def dip(seed):
     return base, tc.Recording(x={"V": v, "T": temperature}, y=y), terms
 
 
-@pytest.mark.parametrize(
-    "seed", [pytest.param(0, marks=pytest.mark.slow), 1, pytest.param(2, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_term_that_bends_to_a_dip_is_no_name(seed):
     d = diagnose(*dip(seed))
     assert d.verdict == "unexplained" or ["none of these"] in d.tied
@@ -405,7 +405,7 @@ def test_a_local_term_whose_shape_shows_is_named_all_the_same():
     assert float(d.settings["region"].removeprefix("v > ")) == pytest.approx(0.4, abs=0.1)
 
 
-@pytest.mark.parametrize(("seed", "depth"), [(1, 0.35), (3, 0.2)])
+@pytest.mark.parametrize(("seed", "depth"), [(1, 0.35), pytest.param(3, 0.2, marks=pytest.mark.slow)])
 def test_what_changes_a_factor_of_the_base_in_a_range_is_no_name(seed, depth):
     """A wake that takes a share of a turbine's power in some directions: terms with a power of their own were named
     there, since no constant loss of power is like it at all wind speeds."""
@@ -438,7 +438,7 @@ def test_what_changes_a_factor_of_the_base_in_a_range_is_no_name(seed, depth):
     assert 180 < span[0] < 220 < span[1] < 260
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_gain_of_the_list_is_no_nameless_one(seed):
     """The base has moved since the candidates were screened, and its slopes with it: both are taken where it stands."""
     rng = np.random.default_rng(seed)
@@ -458,9 +458,8 @@ def test_a_gain_of_the_list_is_no_nameless_one(seed):
     assert not any(model.names == ("a change of the gain of y",) for model in search.nameless)
 
 
-@pytest.mark.parametrize(
-    "seed", [pytest.param(0, marks=pytest.mark.slow), 1, pytest.param(2, marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_bend_that_is_in_no_list_is_no_window_of_a_curved_term(seed):
     """Extinction that grows from an airmass of 2.2 on: a curved term that begins at 2.4 was named there (seed 1)."""
     rng = np.random.default_rng(seed)

@@ -109,7 +109,9 @@ def combinations():
             for prior in PRIORS:
                 error = expected_error(likelihood, embedding, prior, count)
                 name = f"{likelihood}-{count}-{embedding}-{prior}"
-                yield pytest.param(likelihood, count, embedding, prior, error, id=name)
+                again = prior == "normal" and embedding in ("independent", "second order", "legendre", "subset")
+                marks = pytest.mark.slow if error is None and again else ()
+                yield pytest.param(likelihood, count, embedding, prior, error, id=name, marks=marks)
 
 
 @pytest.mark.parametrize(("likelihood", "count", "embedding", "prior", "error"), list(combinations()))

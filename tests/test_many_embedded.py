@@ -60,7 +60,7 @@ def followed(monkeypatch):
 @pytest.mark.parametrize(
     ("names", "embedding", "likelihood"),
     [
-        ("abc", tc.embeddings.Gaussian(), "abc"),
+        pytest.param("abc", tc.embeddings.Gaussian(), "abc", marks=pytest.mark.slow),
         ("ab", tc.embeddings.PolynomialChaos(order=2), "abc"),
         pytest.param("ab", tc.embeddings.Gaussian(), "gaussian_marginal", marks=pytest.mark.slow),
     ],

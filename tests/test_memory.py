@@ -67,6 +67,7 @@ def peaks(*sizes):
     return json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_peak_memory_grows_with_neither_nodes_nor_chains():
     """What a piece leaves behind for the gradient must not be kept for all of them."""
     piece = 2**18

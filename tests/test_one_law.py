@@ -34,6 +34,7 @@ def decay(starts=(1.0, 3.0), sd=0.01, units=None):
     return model, tc.Recording(runs=runs, units=units, noise=sd)
 
 
+@pytest.mark.slow
 def test_a_reaction_order_is_one_law_for_runs_that_begin_elsewhere():
     d = diagnose(*decay(), tc.terms.kinetics("A", rate="k"))
     assert d.terms == ["reaction order"]

@@ -597,7 +597,7 @@ def test_long_sets_of_terms_are_broken_between_terms():
     assert first.get_fontsize() == second.get_fontsize() == base.get_fontsize()
 
 
-@pytest.mark.parametrize("rows", [3, 16])
+@pytest.mark.parametrize("rows", [3, pytest.param(16, marks=pytest.mark.slow)])
 def test_names_and_notes_of_two_lines_leave_their_neighbours_alone(rows):
     terms = [(f"fuel reaction order {i}", "temperature exponent", "pressure error") for i in range(rows)]
     note = "its tangent tells nothing new: only large effects can"

@@ -174,7 +174,7 @@ def test_densities_that_differ_stop_everything(prepared, tmp_path):
     [
         "torchcal-hmc",
         pytest.param("pytuq-tuned", marks=needs("pytuq")),
-        pytest.param("emcee", marks=needs("emcee")),
+        pytest.param("emcee", marks=(needs("emcee"), pytest.mark.slow)),
     ],
 )
 def test_rows(prepared, sampler):

@@ -694,6 +694,7 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == ["file.npz"]
 
 
+@pytest.mark.slow
 def test_a_posterior_that_leaves_the_box_is_told_though_the_maximum_does_not():
     """The box is held against what predictions average over: the polynomial explodes where tanh does not."""
     x = torch.linspace(0, 1, 4, dtype=torch.float64)

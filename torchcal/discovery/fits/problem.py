@@ -35,7 +35,7 @@ class Whitening:
 
     Attributes:
         sd: Noise sd, ``(n,)``.
-        correlation: φ^d with the sample before, ``(n,)``; 0 for the first.
+        correlation: φ^d with the sample before, ``(n,)``; 0 for the first. Of several memories ``(m, n)``.
         before: Place of the sample before, ``(n,)``.
     """
 
@@ -43,13 +43,22 @@ class Whitening:
     correlation: Tensor
     before: Tensor
 
+    @cached_property
+    def white(self) -> bool:
+        """Whether no datum is correlated with another, where one memory was asked for."""
+        return self.correlation.ndim == 1 and not bool((self.correlation != 0).any())
+
+    @cached_property
+    def news(self) -> Tensor:
+        """Share of the noise sd that is not remembered, like `correlation`."""
+        return (1 - self.correlation.square()).sqrt()
+
     def __call__(self, values: Tensor) -> Tensor:
-        """Whitened ``(*batch, n, columns)``."""
+        """Whitened ``(*batch, n, columns)``; ``(m, n, columns)`` of ``(n, columns)`` in noise of m memories."""
         scaled = values / self.sd[:, None]
-        if not bool((self.correlation != 0).any()):
+        if self.white:
             return scaled
-        rho = self.correlation[:, None]
-        return (scaled - rho * scaled[..., self.before, :]) / (1 - rho.square()).sqrt()
+        return (scaled - self.correlation[..., None] * scaled[..., self.before, :]) / self.news[..., None]
 
     def vector(self, values: Tensor) -> Tensor:
         """Whitened ``(*batch, n)``."""
@@ -110,6 +119,14 @@ class Problem:
     def condition_of(self) -> Tensor:
         """Number of the condition of each used datum, ``(n,)``."""
         return self.index % self.recording.n
+
+    @cached_property
+    def before(self) -> Tensor:
+        """Place of the datum that was recorded before each one, ``(n,)``; of the first its own."""
+        found = torch.arange(self.n)
+        for places in self.recorded:
+            found[places[1:]] = places[:-1]
+        return found
 
     @property
     def in_time(self) -> bool:
@@ -209,17 +226,20 @@ class Problem:
         each = [timed.gaps(places) for places in self.recorded if len(places) > 2] if self.in_time else []
         return any(bool((gaps - 1).abs().amax() > UNEVEN) for gaps in each)
 
+    @cached_property
+    def _gaps(self) -> list[Tensor]:
+        """`gaps` of all `recorded` sequences."""
+        return [self.gaps(places) for places in self.recorded]
+
     def whitening(self, sd: Tensor, correlation: Tensor) -> Whitening:
-        """Of noise with sd ``(n_total,)`` and an AR(1) coefficient for each output, ``(outputs,)``."""
-        rho = torch.zeros(self.n, dtype=torch.float64)
-        before = torch.arange(self.n)
+        """Of noise with sd ``(n_total,)`` and an AR(1) coefficient for each output, ``(outputs,)``; or of m memories,
+        ``(m, outputs)``."""
+        rho = torch.zeros(*correlation.shape[:-1], self.n, dtype=torch.float64)
         if bool((correlation != 0).any()):
-            for places in self.recorded:
-                if len(places) < 2:
-                    continue
-                rho[places[1:]] = remembered(correlation[int(self.output_of[places[0]])], self.gaps(places))
-                before[places[1:]] = places[:-1]
-        return Whitening(sd[self.index], rho, before)
+            for places, gaps in zip(self.recorded, self._gaps, strict=True):
+                each = remembered(correlation[..., int(self.output_of[places[0]])], gaps)
+                rho[..., places[1:]] = each.movedim(0, -1)
+        return Whitening(sd[self.index], rho, self.before)
 
     # --- parameters ---------------------------------------------------------------------------------------
 

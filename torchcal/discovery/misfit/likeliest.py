@@ -58,19 +58,21 @@ class Tangents:
         """Of the base's fit."""
         slope = orthonormal(base.jacobian[:, ~base.at_bound], cut=1e-7)
         problem, outputs, unit = base.problem, len(noise.correlation), _unit(noise)
-        grams, logs = [], []
-        for rho in GRID:
-            w = problem.whitening(unit, torch.full_like(noise.correlation, float(rho)))
-            white, half = w(slope), 0.5 * torch.log1p(-w.correlation.square())
-            parts = [problem.output_of == k for k in range(outputs)]
-            grams.append(torch.stack([white[part].T @ white[part] for part in parts]))
-            logs.append(torch.stack([half[part].sum() for part in parts]))
-        return cls(slope, torch.stack(grams, 1), torch.stack(logs, 1))
+        w = problem.whitening(unit, _memories(outputs))
+        white, half = w(slope), 0.5 * torch.log1p(-w.correlation.square())
+        parts = [problem.output_of == k for k in range(outputs)]
+        grams = [white[:, part].transpose(-1, -2) @ white[:, part] for part in parts]
+        return cls(slope, torch.stack(grams), torch.stack([half[:, part].sum(-1) for part in parts]))
 
 
 def _counts(problem: Problem) -> Tensor:
     """Used data of every output, ``(outputs,)``."""
     return torch.bincount(problem.output_of, minlength=len(problem.recording.outputs)).double()
+
+
+def _memories(outputs: int) -> Tensor:
+    """Those of `GRID`, of every output alike, ``(grid, outputs)``."""
+    return GRID[:, None].expand(-1, outputs)
 
 
 def _unit(noise: Noise) -> Tensor:
@@ -111,10 +113,7 @@ def alone(found: Fitted, noise: Noise, tangents: Tangents) -> tuple[Noise, float
     if noise.source == "replicates":
         return noise, log_likelihood(found, noise, tangents)
     unit, outputs = _unit(noise), len(noise.correlation)
-    squares = torch.stack([
-        problem.whitening(unit, torch.full_like(noise.correlation, float(rho))).vector(found.residual).square()
-        for rho in GRID
-    ])  # fmt: skip
+    squares = problem.whitening(unit, _memories(outputs)).vector(found.residual).square()
     count = _counts(problem)
     freedom = (count * (1 - len(found.free) / problem.n)).clamp_min(1.0)
     square = torch.stack([squares[:, problem.output_of == k].sum(1) for k in range(outputs)])  # (outputs, grid)
