@@ -7,27 +7,18 @@ A term whose window leaves something is tried in all others: from the base alone
 """
 
 import dataclasses
-import itertools
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
+from torchcal.discovery.begun_in_windows import in_any_window, wanted_changes
 from torchcal.discovery.fits.candidates import Candidate, prepare
-from torchcal.discovery.fits.changes import Places, constant_change, distance, fading_to, places_of
-from torchcal.discovery.fits.local import (
-    EDGE,
-    ENDS,
-    WIDTH_OF_EDGE,
-    WIDTHS,
-    Span,
-    is_window,
-    localised,
-    multiplied,
-)
+from torchcal.discovery.fits.changes import Places, constant_change, places_of
+from torchcal.discovery.fits.local import is_window
 from torchcal.discovery.fits.readings import threshold_of
 from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.hypotheses.own_noise import likeliest_alone
@@ -53,19 +44,12 @@ PROMISING = 2
 #: Shares and χ² by which a change in a range may remove less than the leading term, and still be tried: its effect is
 #: taken for linear, and its edges from a coarse grid.
 LACKING, LESS = 0.35, 10.0
-#: Terms that are tried in all windows of a driver, and places where these may begin or end.
-TRIED, CUTS = 4, 14
-#: Places within an open window where a nameless change may begin or end, and starts that are refitted with each width
-#: of the edges.
-INSIDE, STARTS = 10, 2
-#: Shares of a window by which its ends are moved for other starts; not at all first.
-MOVES = (0.0, -0.15, 0.15, -0.3, 0.3)
-#: What the name of a term that fades begins with.
-FADING = "a fading "
+#: Terms that are tried in all windows of a driver.
+TRIED = 4
 #: Share of an output's data from which on a range of a driver is where an instrument errs.
 ALIKE = 0.9
-#: Relative difference up to which two effects are one, and relative size from which on two are independent.
-SAME, RANK = 1e-4, 1e-7
+#: Relative difference up to which two effects are one.
+SAME = 1e-4
 
 
 def refit_nameless(search: Search) -> None:
@@ -85,7 +69,7 @@ def refit_nameless(search: Search) -> None:
     changes.hold_against(lead)
     outdone = any(one.weight > lead.weight for one in search.nameless)
     if outdone or search.examine(lead).p_value < PLAINLY_WHITE:  # its window may not be the best that the term has
-        again = [(old, one) for old in _rivals(search, lead) if (one := _anywhere(search, old)) is not None]
+        again = [(old, one) for old in _rivals(search, lead) if (one := in_any_window(search, old)) is not None]
         before = search.models
         moved = map(long_enough, _refitted(search, [one for _, one in again]))
         for (old, _), new in zip(again, moved, strict=True):
@@ -146,7 +130,7 @@ class _Changes:
                 if (place, window.driver) in wanted or key in self.tried:
                     continue
                 self.tried.add(key)
-                begun, chi2 = _wanted(search, model, place, self.prior, self.named)
+                begun, chi2 = wanted_changes(search, model, place, self.prior, self.named)
                 if place == where:
                     wanted[place, window.driver] = begun
                 elif chi2 < search.base.chi2:
@@ -185,7 +169,7 @@ class _Changes:
             self._refit(self._begun(model, place, "edge")[0][:1])
 
     def _begun(self, model: Model, place: Places, kind: str) -> tuple[list[Hypothetical], float]:
-        return _wanted(self.search, model, place, self.prior, self.named, (kind,))
+        return wanted_changes(self.search, model, place, self.prior, self.named, (kind,))
 
     def _refit(self, wanted: Sequence[Hypothetical]) -> list[Model | None]:
         found = [long_enough(one) for one in _refitted(self.search, wanted)]
@@ -314,116 +298,3 @@ def _is_constant(search: Search, candidate: Candidate, own: Tensor) -> bool:
     where = places_of(candidate)
     still = None if where is None else _effect(search, constant_change(where, search.problem.in_time))
     return still is not None and own.shape[1] == 1 and _within(own, still)
-
-
-def _wanted(
-    search: Search,
-    model: Model,
-    where: Places,
-    prior: float,
-    named: set[Places | None],
-    only: Collection[str] = ("step", "edge", "grown", "faded"),
-) -> tuple[list[Hypothetical], float]:
-    """A constant in a model's window, with steep edges and with edges to fit; an open window closed as well, with a
-    change that grows from its end, and with one that fades towards it; or ``only`` some of these. And the least χ² of
-    all their beginnings, for linear."""
-    w = model.window
-    if w is None:
-        return [], math.inf
-    driver = search.drivers()[w.driver]
-    inside = driver[(driver >= w.low) & (driver <= w.high)]
-    span = w.span or search.spans()[w.driver]
-    moves = [k * span.size * span.share(w.low, w.high) for k in MOVES]
-    moved = [(span.moved(w.low, a), span.moved(w.high, b)) for a, b in itertools.product(moves, moves)]
-    ends = [list(dict.fromkeys(moved))]
-    if not (math.isfinite(w.low) and math.isfinite(w.high)) and len(inside):
-        cuts = inside.double().quantile(torch.linspace(0, 1, INSIDE, dtype=torch.float64)).unique().tolist()
-        last = w.low if math.isfinite(w.low) else w.high  # the end that it has, which need not be one of the data
-        cuts = sorted({*cuts[1:], last}) if math.isfinite(w.low) else sorted({*cuts[:-1], last})
-        ends += [list(itertools.combinations(cuts, 2))] if len(cuts) > 1 else []
-    still = constant_change(where, search.problem.in_time)
-    edges = {"step": False, "edge": True}
-    shapes = [(kind, still, chosen) for chosen in ends for kind in edges] if where not in named else []
-    if len(ends) > 1:
-        in_time, end = search.problem.in_time, ENDS["from" if math.isfinite(w.low) else "to"]
-        grows = distance(w.driver, end, span, in_time)
-        shapes.append(("grown", constant_change(where, in_time, grows), ends[0]))
-        fading = fading_to(w.driver, end, span, in_time)
-        shapes.append(("faded", constant_change(where, in_time, fading), ends[0]))
-        term = search.candidates[model.numbers[0]].terms[0]
-        if where == places_of(model.candidate) and not term.elapsed:  # whose t is not the window's
-            shapes.append(("faded", multiplied(term, f"{FADING}{term.name}", fading), ends[0]))
-    found, least = [], math.inf
-    for kind, change, chosen in shapes:
-        if kind not in only:
-            continue
-        low, high = chosen[0]
-        near = span.edged(low, high)
-        local = localised(
-            change, w.driver, low, high, near,
-            static=not search.problem.in_time, edge=edges.get(kind, False),
-        )  # fmt: skip
-        try:
-            candidate = prepare(search.base.problem, search.base, [local], search.fixed)
-            begin, chi2 = _begin(search, model, candidate, chosen, span)
-        except (SimulatorError, DomainError):
-            continue
-        window = dataclasses.replace(w, low=low, high=high, span=near)
-        found.append(Hypothetical((), candidate, begin, prior, window))
-        least = min(least, chi2)
-    return found, least
-
-
-def _anywhere(search: Search, model: Model) -> Hypothetical | None:
-    """A model's term in all windows along the same driver, open ones too, from the best of them."""
-    w, term = model.window, search.candidates[model.numbers[0]].terms[0]
-    if w is None or len(model.candidate.amplitudes) != 1:
-        return None
-    span = search.spans()[w.driver]
-    cuts = [span.moved(span.low, k / (CUTS - 1) * span.size) for k in range(CUTS)]
-    local = localised(term, w.driver, cuts[0], cuts[-1], span, static=not search.problem.in_time, edge=True)
-    try:
-        candidate = prepare(search.base.problem, search.base, [local], search.fixed)
-        begin, _ = _begin(search, model, candidate, list(itertools.combinations(cuts, 2)), span)
-    except (SimulatorError, DomainError):
-        return None
-    window = dataclasses.replace(w, low=cuts[0], high=cuts[-1], span=span)
-    return Hypothetical(model.numbers, candidate, begin, model.log_prior, window)
-
-
-def _begin(
-    search: Search, model: Model, candidate: Candidate, ends: Sequence[tuple[float, float]], span: Span
-) -> tuple[Tensor, float]:
-    """Starting values at a model's base, of the best size each, those of the best few; and the least χ², for linear."""
-    known, problem = model.found.by_name, candidate.problem
-    known |= {f"{FADING}{name}": value for name, value in known.items()}  # a term that fades begins at its shape
-    names = [q.name for q in problem.parameters]
-    places = candidate.amplitudes
-    widths = [share * span.size for share in (EDGE, *WIDTHS)]
-    if not any(name.endswith(WIDTH_OF_EDGE) for name in names):
-        widths = widths[:1]
-    rows = []
-    for width, (low, high) in itertools.product(widths, ends):
-        row = candidate.begin.clone()
-        for i, name in enumerate(names):
-            if is_window(name):
-                row[i] = width if name.endswith(WIDTH_OF_EDGE) else low if name.endswith("from") else high
-            elif i not in places:
-                row[i] = known.get(name, float(row[i]))
-        rows.append(row)
-    begin = torch.stack(rows)
-    y, slope, _ = problem.evaluate(begin, places)
-    w = search.noise.whitening(problem)
-    left, effect = w.vector(problem.y - y), torch.stack([w(one) for one in slope])
-    lost = ~(left.isfinite().all(-1) & effect.square().sum((1, 2)).isfinite())  # solutions that blow up
-    left, effect = left.masked_fill(lost[:, None], 0.0), effect.masked_fill(lost[:, None, None], 0.0)
-    # Of places where nothing happens the size stays as it is.
-    scale = effect.norm(dim=1, keepdim=True).clamp_min(1e-300)
-    size = torch.linalg.pinv(effect / scale, rtol=RANK) @ left[..., None]
-    begin[:, places] += size[..., 0] / scale[:, 0]
-    chi2 = (left - ((effect / scale) @ size)[..., 0]).square().sum(-1)
-    chi2 = chi2.masked_fill(lost, torch.inf)
-    chi2 = chi2.nan_to_num(nan=torch.inf)
-    order = chi2.reshape(len(widths), -1).argsort(-1)[:, :STARTS]
-    best = begin.reshape(len(widths), -1, begin.shape[-1])[torch.arange(len(widths))[:, None], order]
-    return best.flatten(0, 1), float(chi2.min())

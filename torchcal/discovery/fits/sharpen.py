@@ -60,7 +60,12 @@ def halved(found: Fitted) -> Tensor:
 
 
 def sharpen(
-    found: Fitted, allowed: Callable[[Fitted], Tensor], *, rounds: int, patient: bool = True
+    found: Fitted,
+    allowed: Callable[[Fitted], Tensor],
+    *,
+    rounds: int,
+    patient: bool = True,
+    half: Tensor | None = None,
 ) -> tuple[Fitted, float]:
     """Shorten a fit's time steps, where they err, until halving them moves no output by more than is allowed.
 
@@ -72,6 +77,7 @@ def sharpen(
         allowed: The largest change of every datum, ``(n,)``, of a fit.
         rounds: How often steps are chosen anew at most.
         patient: Whether to go on where that is of little avail, as in a model that jumps.
+        half: What the fit shows with steps half as long, where that is known.
 
     Returns:
         The fit with steps that do, and by what it still errs (0 where it does not).
@@ -82,7 +88,7 @@ def sharpen(
         if not isinstance(simulator, Trajectories) or not may_change(simulator):
             return found, 0.0
         try:
-            y = halved(found)
+            y = halved(found) if number or half is None else half
         except DomainError:  # more steps than anyone can take
             break
         error, most = (y - found.y).abs(), allowed(found)

@@ -326,9 +326,10 @@ class Search:
             return found
         away = math.sqrt(found.chi2) - math.sqrt(max(wanted, 0.0))
         try:
-            if away > 0 and away > SURELY * float(found.whitening.vector(halved(found) - found.y).norm()):
+            finer = halved(found)
+            if away > 0 and away > SURELY * float(found.whitening.vector(finer - found.y).norm()):
                 return found
-            return sharpen(found, lambda now: SOLVER_SHARE * sd, rounds=ROUNDS, patient=False)[0]
+            return sharpen(found, lambda now: SOLVER_SHARE * sd, rounds=ROUNDS, patient=False, half=finer)[0]
         except (SimulatorError, DomainError):  # with steps so short, or with too many of them
             return found
 
