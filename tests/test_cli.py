@@ -81,6 +81,12 @@ def test_mistakes_are_told_in_a_line_before_any_work(problem, tmp_path, capsys, 
     odd.write_text(PROBLEM + "\ncalibrate_options = [1]")
     taken = tmp_path / "json.py"
     taken.write_text(PROBLEM)
+    binary = tmp_path / "binary.py"
+    binary.write_bytes(b"\0x")
+    cut = tmp_path / "cut.json"
+    cut.write_text('{"kind": "diagnosis", "te')
+    linked = tmp_path / "linked.py"
+    linked.symlink_to(problem)
     for arguments, told in [
         (["calibrate", str(tmp_path / "nothing.py")], "which is none"),
         (["calibrate", str(half)], "Got no recording"),
@@ -88,13 +94,18 @@ def test_mistakes_are_told_in_a_line_before_any_work(problem, tmp_path, capsys, 
         (["calibrate", str(taken)], "rename it"),
         (["calibrate", str(problem), "--out", str(tmp_path)], "the name of a file"),
         (["calibrate", str(problem), "--out", str(tmp_path / "no" / "a.nc")], "in a folder that exists"),
+        (["calibrate", str(problem), "--out", str(linked)], "the problem itself"),
+        (["diagnose", str(problem), "--out", str(tmp_path / "a"), "--report", str(tmp_path / "a")], "something else"),
+        (["calibrate", str(binary)], "null bytes"),
         (["show", str(problem)], "netCDF"),
+        (["show", str(cut)], "or cut"),
     ]:
         assert cli.main(arguments) == 1
         error = capsys.readouterr().err
         assert told in error
         assert error.startswith("torchcal: ")
         assert "Traceback" not in error
+    assert problem.read_text() == PROBLEM
     for name in ("half", "odd"):
         sys.modules.pop(name, None)
     with pytest.raises(SystemExit) as stop:

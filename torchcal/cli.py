@@ -111,9 +111,9 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _calibrate(given: argparse.Namespace) -> None:
+    _check_targets(given.problem, given.out)
     problem = _problem(given.problem)
     if given.out is not None:
-        check_target(given.out)
         netcdf_modules()
     options = _options(problem, "calibrate_options", calibrate, given, target_ess=given.target_ess)
     warnings.simplefilter("always", InterruptionWarning)  # by which the status is known, whatever the file filters
@@ -122,15 +122,24 @@ def _calibrate(given: argparse.Namespace) -> None:
 
 
 def _diagnose(given: argparse.Namespace) -> None:
+    _check_targets(given.problem, given.report, given.out)
     problem = _problem(given.problem)
-    for path in (given.report, given.out):
-        if path is not None:
-            check_target(path)
     options = _options(problem, "diagnose_options", diagnose, given)
     warnings.simplefilter("always", InterruptionWarning)
     result = diagnose(problem.simulator, problem.recording, getattr(problem, "candidates", ()), **options)
     wanted = [(result.report, given.report), (result.save, given.out)]
     _finish(result, [functools.partial(write, path) for write, path in wanted if path is not None])
+
+
+def _check_targets(problem: Path, *targets: Path | None) -> None:
+    """Raise unless files of their own can be written: neither each other's nor the problem's."""
+    taken = {os.path.realpath(problem): "the problem itself"}
+    for path in targets:
+        if path is not None:
+            place = os.path.realpath(check_target(path))
+            if place in taken:
+                raise DomainError(f"Expected the name of another file. Got {path}, which is {taken[place]}.")
+            taken[place] = "where something else is written"
 
 
 def _finish(result: object, writes: Sequence[Callable[[], object]]) -> None:
@@ -152,6 +161,8 @@ def _show(given: argparse.Namespace) -> None:
     if (text := text_of(given.result)) is not None:
         print(text)
         return
+    if given.result.is_file() and given.result.read_bytes()[:1] == b"{":
+        raise DomainError(f"Expected a result that diagnose wrote. Got {given.result}, which is another file or cut.")
     try:
         print(Calibration.load(given.result))
     except TorchcalError as first:
@@ -186,6 +197,12 @@ def _problem(path: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(path.stem, path.resolve())
     if spec is None or spec.loader is None:
         raise DomainError(f"Expected a Python file, such as problem.py. Got {path}.")
+    try:
+        spec.loader.get_code(path.stem)  # type: ignore[attr-defined]
+    except (SyntaxError, ValueError) as error:
+        if isinstance(error, SyntaxError) and error.filename is not None:  # told with its line
+            raise
+        raise DomainError(f"Expected a Python file, such as problem.py. Got {path}: {error}.") from error
     module = importlib.util.module_from_spec(spec)
     taken = sys.modules.get(path.stem)
     if taken is not None and not hasattr(taken, _MARK):
