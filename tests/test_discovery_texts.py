@@ -728,3 +728,19 @@ def test_a_shape_at_a_given_bound_along_which_the_size_is_open_is_no_name(low, v
     d = tc.diagnose(base, recording, [term], seed=0, progress=False)
     assert d.verdict == verdict
     assert ("ends at a bound of overpotential.il" in d.settings["doubt"]) == (verdict == "ambiguous")
+
+
+@pytest.mark.parametrize("reach", [1.0, 6.0])
+def test_parameters_of_a_valley_are_said_to_be_hardly_known_apart(reach):
+    """Early on a saturating rise tells its slope, and neither how high it ends nor how fast."""
+    x = torch.linspace(0.05, reach, 40, dtype=torch.float64)
+    base = tc.Simulator(
+        lambda x, p: p["a"] * (1 - torch.exp(-p["k"] * x)), [tc.Parameter("a", low=0.0), tc.Parameter("k", low=0.0)]
+    )
+    noise = torch.randn(40, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    recording = tc.Recording(x=x, y=2 * (1 - torch.exp(-x)) + 0.04 * noise, noise=0.04)
+    d = tc.diagnose(base, recording, tc.terms.sensor(("y",), static=True), seed=0, progress=False)
+    rows = [row for row in d.identifiability if "hardly known apart" in row]
+    a, k = (100 * e.sd / e.value for e in d.base.estimates)
+    told = f"a and k are hardly known apart (correlation of their estimates 0.993; sd of {a:.0f} %, {k:.0f} %)"
+    assert rows == ([told] if reach == 1.0 else [])

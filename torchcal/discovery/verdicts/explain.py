@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import torch
 from torch import Tensor
@@ -49,6 +49,8 @@ DEEPER = 0.1
 #: Correlation of what two accepted terms do to the data, beside what the base may do, from which on one law between
 #: them may look like their sum.
 ONE_LAW = 0.9
+#: Share of its estimate that an sd must be, and correlation of two estimates from which on they are hardly known apart.
+HARDLY, TOGETHER = 0.05, 0.98
 #: A parameter depends on what acts beside it when that moves it by more than this many of its sd.
 MOVED = 2.0
 
@@ -161,6 +163,7 @@ def identifiability(search: Search, best: Model | None) -> list[str]:
         f"a common change of {', '.join(group)} moves no datum: only combinations can be told"
         for group in _merged(mixed)
     ]
+    rows += _hardly_apart(search.base if best is None else best.found, {name for group in mixed for name in group})
     screening = search.screening
     for i, candidate in enumerate(search.candidates):
         if screening.best[i] < 0 and not candidate.blind:
@@ -250,6 +253,31 @@ def _untold(found: Fitted) -> tuple[list[str], list[list[str]]]:
         if sum(bool(loose[j]) for j in members) > 1:
             groups.append([names[j] for j in members])
     return unseen, groups
+
+
+def _hardly_apart(found: Fitted, told: Collection[str]) -> list[str]:
+    """Parameters of a fit that are not known well, each alone, and go with each other; but those told before."""
+    names, sd = [found.problem.parameters[i].name for i in found.free], stated_sd(found)[found.free]
+    values, own = found.values[found.free], found.covariance()
+    size = own.diagonal().clamp_min(1e-300).sqrt()
+    open_ = [
+        k
+        for k, name in enumerate(names)
+        if name not in told and not is_window(name) and HARDLY * abs(float(values[k])) < float(sd[k]) < math.inf
+    ]
+    pairs = {
+        (j, k): abs(r)
+        for j, k in itertools.combinations(open_, 2)
+        if abs(r := float(own[j, k] / (size[j] * size[k]))) > TOGETHER
+    }
+    rows = []
+    for group in _merged([[names[j], names[k]] for j, k in pairs]):
+        least = min(r for (j, k), r in pairs.items() if {names[j], names[k]} <= {*group})
+        shares = [100 * float(sd[k] / values[k].abs()) for k in map(names.index, group)]
+        each = ", ".join(f"{share:.0f} %" if share < 1000 else "more than 1000 %" for share in shares)
+        text = f"{', '.join(group[:-1])} and {group[-1]} are hardly known apart"
+        rows.append(f"{text} (correlation of their estimates {least:.3f}; sd of {each})")
+    return rows
 
 
 def _merged(groups: Sequence[list[str]]) -> list[list[str]]:
