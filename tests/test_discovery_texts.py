@@ -623,6 +623,24 @@ def test_opposites_that_have_one_sign_each_are_not_the_same(low, told):
     assert any("less and more are nearly the same" in row for row in d.identifiability) is told
 
 
+@pytest.mark.parametrize("size", [0.1, -0.1])
+def test_what_may_not_have_the_sign_that_was_found_is_no_alias(size):
+    x = torch.linspace(1, 3, 40, dtype=F64)
+    base = tc.Simulator(lambda x, p: p["k"] / x, [tc.Parameter("k", low=0.0)])
+    either = tc.Term("either", outputs={"y": lambda x, p, y: y + p["b"] / x**2}, parameters=[tc.Parameter("b")])
+    less = tc.Term("less", outputs={"y": lambda x, p, y: y - p["d"] / x**2}, parameters=[tc.Parameter("d", low=0.0)])
+    others = [
+        tc.Term(f"power {n}", outputs={"y": lambda x, p, y, n=n: y + p["c"] * x**n}, parameters=[tc.Parameter("c")])
+        for n in range(1, 8)
+    ]
+    wobble = 0.01 * torch.randn(40, generator=torch.Generator().manual_seed(0), dtype=F64)
+    data = tc.Recording(x=x, y=1 / x + size / x**2 + wobble, noise=0.01)
+    d = tc.diagnose(base, data, [either, less, *others], progress=False)
+    (row,) = [row for row in d.ranking if row.terms == ("either",) and row.region is None]
+    assert row.aliases == (() if size > 0 else ("less",))
+    assert ("less" in {name for terms in d.tied for name in terms}) is (size < 0)
+
+
 def test_candidates_that_are_nearly_the_same_are_told_in_groups():
     x = torch.linspace(0, 1, 40, dtype=F64)
     base = tc.Simulator(lambda x, p: p["k"] + 0 * x, [tc.Parameter("k")])

@@ -198,7 +198,7 @@ class Search:
         for i, k in self.twins.items():
             a, b = plain.get(i), plain.get(k)
             own = a or before.get(i)  # once merged it is refitted no more, so that its fit says nothing against it
-            if i in self.failed or (own is not None and b is None):
+            if i in self.failed or (own is not None and b is None) or (own is None and not self._follows(i, k, b)):
                 continue
             if a is not None and b is not None and (a.physical != b.physical or abs(a.found.chi2 - b.found.chi2) > 0.5):
                 continue
@@ -206,6 +206,17 @@ class Search:
             self.merged |= {i: own} if own is not None else {}
         self.gone = {i for alike in self.aliases.values() for i in alike}
         self.models = [m for m in self.models if not self.gone & set(m.numbers)]
+
+    def _follows(self, i: int, k: int, model: Model | None) -> bool:
+        """Whether a candidate that was not refitted may have the sign with which it does what another one's model does.
+        """
+        own, other = self.candidates[i], self.candidates[k]
+        side = own.one_sided(own.amplitudes[0])
+        if model is None or not side:
+            return True
+        place = other.amplitudes[0]
+        size = float(model.found.values[place]) - float(other.neutral[other.own.index(place)])
+        return side * self.screening.correlation(i, k) * size >= 0
 
     def duplicate(self, i: int, j: int) -> bool:
         """Whether two candidates do the same whatever is calibrated beside them, to first order."""
