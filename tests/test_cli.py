@@ -99,6 +99,7 @@ def test_mistakes_are_told_in_a_line_before_any_work(problem, tmp_path, capsys, 
         (["calibrate", str(binary)], "null bytes"),
         (["show", str(problem)], "netCDF"),
         (["show", str(cut)], "or cut"),
+        (["show", str(tmp_path)], "which is none"),
     ]:
         assert cli.main(arguments) == 1
         error = capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import types
 import warnings
 
 import matplotlib.figure
@@ -1215,3 +1216,16 @@ def test_a_term_that_acts_only_near_the_true_initial_states_is_found():
     found = estimate_of(d, "ground effect.R")
     assert abs(found.value - 0.9) < 4 * found.sd
     assert d.noise.sd["z"] == pytest.approx(0.02, rel=0.2)
+
+
+@pytest.mark.parametrize(("after", "worse"), [(0.0, False), (0.5, False), (6.0, True)])
+def test_three_data_that_were_held_out_may_withdraw_a_name(after, worse):
+    from torchcal.discovery.hypotheses.verify import HeldOut, compare
+
+    recording = tc.Recording(x=torch.arange(8.0, dtype=F64), y=torch.zeros(8, dtype=F64), noise=0.1)
+    sd, mask = torch.full((8,), 0.1, dtype=F64), torch.arange(8) > 4
+    before, other = (HeldOut(torch.full((8,), 0.1 * size, dtype=F64), sd) for size in (0.3, after))
+    better, error = compare(recording, before, other, types.SimpleNamespace(sd=sd), mask)
+    assert better == pytest.approx(0.3**2 - after**2)
+    assert error == pytest.approx(4 * abs(after - 0.3) / math.sqrt(3))
+    assert (better < -error) is worse

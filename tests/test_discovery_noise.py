@@ -242,6 +242,24 @@ def test_spikes_at_the_ends_and_side_by_side(places):
             assert spikes_in(spiked) == places
 
 
+@pytest.mark.parametrize("apart", [False, True])
+def test_neighbours_on_one_curve_of_a_grid_that_are_set_aside_are_told(apart):
+    a, b = (v.ravel() for v in np.meshgrid(np.geomspace(0.01, 300, 14), [0.0, 3.0, 20.0], indexing="ij"))
+    y = 100 * a / (a + 0.8 * (1 + b / 4)) + 0.2 * np.random.default_rng(1).standard_normal(42)
+    places = [21, 30 if apart else 24]
+    y[places] -= [9.0, 8.0]
+    base = tc.Simulator(
+        lambda x, p: p["top"] * x["a"] / (x["a"] + p["half"] * (1 + x["b"] / p["k"])),
+        [tc.Parameter(name, low=0.05, high=200.0) for name in ("top", "half", "k")],
+    )
+    d = tc.diagnose(base, tc.Recording(x={"a": a, "b": b}, y=y, noise=0.2), [], seed=0, progress=False)
+    assert {*places} <= {*d.set_aside.nonzero()[:, 0].tolist()}
+    told = [line for line in d.symptoms if "are neighbours, output 'y' at a = 2.57" in line]
+    assert len(told) == (not apart)
+    if told:  # 13 on each of 3 curves, and 2 on each of 14, of 42 * 41 / 2 pairs
+        assert "probability of 0.075" in told[0]
+
+
 @pytest.mark.parametrize("noise", [0.05, None])
 def test_two_neighbours_alone_that_are_set_aside_are_told(noise):
     x = torch.linspace(0, 10, 50, dtype=F64)

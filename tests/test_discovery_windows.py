@@ -12,11 +12,12 @@ import torch
 from scipy.integrate import solve_ivp
 
 import torchcal as tc
+from torchcal.discovery.begun_in_windows import wanted_changes
 from torchcal.discovery.fits.local import Span, localised
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.screen import Window, windows_of
 from torchcal.discovery.hypotheses.search import Search
-from torchcal.discovery.nameless import _elsewhere, _where_possible, refit_nameless
+from torchcal.discovery.nameless import _Changes, _elsewhere, _where_possible, refit_nameless
 from torchcal.discovery.verdicts.doubts import CLEARLY, doubt
 from torchcal.discovery.windows import _beyond_the_edge
 from torchcal.errors import SimulatorError
@@ -697,3 +698,51 @@ def test_windows_of_many_data_take_no_square_of_their_number():
     best = max(windows, key=lambda w: w.z)
     assert (best.low, best.high) == pytest.approx((0.25, 0.5), abs=1e-4)
     assert best.amplitude == pytest.approx(0.1, abs=0.02)
+
+
+def test_a_level_at_the_end_of_a_condition_is_a_window():
+    """Its end, anywhere between two levels, came to lie on the last one: no share of the range, and no model."""
+    g, t = (torch.as_tensor(v.ravel()) for v in np.meshgrid(np.geomspace(0.1, 500, 22), [10.0, 25.0, 40.0]))
+    y = math.log(5) - 0.02 * (t - 25) + 0.6 * g.log()
+    noise = torch.as_tensor(np.random.default_rng(3).standard_normal(66))
+    y = y + torch.log1p(0.6 * (t < 15) * torch.exp(-y)) + 0.015 * noise
+    base = tc.Simulator(
+        lambda x, p: torch.log(p["K"]) - p["b"] * (x["T"] - 25) + p["n"] * torch.log(x["g"]),
+        [tc.Parameter("K", low=0.01, high=100.0), tc.Parameter("n", low=0.05, high=2.0), tc.Parameter("b", low=-0.1)],
+    )
+    term = tc.Term(
+        "yield stress", outputs={"y": lambda x, p, y: y + torch.log1p(p["y0"] * torch.exp(-y))},
+        parameters=[tc.Parameter("y0", low=0.0)],
+    )  # fmt: skip
+    d = diagnose(base, tc.Recording(x={"g": g, "T": t}, y=y, noise=0.015), [term])
+    assert d.tied == [["yield stress"], ["none of these"]]
+    (row,) = [row for row in d.ranking if row.terms == ("yield stress",) and row.region and row.probability > 0.5]
+    assert row.region.startswith("T < ")
+    assert 10 < float(row.region.split()[-1]) < 25
+
+
+@pytest.mark.parametrize(("low", "high", "side"), [(0.0, None, -1), (None, 0.0, 1), (None, None, 0)])
+def test_a_constant_of_one_sign_has_no_name_with_the_other(monkeypatch, low, high, side):
+    """A push was a window of another term, as a loss that cannot push was in the list."""
+    seen = []
+    monkeypatch.setattr(sys.modules["torchcal.discovery.diagnose"], "refit_nameless", seen.append)
+    time = torch.linspace(0, 20, 41, dtype=torch.float64)
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"h": -p["k"] * s["h"]}, {"h": "m"}, [tc.Parameter("k", low=0.0, initial=0.1)]
+    )
+    loss = tc.Term(
+        "loss", equation="h", rate=lambda t, s, p, u: -p["e"] + 0 * s["h"],
+        parameters=[tc.Parameter("e", low=low, high=high)],
+    )  # fmt: skip
+    wobble = 0.01 * torch.randn(41, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    run = tc.Run(time=time, outputs={"h": torch.exp(-0.1 * time) + 0.3 * torch.sigmoid(time - 9) + wobble})
+    diagnose(base, tc.Recording(runs=[run], noise=0.01), [loss])
+    (search,) = seen
+    place = (("rates", "h"),)
+    changes = _Changes.of(search)
+    assert changes.named == {place: side}
+    model = search.plain[0]
+    window = Window(0, "t", 5.0, 15.0, 1.0, 1.0)
+    wanted = wanted_changes(search, dataclasses.replace(model, window=window), place, -5.0, changes.named)[0]
+    bounds = {(q.low, q.high) for one in wanted for q in one.candidate.problem.parameters if q.name.endswith(".c1")}
+    assert bounds == ({(None, 0.0)} if side > 0 else {(0.0, None)} if side < 0 else set())

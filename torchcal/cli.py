@@ -89,7 +89,7 @@ def _line(error: BaseException | None, path: Path | None) -> int | None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="torchcal", description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser(prog="torchcal", description=(__doc__ or "").split("\n")[0].replace("``", ""))
     parser.add_argument("--version", action="version", version=f"torchcal {version('torchcal')}")
     commands = parser.add_subparsers(required=True, metavar="command")
     calibrating = commands.add_parser("calibrate", help="calibrate with model error embedded in the parameters")
@@ -161,7 +161,9 @@ def _show(given: argparse.Namespace) -> None:
     if (text := text_of(given.result)) is not None:
         print(text)
         return
-    if given.result.is_file() and given.result.read_bytes()[:1] == b"{":
+    if not given.result.is_file():
+        raise DomainError(f"Expected a file that calibrate or diagnose wrote. Got {given.result}, which is none.")
+    if given.result.read_bytes()[:1] == b"{":
         raise DomainError(f"Expected a result that diagnose wrote. Got {given.result}, which is another file or cut.")
     try:
         print(Calibration.load(given.result))

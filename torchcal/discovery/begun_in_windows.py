@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -44,7 +44,7 @@ def wanted_changes(
     model: Model,
     where: Places,
     prior: float,
-    named: set[Places | None],
+    named: Mapping[Places | None, int],
     only: Collection[str] = ("step", "edge", "grown", "faded"),
 ) -> tuple[list[Hypothetical], float]:
     """A constant in a model's window, with steep edges and with edges to fit; an open window closed as well, with a
@@ -66,7 +66,10 @@ def wanted_changes(
         ends += [list(itertools.combinations(cuts, 2))] if len(cuts) > 1 else []
     still = constant_change(where, search.problem.in_time)
     edges = {"step": False, "edge": True}
-    shapes = [(kind, still, chosen) for chosen in ends for kind in edges] if where not in named else []
+    side = named.get(where)
+    if side:  # what has a name is no nameless one, but with the other sign
+        still = constant_change(where, search.problem.in_time, side=-side)
+    shapes = [(kind, still, chosen) for chosen in ends for kind in edges] if side != 0 else []
     if len(ends) > 1:
         in_time, end = search.problem.in_time, ENDS["from" if math.isfinite(w.low) else "to"]
         grows = distance(w.driver, end, span, in_time)

@@ -87,14 +87,14 @@ class _Changes:
     Attributes:
         search: Whose terms these are.
         prior: Log prior probability of each change.
-        named: Places where a constant of the list has a name.
+        named: Places where a constant of the list has a name, and the only sign with which it does; 0 where it has any.
         elsewhere: Parameters of the base and gains of outputs, which change whatever acts there, with their effects.
         tried: Places and windows from which one has been refitted.
     """
 
     search: Search
     prior: float
-    named: set[Places | None]
+    named: dict[Places | None, int]
     elsewhere: dict[Places, Tensor]
     tried: set[tuple[Places, str, float, float]] = field(default_factory=set)
 
@@ -106,9 +106,13 @@ class _Changes:
         prior = math.log(PRIOR["none"] / max(count, 1)) - math.log(3.0 * len(search.drivers()))
         alone = {i: c for i, c in enumerate(search.candidates) if c.tangents.shape[::2] == (1, 1)}
         listed = {i: own for i, c in alone.items() if (own := _effect(search, c.terms[0])) is not None}
-        search.constants = {i for i, own in listed.items() if _is_constant(search, alone[i], own)}
-        # That of an instrument in a part of its range has no name.
-        named = {places_of(alone[i]) for i in search.constants if not alone[i].terms[0].outputs}
+        sides = {i: side for i, own in listed.items() if (side := _constant(search, alone[i], own)) is not None}
+        search.constants = {*sides}
+        named: dict[Places | None, int] = {}
+        for i, side in sides.items():
+            if not alone[i].terms[0].outputs:  # that of an instrument in a part of its range has no name
+                place = places_of(alone[i])
+                named[place] = side if named.get(place, side) == side else 0
         physics = [own for i, own in listed.items() if not alone[i].terms[0].outputs]
         return cls(search, prior, named, _elsewhere(search, list(listed.values()), physics))
 
@@ -293,8 +297,11 @@ def _rivals(search: Search, lead: Model) -> list[Model]:
     return list(best.values())[:TRIED]
 
 
-def _is_constant(search: Search, candidate: Candidate, own: Tensor) -> bool:
-    """Whether a candidate with an effect ``(n, 1)`` is a constant change."""
+def _constant(search: Search, candidate: Candidate, own: Tensor) -> int | None:
+    """Of a candidate with an effect ``(n, 1)`` that is a constant change, the only sign that it may have, or 0; None of
+    others."""
     where = places_of(candidate)
     still = None if where is None else _effect(search, constant_change(where, search.problem.in_time))
-    return still is not None and own.shape[1] == 1 and _within(own, still)
+    if still is None or own.shape[1] != 1 or not _within(own, still):
+        return None
+    return candidate.one_sided(candidate.amplitudes[0]) * (1 if float((own * still[:, :1]).sum()) > 0 else -1)

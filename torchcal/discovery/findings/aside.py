@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import torch
 from torch import Tensor
 
 from torchcal.discovery.fits.problem import Problem
@@ -11,28 +12,30 @@ from torchcal.discovery.misfit.outliers import chance_of_pairs
 __all__ = ["side_by_side"]
 
 #: Probability by chance of as many outliers side by side, on the same side, below which they are told.
-CHANCE = 0.05
+CHANCE = 0.1
 
 
 def side_by_side(problem: Problem, off: Tensor, aside: Tensor) -> list[str]:
-    """Outliers that are neighbours in an order, and on the same side, where that is hardly chance (`chance_of_pairs`).
+    """Outliers that are neighbours, and on the same side, where that is hardly chance (`chance_of_pairs`).
+
+    Neighbours are those in time, along the only condition, or along one of several where the others are the same.
 
     Args:
         problem: The used data.
         off: How far all data are off the fit that the verdict rests on, in noise sd, ``(n_total,)``.
         aside: Which of them were set aside, bool ``(n_total,)``.
     """
-    order = problem.order
-    if order is None or int(aside.sum()) < 2:
+    if int(aside.sum()) < 2:
         return []
     problem = dataclasses.replace(problem, keep=problem.keep | aside)
     far, out = off[problem.index], aside[problem.index]
-    at = order[problem.condition_of]  # of every used datum
-    pairs = [pair for places in problem.sequences for pair in _pairs(places, far, out, at)]
+    curves = _curves(problem)
+    pairs = [pair for places, at in curves for pair in _pairs(places, far, out, at)]
     if not pairs:
         return []
     above, below = (int((out & (far * sign > 0)).sum()) for sign in (1, -1))
-    chance = chance_of_pairs(len(pairs), above, below, problem.n)
+    ways = sum(len(places) - 1 for places, _ in curves) / max(problem.n - 1, 1)  # 1 of data in one row
+    chance = chance_of_pairs(len(pairs), above, below, problem.n, ways)
     if chance >= CHANCE:
         return []
     first, second = max(pairs, key=lambda pair: float(far[list(pair)].abs().min()))
@@ -42,6 +45,20 @@ def side_by_side(problem: Problem, off: Tensor, aside: Tensor) -> list[str]:
         f"outliers are so by chance with a probability of {chance:.2g}. Something short may act there; repeat them, or "
         "record more densely there"
     ]
+
+
+def _curves(problem: Problem) -> list[tuple[Tensor, Tensor]]:
+    """Places among the used data that follow each other, with what they follow each other in at every used datum."""
+    if problem.order is not None:
+        return [(places, problem.order[problem.condition_of]) for places in problem.sequences]
+    columns, found = problem.recording.columns[problem.condition_of], []
+    for k in range(columns.shape[1]):
+        others = torch.cat([problem.output_of[:, None].double(), columns[:, :k], columns[:, k + 1 :]], dim=1)
+        curve = others.unique(dim=0, return_inverse=True)[1]
+        each = [(curve == c).nonzero()[:, 0] for c in range(int(curve.max()) + 1)]
+        each = [places[columns[places, k].argsort(stable=True)] for places in each if len(places) > 2]
+        found += [(places, columns[:, k]) for places in each]
+    return found
 
 
 def _pairs(places: Tensor, far: Tensor, out: Tensor, at: Tensor) -> list[tuple[int, int]]:

@@ -21,6 +21,8 @@ __all__ = ["limits"]
 ROUNDS, MOST = 8, 4.0
 #: Where it is close enough, as a logarithm.
 CLOSE = 0.05
+#: How often the distance of a limit is worked out from the one before.
+SETTLES = 4
 #: Data to spare below which the size of the noise is anyone's guess.
 SPARE = 3
 
@@ -54,9 +56,11 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
         column = _typical(search, i)
         # Seen is not enough: the evidence for the term must outweigh that for the base too.
         wanted = max(critical, math.sqrt(max(2 * odds + len(candidate.own) * math.log(search.problem.n), 0.0)))
-        # The noise's estimate wavers, and the score with it.
-        doubt = math.sqrt(1 + 0.5 * wanted**2 * _wavers(search, screening.columns[:, column]))
-        effects[i] = _Effect(column, wanted + doubt * from_power, float(screening.norm[column]))
+        # The noise's estimate wavers, and with it the score and this limit itself.
+        wavers, distance = _wavers(search, screening.columns[:, column]), wanted + from_power
+        for _ in range(SETTLES):
+            distance = wanted + from_power * math.sqrt(1 + 0.5 * wavers * (wanted**2 + distance**2))
+        effects[i] = _Effect(column, distance, float(screening.norm[column]))
     sizes = {i: effect.distance / effect.norm for i, effect in effects.items()}
     hidden: dict[int, _Hidden] = {}
     if not search.exact and not search.stop.is_set():

@@ -50,8 +50,9 @@ def fading_to(driver: str, end: str, span: Span, in_time: bool) -> Callable[...,
     return share
 
 
-def constant_change(where: Places, in_time: bool, grows: Callable[..., Any] | None = None) -> Term:
-    """A constant change of its own in every one of some places, or one that grows in proportion to something."""
+def constant_change(where: Places, in_time: bool, grows: Callable[..., Any] | None = None, side: int = 0) -> Term:
+    """A constant change of its own in every one of some places, or one that grows in proportion to something; of either
+    sign, or of one ``side`` alone."""
     number = itertools.count(1)
 
     def added() -> Callable[..., Any]:
@@ -75,4 +76,6 @@ def constant_change(where: Places, in_time: bool, grows: Callable[..., Any] | No
         kinds.setdefault(place, {})[name] = change()
     of = {"shifts": "a change of {}", "gains": "a change of the gain of {}"}
     what = " and ".join(of[kind].format(name) for kind, name in where if kind in of)
-    return Term(what or "something unknown", **kinds, parameters=[Parameter(f"c{i}") for i in range(1, next(number))])
+    low, high = (0.0 if side > 0 else None), (0.0 if side < 0 else None)
+    own = [Parameter(f"c{i}", low=low, high=high) for i in range(1, next(number))]
+    return Term(what or "something unknown", **kinds, parameters=own)

@@ -209,16 +209,18 @@ def score(recording: Recording, prediction: Tensor, sd: Tensor, mask: Tensor) ->
 def compare(recording: Recording, before: HeldOut, after: HeldOut, noise: Noise, mask: Tensor) -> tuple[float, float]:
     """Mean gain in squared error over the held-out data, in noise variances, and its standard error.
 
-    Neighbours err together: the standard error comes from block means, and of few blocks it is Student's. What the
-    fitted data leave open of either model's parameters adds to it, with the root mean square of the squared error that
-    it makes: along one direction of them all predictions err together, and that of a χ² with one degree of freedom is
-    √3.
+    Neighbours err together: the standard error comes from block means, and of few blocks it is Student's. Three data
+    and fewer say nothing of it: there it is twice that of independent noise around the second model. What the fitted
+    data leave open of either model's parameters adds to it, with the root mean square of the squared error that it
+    makes: along one direction of them all predictions err together, and that of a χ² with one degree of freedom is √3.
     """
     sd, y = noise.sd[mask], recording.y[mask]
     gain = ((y - before.prediction[mask]) / sd).square() - ((y - after.prediction[mask]) / sd).square()
     blocks = min(len(gain), max(4, int(math.sqrt(len(gain)))))
-    means = torch.stack([part.mean() for part in gain.tensor_split(blocks)])
-    few = (blocks - 1) / (blocks - 3) if blocks > 3 else math.inf  # variance of Student's t
-    error = float(means.std()) * math.sqrt(few / blocks) if blocks > 3 else math.inf
+    if blocks > 3:
+        means = torch.stack([part.mean() for part in gain.tensor_split(blocks)])
+        error = float(means.std()) * math.sqrt((blocks - 1) / (blocks - 3) / blocks)  # variance of Student's t
+    else:
+        error = 2 * 2.0 * float(((after.prediction - before.prediction)[mask] / sd).norm()) / len(gain)
     open_ = [math.sqrt(3) * float(((part.sd[mask] / sd).square() - 1).mean()) for part in (before, after)]
     return float(gain.mean()), math.hypot(error, *open_)

@@ -253,8 +253,9 @@ def _in_a_row(column: Tensor, high: Tensor, r: Tensor, chance: float) -> bool:
     return chance_of_pairs(pairs, int((side > 0).sum()), int((side < 0).sum()), m, BESIDE) < chance
 
 
-def chance_of_pairs(pairs: int, above: int, below: int, m: int, beside: int = 1) -> float:
-    """Probability that so many or more pairs of data that stick out to one side lie at most ``beside`` places apart.
+def chance_of_pairs(pairs: int, above: int, below: int, m: int, beside: float = 1) -> float:
+    """Probability that so many or more pairs of data that stick out to one side lie at most ``beside`` places apart in
+    a row; of other arrangements it is half the number of neighbours that a datum has.
 
     Outliers do not know of each other: of a above and b below among m, as many do as a Poisson variable with a mean of
     (a (a - 1) + b (b - 1)) ``beside`` / m.
