@@ -561,8 +561,15 @@ def test_region_and_held_out():
                       predicted_before=[9.0, 9.0, 3.0, 4.0], predicted_after=[9.0, 9.0, 0.3, 0.4])  # fmt: skip
     assert score.region_f1(found, truth) == pytest.approx(2 * 2 / (3 + 2))
     assert score.region_f1(result_of("consistent", region=region), truth) == 0
+    found["noise"] = {"sd": {"force": 0.1}}
     assert score.held_out_ratio(found, truth) == pytest.approx(0.1)
     assert score.held_out_ratio(result_of("consistent"), truth) is None
+    # Outputs are in the order of the recording, which need not be the answers'.
+    truth = answer_of("library", ["cubic stiffness"], truth=[{"a": [1.0, 1.0], "b": [5.0, 5.0]}])
+    truth["noise"] = {**truth["noise"], "sd": {"a": 1.0, "b": 1.0}}
+    found = {**found, "noise": {"sd": {"b": 1.0, "a": 1.0}}, "held_out": [0, 1, 0, 1],
+             "predicted_before": [5.0, 7.0, 1.0, 3.0], "predicted_after": [5.0, 5.4, 1.0, 1.4]}  # fmt: skip
+    assert score.held_out_ratio(found, truth) == pytest.approx(0.2)
 
 
 def test_missing_rate_forgives_what_the_base_can_do():

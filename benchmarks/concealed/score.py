@@ -220,10 +220,10 @@ def held_out_ratio(result: Mapping[str, Any], answer: Mapping[str, Any]) -> floa
     if not (held and before and after):
         return None
     truth, sizes = [], []
-    for name, sd in answer["noise"]["sd"].items():
+    for name in result["noise"]["sd"]:  # in the recording's order, which the answers do not keep
         for run in answer["truth"]:
             truth += run[name]
-            sizes += [sd] * len(run[name])
+            sizes += [answer["noise"]["sd"][name]] * len(run[name])
     if len(truth) != len(held):
         return None
     mask = np.asarray(held, dtype=bool)
