@@ -10,6 +10,7 @@ import pytest
 import torch
 
 import torchcal as tc
+from torchcal.discovery.findings.limits import _distance
 from torchcal.discovery.fits.fitting import fit
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.base import calibrate_base
@@ -400,6 +401,17 @@ def test_a_planted_effect_moves_its_score_by_its_size():
         i = search.screening.best[0]
         z.append(float(search.screening.columns[:, i] @ search.residual.e) - 0.05 * float(search.screening.norm[i]))
     assert abs(np.mean(z)) < 5 / math.sqrt(seeds) + 0.2
+
+
+@pytest.mark.parametrize("freedom", [10, 57, 400])
+def test_an_effect_at_a_limit_from_wavering_noise_is_seen_as_often_as_is_said(freedom):
+    """A limit is told by one recording, and a fresh one with an effect of that size has an estimate of its own."""
+    rng, wanted = np.random.default_rng(0), 2.8
+    there, here = np.sqrt(rng.chisquare(freedom, (2, 200_000)) / freedom)
+    size = _distance(wanted, 1.645, 1 / (2 * freedom)) * there
+    seen = (size + rng.standard_normal(200_000) > wanted * here).mean()
+    assert seen == pytest.approx(0.95, abs=0.012)
+    assert _distance(wanted, 1.645, 0.0) == pytest.approx(wanted + 1.645)
 
 
 def test_the_stated_limit_is_where_detection_begins():

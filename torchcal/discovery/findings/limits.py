@@ -21,8 +21,8 @@ __all__ = ["limits"]
 ROUNDS, MOST = 8, 4.0
 #: Where it is close enough, as a logarithm.
 CLOSE = 0.05
-#: How often the distance of a limit is worked out from the one before.
-SETTLES = 4
+#: Smallest share that is left of a distance by how much it wavers itself.
+LEFT = 0.25
 #: Data to spare below which the size of the noise is anyone's guess.
 SPARE = 3
 
@@ -56,10 +56,7 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
         column = _typical(search, i)
         # Seen is not enough: the evidence for the term must outweigh that for the base too.
         wanted = max(critical, math.sqrt(max(2 * odds + len(candidate.own) * math.log(search.problem.n), 0.0)))
-        # The noise's estimate wavers, and with it the score and this limit itself.
-        wavers, distance = _wavers(search, screening.columns[:, column]), wanted + from_power
-        for _ in range(SETTLES):
-            distance = wanted + from_power * math.sqrt(1 + 0.5 * wavers * (wanted**2 + distance**2))
+        distance = _distance(wanted, from_power, 0.5 * _wavers(search, screening.columns[:, column]))
         effects[i] = _Effect(column, distance, float(screening.norm[column]))
     sizes = {i: effect.distance / effect.norm for i, effect in effects.items()}
     hidden: dict[int, _Hidden] = {}
@@ -88,6 +85,17 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
         name = term.full(term.parameters[0].name) if term.parameters else term.frees[0]
         rows.append(Limit(term.name, name, math.inf, None, power, None, "already in the base model"))
     return Table(rows, ("term", "parameter", "smallest", "unit", "power", "estimate", "note"))
+
+
+def _distance(wanted: float, from_power: float, wavers: float) -> float:
+    """How far from the base an effect must be, in noise sd, to be seen as far as ``wanted`` with some power.
+
+    The estimate of the noise's sd has a relative variance of ``wavers`` (v), and with it the score (s) and this
+    distance (d) itself: d = s + z √(1 + v (s² + d²)).
+    """
+    left = max(1 - from_power**2 * wavers, LEFT)
+    own = wavers * wanted**2
+    return (wanted + from_power * math.sqrt(own + left * (1 + own))) / left
 
 
 def _spare(search: Search, candidate: Candidate) -> int:
