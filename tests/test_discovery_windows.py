@@ -746,3 +746,25 @@ def test_a_constant_of_one_sign_has_no_name_with_the_other(monkeypatch, low, hig
     wanted = wanted_changes(search, dataclasses.replace(model, window=window), place, -5.0, changes.named)[0]
     bounds = {(q.low, q.high) for one in wanted for q in one.candidate.problem.parameters if q.name.endswith(".c1")}
     assert bounds == ({(None, 0.0)} if side > 0 else {(0.0, None)} if side < 0 else set())
+
+
+def test_a_constant_of_two_equations_takes_no_nameless_change_of_both(monkeypatch):
+    """What one loses the other gains: no single sign is that of both."""
+    seen = []
+    monkeypatch.setattr(sys.modules["torchcal.discovery.diagnose"], "refit_nameless", seen.append)
+    time = torch.linspace(0, 20, 41, dtype=torch.float64)
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"A": -p["k"] * s["A"], "B": p["k"] * s["A"] - 0.1 * s["B"]}, {"A": None, "B": None},
+        [tc.Parameter("k", low=0.0, initial=0.1)],
+    )  # fmt: skip
+    step = tc.Term(
+        "step", rates={"A": lambda t, s, p, u: -p["e"] + 0 * s["A"], "B": lambda t, s, p, u: p["e"] + 0 * s["A"]},
+        parameters=[tc.Parameter("e", low=0.0)],
+    )  # fmt: skip
+    wobble = 0.01 * torch.randn(2, 41, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    outputs = {"A": torch.exp(-0.1 * time) + 0.3 * torch.sigmoid(time - 9) + wobble[0],
+               "B": 0.1 * time * torch.exp(-0.1 * time) + wobble[1]}  # fmt: skip
+    run = tc.Run(time=time, outputs=outputs)
+    diagnose(base, tc.Recording(runs=[run], noise={"A": 0.01, "B": 0.01}), [step])
+    (search,) = seen
+    assert _Changes.of(search).named == {(("rates", "A"), ("rates", "B")): 0}

@@ -163,7 +163,9 @@ def _show(given: argparse.Namespace) -> None:
         return
     if not given.result.is_file():
         raise DomainError(f"Expected a file that calibrate or diagnose wrote. Got {given.result}, which is none.")
-    if given.result.read_bytes()[:1] == b"{":
+    with given.result.open("rb") as file:
+        cut = file.read(1) == b"{"
+    if cut:
         raise DomainError(f"Expected a result that diagnose wrote. Got {given.result}, which is another file or cut.")
     try:
         print(Calibration.load(given.result))

@@ -298,10 +298,12 @@ def _rivals(search: Search, lead: Model) -> list[Model]:
 
 
 def _constant(search: Search, candidate: Candidate, own: Tensor) -> int | None:
-    """Of a candidate with an effect ``(n, 1)`` that is a constant change, the only sign that it may have, or 0; None of
-    others."""
+    """Of a candidate with an effect ``(n, 1)`` that is a constant change, the only sign that it may have, or 0 (any, or
+    one in each of several places); None of others."""
     where = places_of(candidate)
     still = None if where is None else _effect(search, constant_change(where, search.problem.in_time))
     if still is None or own.shape[1] != 1 or not _within(own, still):
         return None
-    return candidate.one_sided(candidate.amplitudes[0]) * (1 if float((own * still[:, :1]).sum()) > 0 else -1)
+    if still.shape[1] > 1:
+        return 0
+    return candidate.one_sided(candidate.amplitudes[0]) * (1 if float((own * still).sum()) > 0 else -1)

@@ -34,7 +34,8 @@ def side_by_side(problem: Problem, off: Tensor, aside: Tensor) -> list[str]:
     if not pairs:
         return []
     above, below = (int((out & (far * sign > 0)).sum()) for sign in (1, -1))
-    ways = sum(len(places) - 1 for places, _ in curves) / max(problem.n - 1, 1)  # 1 of data in one row
+    # 1 of data in one row; replicates are no neighbours.
+    ways = sum(int((at[places].diff() != 0).sum()) for places, at in curves) / max(problem.n - 1, 1)
     chance = chance_of_pairs(len(pairs), above, below, problem.n, ways)
     if chance >= CHANCE:
         return []
@@ -55,9 +56,9 @@ def _curves(problem: Problem) -> list[tuple[Tensor, Tensor]]:
     for k in range(columns.shape[1]):
         others = torch.cat([problem.output_of[:, None].double(), columns[:, :k], columns[:, k + 1 :]], dim=1)
         curve = others.unique(dim=0, return_inverse=True)[1]
-        each = [(curve == c).nonzero()[:, 0] for c in range(int(curve.max()) + 1)]
-        each = [places[columns[places, k].argsort(stable=True)] for places in each if len(places) > 2]
-        found += [(places, columns[:, k]) for places in each]
+        along = columns[:, k].argsort(stable=True)
+        along = along[curve[along].argsort(stable=True)]  # curve by curve
+        found += [(each, columns[:, k]) for each in along.split(torch.bincount(curve).tolist()) if len(each) > 2]
     return found
 
 

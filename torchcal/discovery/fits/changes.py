@@ -52,7 +52,7 @@ def fading_to(driver: str, end: str, span: Span, in_time: bool) -> Callable[...,
 
 def constant_change(where: Places, in_time: bool, grows: Callable[..., Any] | None = None, side: int = 0) -> Term:
     """A constant change of its own in every one of some places, or one that grows in proportion to something; of either
-    sign, or of one ``side`` alone."""
+    sign, or all of one ``side`` alone."""
     number = itertools.count(1)
 
     def added() -> Callable[..., Any]:

@@ -58,11 +58,14 @@ class Tangents:
         """Of the base's fit."""
         slope = orthonormal(base.jacobian[:, ~base.at_bound], cut=1e-7)
         problem, outputs, unit = base.problem, len(noise.correlation), _unit(noise)
-        w = problem.whitening(unit, _memories(outputs))
-        white, half = w(slope), 0.5 * torch.log1p(-w.correlation.square())
         parts = [problem.output_of == k for k in range(outputs)]
-        grams = [white[:, part].transpose(-1, -2) @ white[:, part] for part in parts]
-        return cls(slope, torch.stack(grams), torch.stack([half[:, part].sum(-1) for part in parts]))
+        grams, logs = [], []
+        for memory in _memories(outputs):  # one by one: all at once they are 39 times as large
+            w = problem.whitening(unit, memory)
+            white, half = w(slope), 0.5 * torch.log1p(-w.correlation.square())
+            grams.append(torch.stack([white[part].T @ white[part] for part in parts]))
+            logs.append(torch.stack([half[part].sum() for part in parts]))
+        return cls(slope, torch.stack(grams, 1), torch.stack(logs, 1))
 
 
 def _counts(problem: Problem) -> Tensor:

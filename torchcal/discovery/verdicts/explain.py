@@ -265,14 +265,15 @@ def _hardly_apart(found: Fitted, told: Collection[str]) -> list[str]:
         for k, name in enumerate(names)
         if name not in told and not is_window(name) and HARDLY * abs(float(values[k])) < float(sd[k]) < math.inf
     ]
-    pairs = {
-        (j, k): abs(r)
+    pairs = [
+        [names[j], names[k]]
         for j, k in itertools.combinations(open_, 2)
-        if abs(r := float(own[j, k] / (size[j] * size[k]))) > TOGETHER
-    }
+        if abs(float(own[j, k] / (size[j] * size[k]))) > TOGETHER
+    ]
     rows = []
-    for group in _merged([[names[j], names[k]] for j, k in pairs]):
-        least = min(r for (j, k), r in pairs.items() if {names[j], names[k]} <= {*group})
+    for group in _merged(pairs):
+        whole = itertools.combinations(map(names.index, group), 2)
+        least = min(abs(float(own[j, k] / (size[j] * size[k]))) for j, k in whole)
         shares = [100 * float(sd[k] / values[k].abs()) for k in map(names.index, group)]
         each = ", ".join(f"{share:.0f} %" if share < 1000 else "more than 1000 %" for share in shares)
         text = f"{', '.join(group[:-1])} and {group[-1]} are hardly known apart"
