@@ -64,11 +64,9 @@ def wanted_changes(
         last = w.low if math.isfinite(w.low) else w.high  # the end that it has, which need not be one of the data
         cuts = sorted({*cuts[1:], last}) if math.isfinite(w.low) else sorted({*cuts[:-1], last})
         ends += [list(itertools.combinations(cuts, 2))] if len(cuts) > 1 else []
-    still = constant_change(where, search.problem.in_time)
+    side = named.get(where)  # what has a name is no nameless one, but with the other sign
+    still = constant_change(where, search.problem.in_time, side=-(side or 0))
     edges = {"step": False, "edge": True}
-    side = named.get(where)
-    if side:  # what has a name is no nameless one, but with the other sign
-        still = constant_change(where, search.problem.in_time, side=-side)
     shapes = [(kind, still, chosen) for chosen in ends for kind in edges] if side != 0 else []
     if len(ends) > 1:
         in_time, end = search.problem.in_time, ENDS["from" if math.isfinite(w.low) else "to"]

@@ -258,23 +258,22 @@ def _untold(found: Fitted) -> tuple[list[str], list[list[str]]]:
 def _hardly_apart(found: Fitted, told: Collection[str]) -> list[str]:
     """Parameters of a fit that are not known well, each alone, and go with each other; but those told before."""
     names, sd = [found.problem.parameters[i].name for i in found.free], stated_sd(found)[found.free]
-    values, own = found.values[found.free], found.covariance()
-    size = own.diagonal().clamp_min(1e-300).sqrt()
+    values, covariance = found.values[found.free], found.covariance()
+    size = covariance.diagonal().clamp_min(1e-300).sqrt()
+    correlation = (covariance / (size[:, None] * size)).abs()
     open_ = [
         k
         for k, name in enumerate(names)
         if name not in told and not is_window(name) and HARDLY * abs(float(values[k])) < float(sd[k]) < math.inf
     ]
     pairs = [
-        [names[j], names[k]]
-        for j, k in itertools.combinations(open_, 2)
-        if abs(float(own[j, k] / (size[j] * size[k]))) > TOGETHER
+        [names[j], names[k]] for j, k in itertools.combinations(open_, 2) if float(correlation[j, k]) > TOGETHER
     ]
     rows = []
     for group in _merged(pairs):
-        whole = itertools.combinations(map(names.index, group), 2)
-        least = min(abs(float(own[j, k] / (size[j] * size[k]))) for j, k in whole)
-        shares = [100 * float(sd[k] / values[k].abs()) for k in map(names.index, group)]
+        mine = [names.index(name) for name in group]
+        least = float(correlation[mine][:, mine].min())
+        shares = [100 * float(sd[k] / values[k].abs()) for k in mine]
         each = ", ".join(f"{share:.0f} %" if share < 1000 else "more than 1000 %" for share in shares)
         text = f"{', '.join(group[:-1])} and {group[-1]} are hardly known apart"
         rows.append(f"{text} (correlation of their estimates {least:.3f}; sd of {each})")
