@@ -14,6 +14,7 @@ from torchcal.discovery.fits.ranges import Scale, drivers_scale, sized
 from torchcal.discovery.hypotheses.base import calibrate_base
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.errors import DomainError, UnitWarning
+from torchcal.terms.labels import labelled
 
 F64 = torch.float64
 
@@ -162,3 +163,41 @@ def test_a_library_in_another_unit_of_time_is_told(time, mine, told):
     if told:
         assert "'reverse reaction', 'autocatalysis'" in texts[0]
         assert f"time={mine!r}" in texts[0]
+
+
+def test_estimates_are_in_the_units_of_the_states_whatever_a_library_calls_them():
+    t = torch.linspace(0, 3, 40, dtype=F64)
+    fall = 9.81e3 * t.square() / 2
+    ball = tc.ODESimulator(
+        lambda t, s, p, u: {"z": s["v"], "v": p["g"]},
+        {"z": "mm", "v": "mm/s"},
+        [tc.Parameter("g", unit="mm/s^2", initial=9.81e3)],
+        observe=("z",),
+    )
+    runs = [tc.Run(time=t, outputs={"z": fall}, initial={"z": 0.0, "v": 0.0})]
+    terms = [*tc.terms.mechanics("z", "v", angle=False), *tc.terms.sensor(("z",))]
+    told = {q.name: q.unit for q in terms[1].parameters}
+    d = diagnose(ball, tc.Recording(runs=runs, noise=5.0, units={"z": "mm"}), terms, holdout=False, num_starts=2)
+    units = {row.term: row.unit for row in d.detection_limit}
+    assert told == {"c": "1/m"}
+    assert units["quadratic drag"] == units["non-linearity of z"] == "1/mm"
+    assert units["cubic drag"] == "s/mm^2"
+    assert units["offset of z"] == "mm"
+
+
+@pytest.mark.parametrize(
+    ("known", "told"),
+    [({"y": "mm"}, "1/mm"), ({"y": "mol/L"}, "1/(mol/L)"), ({"x": "K"}, "1/([y])"), ({"y": None}, "1/([y])")],
+)
+def test_a_unit_that_is_known_takes_the_place_of_its_name(known, told):
+    bend = labelled(tc.terms.sensor(("y",), static=True)[2], known)
+    assert [q.unit for q in bend.parameters] == [told]
+    offset = labelled(tc.terms.sensor(("y",), static=True)[0], known)
+    assert [q.unit for q in offset.parameters] == [known.get("y") or "[y]"]
+
+
+def test_own_states_of_a_term_are_in_the_units_of_what_they_follow():
+    (second,) = [term for term in tc.terms.hydraulics("h") if term.states]
+    assert [*labelled(second, {"h": "cm"}).states.values()] == ["cm"]
+    with pytest.raises(DomainError, match=r"labels= of the term 't' as names of units\. Got 'x': 3"):
+        tc.Term("t", frees=["a"], labels={"x": 3})

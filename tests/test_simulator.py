@@ -130,6 +130,33 @@ def test_scaling_and_back_is_the_identity():
     assert torch.autograd.gradcheck(scaling.physical, scaled.requires_grad_())
 
 
+@pytest.mark.parametrize("energy", [1.0, 800.0, 1e5])
+def test_a_large_value_beside_a_logarithmic_one_has_a_derivative(energy):
+    """exp(800) is not finite, and no parameter of that size is to be sought along NaN."""
+    factor, height = tc.Parameter("A", transform="log", initial=2.0), tc.Parameter("E", initial=energy)
+    scaling = Scaling.from_parameters([factor, height])
+    point = torch.tensor([0.3, 0.1], dtype=torch.float64, requires_grad=True)
+    values = scaling.physical(point)
+    (slope,) = torch.autograd.grad(values.sum(), point)
+    assert slope.tolist() == pytest.approx([values[0].item(), energy], rel=1e-12)
+
+
+def test_the_transform_of_a_factor_changes_no_calibration_of_an_activation_energy():
+    x = torch.linspace(300.0, 400.0, 15, dtype=torch.float64)
+    y = 2.0 * torch.exp(-5000.0 * (1 / x - 1 / 350)) * (1 + 0.1 * torch.sin(x / 10))
+
+    def rate(x, p):
+        return p["A"] * torch.exp(-p["E"] * (1 / x - 1 / 350))
+
+    maps = []
+    for transform in (None, "log"):
+        parameters = [tc.Parameter("A", transform=transform, initial=2.0), tc.Parameter("E", unit="K", initial=5e3)]
+        found = tc.calibrate(tc.Simulator(rate, parameters), tc.Recording(x=x, y=y), num_samples=0, progress=False).map
+        maps.append(torch.stack([found.mean, found.sd]))
+    # ln A and A bear a density of the same width a little differently.
+    torch.testing.assert_close(maps[1], maps[0], rtol=0.03, atol=0)
+
+
 def test_bounds_of_a_logarithmic_parameter_limit_its_median():
     # The data ask for more than high=: the median stays at it, and the mean goes beyond.
     x = torch.linspace(0.2, 2, 8, dtype=torch.float64)

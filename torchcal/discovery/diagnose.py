@@ -34,6 +34,7 @@ from torchcal.errors import DomainError, EmbeddingError, InterruptionWarning, Re
 from torchcal.simulators import ODESimulator, Simulator, is_value_of
 from torchcal.simulators.executor import check_executor
 from torchcal.terms import Term, extend
+from torchcal.terms.labels import labelled
 from torchcal.threads import with_torch_settings
 
 __all__ = ["diagnose"]
@@ -233,7 +234,16 @@ def _check(simulator: Any, recording: Any, candidates: Any, confidence: float) -
             "Expected confidence above 0.5 and at most 0.998, which 1000 simulated residuals can resolve. "
             f"Got {confidence!r}."
         )
-    return list(by_name.values())
+    known = _units(simulator, recording)
+    return [labelled(term, known) for term in by_name.values()]
+
+
+def _units(simulator: Simulator, recording: Recording) -> dict[str, str | None]:
+    """What is known of the units of conditions, states, inputs and outputs."""
+    found: dict[str, str | None] = dict(recording.units)
+    for run in recording.runs or ():
+        found |= run.units
+    return found | {name: unit for name, unit in getattr(simulator, "states", {}).items() if unit}
 
 
 def _compare_times(recording: Recording, terms: Sequence[Term]) -> None:

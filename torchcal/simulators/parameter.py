@@ -264,7 +264,8 @@ class Scaling:
         """λ of λ̃, last dimension d."""
         value = self.center.to(scaled) + self.scale.to(scaled) * scaled
         if bool(self.log.any()):
-            value = torch.where(self.log.to(scaled.device), value.exp(), value)
+            log = self.log.to(scaled.device)  # where it is not, a large value's exponential has no derivative
+            value = torch.where(log, torch.where(log, value, torch.zeros_like(value)).exp(), value)
         return value
 
     def scaled(self, physical: Tensor) -> Tensor:

@@ -54,7 +54,7 @@ def hydraulics(
             highest in the base's fit, which `diagnose` finds (by hand give one). It is the same in all runs, as the
             coefficient is.
         label: Added to the names of the terms, where several tanks need them.
-        length: Unit of the level, for reports.
+        length: Unit of the level, for reports, where the simulator gives it none.
         time: Unit of time, for reports.
 
     Returns:
@@ -89,7 +89,7 @@ def hydraulics(
         terms += _inflow(check_name(inflow, "inflow"), h, downstream, label, units)
     if outlet is not None:
         terms += _outlet(check_name(outlet, "outlet"), h, reference, label, units)
-    return timed(terms, time)
+    return timed(terms, time, {h: length})
 
 
 def _second(h: str, label: str | None, units: Units) -> Term:

@@ -62,7 +62,7 @@ def mechanics(
             degree of freedom alone.
         angle: Whether the position may be an angle in rad; otherwise there is no large-angle term.
         label: Added to the names of the terms, where several bodies need them.
-        length: Unit of the position, for reports.
+        length: Unit of the position, for reports, where the simulator gives it none.
         time: Unit of time, for reports.
 
     Returns:
@@ -127,7 +127,7 @@ def mechanics(
     terms.append(_viscoelastic(v, label, units))
     if force is not None:
         terms += _actuator(check_name(force, "force"), v, label, units)
-    return timed(terms, time)
+    return timed(terms, time, {x: length})
 
 
 def _large_angle(x: str, v: str, stiffness: Quantity | None, label: str | None, unit: str) -> Term:
@@ -221,4 +221,4 @@ def _in_space(x: tuple[str, ...], v: tuple[str, ...], units: Units, label: str |
                  parameters=[amplitude("b", units(-1, 2))], formula=f"d{axis}/dt ∋ b",
                  description=f"Constant force along {axis}.")
         )  # fmt: skip
-    return timed(terms, units.time)
+    return timed(terms, units.time, dict.fromkeys(x, units.length))

@@ -70,7 +70,7 @@ def orbital(
             in the base's fit, which `diagnose` finds (by hand give one). It is the same in all runs, as the
             gravitational parameter is.
         label: Added to the names of the terms, where several bodies need them.
-        length: Unit of the positions, for reports.
+        length: Unit of the positions, for reports, where the simulator gives them none.
         time: Unit of time, for reports.
 
     Returns:
@@ -160,7 +160,7 @@ def orbital(
                  parameters=[amplitude("b", units(-1, 2))], formula=f"d{axis}/dt ∋ b",
                  description=f"Constant push along {axis}: a thruster, or the light of a distant source.")
         )  # fmt: skip
-    return timed(terms, time)
+    return timed(terms, time, dict.fromkeys(x, length))
 
 
 def _dot(a: Vector, b: Vector) -> Tensor:

@@ -160,14 +160,15 @@ def titled(name: str, label: str | None) -> str:
     return name if label is None else f"{name} ({check_name(label, 'label')})"
 
 
-def timed(terms: Sequence[Term], time: str) -> list[Term]:
-    """The terms, of which those with time in the units of their parameters remember it."""
+def timed(terms: Sequence[Term], time: str, labels: Mapping[str, str] | None = None) -> list[Term]:
+    """The terms, of which those with time in the units of their parameters remember it, and all what others are in."""
     check_name(time, "time")
 
     def has_time(term: Term) -> bool:
         return any(time in re.split(r"[\s/*^()0-9.-]+", q.unit or "") for q in term.parameters)
 
-    return [dataclasses.replace(term, time=time) if has_time(term) else term for term in terms]
+    labels = dict(labels or {})
+    return [dataclasses.replace(term, time=time if has_time(term) else None, labels=labels) for term in terms]
 
 
 def own_name(name: str, *taken: Any) -> str:

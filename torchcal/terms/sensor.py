@@ -51,7 +51,8 @@ def sensor(
         drift: Condition against which the instrument of a static simulator drifts, and the value at which it reads
             right, ``{"T": 293.15}``. With the name alone that is 0; far from there a drift is an offset, nearly.
         dynamic: Whether to offer lag and delay, each of which brings hidden states.
-        units: Units of the outputs, for reports; ``[x]`` stands for that of x otherwise.
+        units: Units of the outputs, for reports; ``[x]`` stands for that of x otherwise, which `diagnose` puts in its
+            place where the recording tells it.
         time: Unit of time, for reports.
 
     Returns:

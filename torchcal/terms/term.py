@@ -86,6 +86,8 @@ class Term:
             or several: the largest magnitude (of several the vector's) in the base's fit, to three digits, which
             `diagnose` fills in; elsewhere, as in `extend`, it is 1.
         time: Unit of time that the units of its parameters are in, to be held against the recording's.
+        labels: What the units of states are called in those of its parameters, ``{state: "m"}``: `diagnose` puts the
+            unit there that the simulator gives the state, as it does for ``[x]``, which stands for the unit of x.
 
     Raises:
         DomainError: If it does nothing, or its parts do not fit together.
@@ -110,6 +112,7 @@ class Term:
     expected: dict[str, tuple[float, float]] = field(default_factory=dict)
     constants: dict[str, float | str | tuple[str, ...]] = field(default_factory=dict)
     time: str | None = None
+    labels: dict[str, str] = field(default_factory=dict)
     seen: set[int] = field(init=False, default_factory=set)
 
     def __init__(
@@ -133,6 +136,7 @@ class Term:
         expected: Mapping[str, tuple[float, float]] | None = None,
         constants: Mapping[str, float | str | Sequence[str]] | None = None,
         time: str | None = None,
+        labels: Mapping[str, str] | None = None,
     ) -> None:
         if not isinstance(name, str) or not name:
             raise DomainError(f"Expected a term's name (a non-empty string). Got {name!r}.")
@@ -205,6 +209,10 @@ class Term:
                 )
         if time is not None and not (isinstance(time, str) and time):
             raise DomainError(f"Expected time as the name of a unit or None for the term {name!r}. Got {time!r}.")
+        if bad := [own for own, label in (labels or {}).items() if not (isinstance(label, str) and label)]:
+            raise DomainError(
+                f"Expected labels= of the term {name!r} as names of units. Got {bad[0]!r}: {(labels or {})[bad[0]]!r}."
+            )
         for own, given in (constants or {}).items():
             several = isinstance(given, Sequence) and given and all(isinstance(one, str) and one for one in given)
             if own in names or not (_is_finite(given) or several):
@@ -227,6 +235,7 @@ class Term:
         put(self, "elapsed", elapsed)
         put(self, "takes", takes)
         put(self, "time", time)
+        put(self, "labels", dict(labels or {}))
         put(self, "constants", {
             key: value if isinstance(value, str) else tuple(value) if isinstance(value, Sequence) else float(value)
             for key, value in (constants or {}).items()

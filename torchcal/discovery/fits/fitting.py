@@ -9,7 +9,7 @@ from torch import Tensor
 from torchcal.discovery.fits.problem import Problem, Whitening
 from torchcal.simulators import Solution, Trajectories
 
-__all__ = ["Fitted", "fit", "follow_slopes", "refit", "starts", "weighed"]
+__all__ = ["Fitted", "finished", "fit", "follow_slopes", "refit", "starts", "weighed"]
 
 #: Relative change of χ² below which a fit has converged.
 TOLERANCE = 1e-7
@@ -49,6 +49,7 @@ class Fitted:
         agreeing: Share of the starts that came to this χ².
         ends: Where every start ended, ``(H, P)``.
         ends_chi2: With which χ², ``(H,)``.
+        falling: By how much its χ² fell in its last steps; 0 where it came to an end.
     """
 
     problem: Problem
@@ -63,6 +64,7 @@ class Fitted:
     agreeing: float = 1.0
     ends: Tensor | None = None
     ends_chi2: Tensor | None = None
+    falling: float = 0.0
 
     @property
     def residual(self) -> Tensor:
@@ -93,6 +95,10 @@ class Fitted:
         """Names of the free parameters on a bound that they want to cross."""
         parameters = self.problem.parameters
         return [parameters[i].name for i, at in zip(self.free, self.at_bound.tolist(), strict=True) if at]
+
+    def leads_to(self, aim: float, steps: int = FINISH) -> bool:
+        """Whether it has steps to go that may lead to a χ² of ``aim`` at a multiple of their pace."""
+        return self.falling > 0 and not self.chi2 - FASTER * steps / STEPS * self.falling > aim
 
     def sd(self) -> Tensor:
         """Standard deviations ``(P,)``; 0 for those held."""
@@ -348,21 +354,6 @@ def fit(
             break
     best = int(chi2.argmin())
     agreeing = float((chi2 <= chi2[best] * (1 + 1e-3) + 0.1).double().mean())
-    if free and finish and not bool(done[best]):
-        last = fit(
-            problem,
-            whitening,
-            values[best : best + 1],
-            free,
-            warm=None if warm is None else warm.rows(torch.tensor([best])),
-            data=None if data is None else data[best : best + 1],
-            max_steps=finish,
-            finish=0,
-            aim=aim,
-            bend=True,
-        )
-        if last is not None:
-            return dataclasses.replace(last, ends=values, ends_chi2=chi2, agreeing=agreeing)
     gradient = (whitening(jacobian[best]).T @ residual[best]) if free else residual[best, :0]
     now = values[best, free]
     width = torch.where(torch.isfinite(high - low), high - low, now.abs().clamp_min(1e-300))
@@ -378,7 +369,7 @@ def fit(
         spread = (tangents - basis @ (basis.T @ tangents)).norm(dim=0).clamp_min(1e-300)
     pushed = gradient / spread
     at_bound = ((now <= low + near) & (pushed < -2.0)) | ((now >= high - near) & (pushed > 2.0))
-    return Fitted(
+    ended = Fitted(
         problem=problem,
         whitening=whitening,
         values=values[best],
@@ -391,13 +382,39 @@ def fit(
         ends=values,
         ends_chi2=chi2,
         agreeing=agreeing,
+        falling=0.0 if not free or bool(done[best]) else max(float(passed[-1 - STEPS :][0][best] - chi2[best]), 1e-300),
+    )
+    return finished(ended, aim, finish, None if data is None else data[best : best + 1])
+
+
+def finished(found: Fitted, aim: float = torch.inf, steps: int = FINISH, data: Tensor | None = None) -> Fitted:
+    """A fit brought to its end in so many steps more, where they may lead to a χ² of ``aim``."""
+    if not steps or not found.leads_to(aim, steps):
+        return found
+    last = fit(
+        found.problem,
+        found.whitening,
+        found.values[None],
+        found.free,
+        warm=found.warm,
+        data=data,
+        max_steps=steps,
+        finish=0,
+        aim=aim,
+        bend=True,
+    )
+    return found if last is None else dataclasses.replace(
+        last, ends=found.ends, ends_chi2=found.ends_chi2, agreeing=found.agreeing
     )
 
 
-def refit(found: Fitted, whitening: Whitening, problem: Problem | None = None) -> Fitted:
-    """The same model fitted again with other noise, or to other data, from where it stood."""
+def refit(found: Fitted, whitening: Whitening, problem: Problem | None = None, aim: float = torch.inf) -> Fitted:
+    """The same model fitted again with other noise, or to other data, from where it stood.
+
+    Where its way is long and does not lead to a χ² of ``aim`` it does not go to its end.
+    """
     problem = found.problem if problem is None else problem
-    again = fit(problem, whitening, found.values[None], found.free, warm=found.warm)
+    again = fit(problem, whitening, found.values[None], found.free, warm=found.warm, aim=aim)
     return dataclasses.replace(found, problem=problem, whitening=whitening) if again is None else again
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from torchcal.discovery.fits.fitting import Fitted, fit
+from torchcal.discovery.fits.fitting import Fitted, finished, fit
 from torchcal.discovery.fits.problem import Problem, Whitening
 from torchcal.errors import DomainError, MissingDependencyError, SimulatorError, TorchcalError
 from torchcal.simulators import Solution
@@ -31,6 +31,7 @@ class Refit:
         shape: Those of the terms' shapes among them, held at first: while an amplitude is small they mean nothing.
         warm: Warm start, or None.
         aim: χ² above which its end does not matter.
+        begun: Its fit so far, where that is all that is left to do.
     """
 
     problem: Problem
@@ -40,9 +41,12 @@ class Refit:
     shape: list[int]
     warm: Solution | None
     aim: float = math.inf
+    begun: Fitted | None = None
 
     def run(self) -> Fitted | None:
-        """The fit; None where no start gives one."""
+        """The fit, which a long way may not have brought to its end yet; None where no start gives one."""
+        if self.begun is not None:
+            return finished(self.begun, self.aim)
         begin, warm = self.begin, self.warm
         if self.shape:
             free = [i for i in self.free if i not in self.shape]
@@ -51,7 +55,7 @@ class Refit:
                 return None
             begin = first.ends[first.ends_chi2.argsort()[:2]]
             warm = None if first.warm is None else first.warm.repeated(len(begin))
-        return fit(self.problem, self.whitening, begin, self.free, warm=warm, aim=self.aim)
+        return fit(self.problem, self.whitening, begin, self.free, warm=warm, aim=self.aim, finish=0)
 
 
 def refit_all(

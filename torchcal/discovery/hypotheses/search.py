@@ -305,13 +305,13 @@ class Search:
         found: list[Fitted | None] = [None] * len(wanted)
         if self.stop.is_set() or not wanted:
             return found
-        jobs = []
+        aim, jobs = self._aim(self.models), []
         for one in wanted:
             candidate, begin = one.candidate, one.begin
             warm = candidate.problem.guess(self.base.warm, begin)
             shape = [i for i in candidate.own if i not in candidate.amplitudes]
             whitening = self.noise.whitening(candidate.problem)
-            jobs.append(Refit(candidate.problem, whitening, begin, candidate.free, shape, warm, self._aim()))
+            jobs.append(Refit(candidate.problem, whitening, begin, candidate.free, shape, warm, aim))
         names = [" + ".join(term.name for term in one.candidate.terms) for one in wanted]
 
         def take(index: int, fitted: Fitted | None) -> None:
@@ -320,12 +320,24 @@ class Search:
 
         with self.stop.refitting():
             refit_all(jobs, take, self.executor)
+        # A long way is gone to its end only where that may matter beside what the others have come to.
+        ended = [self._model(one, fitted) for one, fitted in zip(wanted, found, strict=True) if fitted is not None]
+        aim = self._aim([*self.models, *ended])
+        slow = {k: fitted for k, fitted in enumerate(found) if fitted is not None and fitted.leads_to(aim)}
+        longer = [dataclasses.replace(jobs[k], begun=fitted, aim=aim) for k, fitted in slow.items()]
+        found = [None if k in slow else fitted for k, fitted in enumerate(found)]
+        with self.stop.refitting():
+            refit_all(longer, lambda index, fitted: found.__setitem__([*slow][index], fitted), self.executor)
         return found
 
-    def _aim(self) -> float:
-        """χ² above which a model plays no part beside what was found so far."""
-        best = max((model.log_evidence for model in self.models if model.physical), default=0.0)
-        return math.inf if self.exact or best <= 0 else self.base.chi2 - 2 * (HOPELESS * best - NEAR)
+    def _aim(self, models: Sequence[Model]) -> float:
+        """χ² above which a model plays no part beside some that were found."""
+        evidence = [self.gain(model.found.chi2) + model.price for model in models if model.physical]
+        best = max(evidence, default=0.0)
+        if self.exact or best <= 0:
+            return math.inf
+        # Where the noise is estimated anew with the best model, the others may come closer to it.
+        return self.base.chi2 - 2 * ((HOPELESS if self.noise.open else 1.0) * best - NEAR)
 
     def _in_short_steps(self, found: Fitted, wanted: float = math.inf) -> Fitted:
         """A fit with time steps that are short enough for it: what a term brings may be faster than the base.
@@ -381,9 +393,15 @@ class Search:
         """Go on with another noise: the base and some models are fitted again, the others weighed."""
         self.noise = noise
         self.base = refit(self.base, noise.whitening(self.base.problem))
-        for model in (*self.models, *self.merged.values(), *self.nameless):
+        done: list[Model] = []
+        every = (*self.models, *self.merged.values(), *self.nameless)
+        for model in sorted(every, key=lambda model: -model.log_evidence):
             whitening = noise.whitening(model.found.problem)
-            model.found = (refit if any(model is one for one in again) else weighed)(model.found, whitening)
+            if any(model is one for one in again):
+                model.found = refit(model.found, whitening, aim=self._aim(done))
+                done.append(model)
+            else:
+                model.found = weighed(model.found, whitening)
         self.residual = Residual(self.base, self.noise, seed=self.seed)
         self.screening = screen(self.residual, self.candidates, self.screening)
         self.structure = analyse(self.residual, every=True)
