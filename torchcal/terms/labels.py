@@ -34,7 +34,9 @@ def labelled(term: Term, known: Mapping[str, str | None]) -> Term:
     def told(text: str | None) -> str | None:
         if text is None or not any(part in units for part in PARTS.findall(text)):
             return text
-        return units[text] if text in units else NEEDLESS.sub(r"\1", PARTS.sub(lambda part: _factor(units.get(part[0], part[0])), text))
+        if text in units:
+            return units[text]
+        return NEEDLESS.sub(r"\1", PARTS.sub(lambda part: _factor(units.get(part[0], part[0])), text))
 
     return dataclasses.replace(
         term,

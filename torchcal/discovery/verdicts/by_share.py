@@ -67,8 +67,11 @@ def decide_exact(search: Search, ranked: list[Model], mask: Tensor | None, decis
         decision.tied, decision.tied_models = [list(accepted.names), list(NONE)], [accepted]
     elif accepted is not None:
         decision.verdict, decision.best = "named", accepted
-    most = len(accepted.numbers) if accepted else len(decision.tied_models[0].numbers) if decision.tied_models else 1
-    weigh(search, decision, [m for m in search.models if len(m.numbers) <= most])
+    if decision.verdict == "unexplained":  # whatever is likelier than the rest removes too little, or is no physics
+        decision.none = 1.0
+        return decision
+    most = len(accepted.numbers) if accepted else len(decision.tied_models[0].numbers)
+    weigh(search, decision, [m for m in clean if len(m.numbers) <= most])
     return decision
 
 
