@@ -1,5 +1,7 @@
 """When the best explanation is a name, and when it is none."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,8 @@ from torchcal.discovery.fits import candidates
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit import outliers
-from torchcal.discovery.verdicts import doubts
+from torchcal.discovery.verdicts import doubts, instruments
+from torchcal.discovery.verdicts.verdict import _worth_telling
 from torchcal.errors import ConvergenceWarning
 
 F64 = torch.float64
@@ -488,3 +491,44 @@ def test_a_name_that_has_another_is_none_though_it_may_act_in_a_window(seed):
     d = diagnose(base, tc.Recording(runs=[tc.Run(time=t, outputs={"T": seen}, inputs={"Ta": room})]), terms)
     assert d.verdict == "ambiguous"
     assert d.tied[:2] == [["internal heat source"], ["offset of T"]]
+
+
+@pytest.mark.parametrize(
+    ("beside_others", "sd", "told"), [(0.18, 0.02, True), (0.18, 0.05, False), (0.08, 0.02, False)]
+)
+def test_an_instrument_of_another_size_beside_what_is_likelier_is_no_name(beside_others, sd, told, monkeypatch):
+    def model(size, names):
+        problem = SimpleNamespace(parameters=[SimpleNamespace(name="a"), SimpleNamespace(name="offset of y.b")])
+        found = SimpleNamespace(by_name={"a": 1.0, "offset of y.b": size})
+        candidate = SimpleNamespace(problem=problem, amplitudes=[1])
+        return SimpleNamespace(found=found, candidate=candidate, names=names)
+
+    monkeypatch.setattr(instruments, "only_instruments", lambda model: True)
+    monkeypatch.setattr(instruments, "stated_sd", lambda found: torch.tensor([0.0, sd]))
+    alone, larger = model(0.07, ("offset of y",)), model(beside_others, ("film", "offset of y"))
+    words = instruments.reads_otherwise(alone, larger)
+    assert bool(words) is told
+    assert ("offset of y.b is 0.07, and beside film, which is likelier, 0.18" in words) is told
+
+
+@pytest.mark.parametrize(
+    ("weight", "probability", "worth"), [(0.0, 0.5, True), (-1.7, 0.2, True), (-1.7, 0.01, False), (-4.0, 0.2, False)]
+)
+def test_what_is_clearly_less_likely_than_the_base_is_no_explanation(weight, probability, worth):
+    model = SimpleNamespace(weight=weight)
+    decision = SimpleNamespace(probability={id(model): probability})
+    assert _worth_telling(decision, model) is worth
+
+
+def test_without_noise_what_is_no_physics_has_no_probability():
+    # Only a negative amount of what cannot be negative would do it.
+    x = torch.linspace(0, 1, 40, dtype=F64)
+    model = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    square = tc.Term("square", outputs={"y": lambda x, p, y: y + p["c"] * x**2},
+                     parameters=[tc.Parameter("c", low=0.0, neutral=0.0)])  # fmt: skip
+    wave = tc.Term("wave", outputs={"y": lambda x, p, y: y + p["w"] * torch.sin(20 * x)},
+                   parameters=[tc.Parameter("w", neutral=0.0)])  # fmt: skip
+    d = diagnose(model, tc.Recording(x=x, y=1 + x - x**2, noise="none"), [square, wave])
+    assert d.verdict == "unexplained"
+    assert {row.terms: row.probability for row in d.ranking}[("none of these",)] == 1.0
+    assert all(row.probability == 0 for row in d.ranking if row.terms != ("none of these",))

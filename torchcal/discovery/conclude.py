@@ -106,7 +106,9 @@ def conclude(
     any_unlike = bool(apart)
     if decision.verdict != "consistent":
         apart = [*unbounded(search), *begun_elsewhere(search), *more_than_replicates(search, left), *apart]
-        apart += in_rows(search, left)
+        # Of what has no name the best fit tells the noise: the base leaves the misfit too, which goes on along rows.
+        every = () if best is not None else (model.found for model in (*search.models, *search.nameless))
+        apart += in_rows(search, min(every, key=lambda found: found.chi2, default=left))
     if decision.verdict in ("ambiguous", "unexplained"):
         apart = [*held_otherwise(search), *apart]
     remaining, depends = 0.0 if decision.verdict == "consistent" else 1.0, ""

@@ -58,8 +58,8 @@ def ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[Hy
         Hypothesis((), 0.0, decision.base, misfit_removed=0.0, p_white=search.structure.p_value, refitted=True,
                    note="the base alone")
     )
-    if not search.exact:
-        evidence = decision.none_evidence - math.log(PRIOR["none"])
+    if not search.exact or decision.none:
+        evidence = math.nan if search.exact else decision.none_evidence - math.log(PRIOR["none"])
         rows.append(Hypothesis(NONE, evidence, decision.none, note=decision.none_note))
     rows.sort(key=lambda row: (-row.probability, -row.log_evidence))
     return Table(rows, COLUMNS)

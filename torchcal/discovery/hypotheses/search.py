@@ -326,8 +326,9 @@ class Search:
         slow = {k: fitted for k, fitted in enumerate(found) if fitted is not None and fitted.leads_to(aim)}
         longer = [dataclasses.replace(jobs[k], begun=fitted, aim=aim) for k, fitted in slow.items()]
         found = [None if k in slow else fitted for k, fitted in enumerate(found)]
-        with self.stop.refitting():
-            refit_all(longer, lambda index, fitted: found.__setitem__([*slow][index], fitted), self.executor)
+        if longer:
+            with self.stop.refitting():
+                refit_all(longer, lambda index, fitted: found.__setitem__([*slow][index], fitted), self.executor)
         return found
 
     def _aim(self, models: Sequence[Model]) -> float:

@@ -68,7 +68,7 @@ def decide_exact(search: Search, ranked: list[Model], mask: Tensor | None, decis
     elif accepted is not None:
         decision.verdict, decision.best = "named", accepted
     if decision.verdict == "unexplained":  # whatever is likelier than the rest removes too little, or is no physics
-        decision.none = 1.0
+        decision.none, decision.base = 1.0, 0.0
         return decision
     most = len(accepted.numbers) if accepted else len(decision.tied_models[0].numbers)
     weigh(search, decision, [m for m in clean if len(m.numbers) <= most])

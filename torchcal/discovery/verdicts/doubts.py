@@ -81,6 +81,7 @@ def unfit(search: Search, model: Model) -> str:
 def left_open(search: Search, model: Model) -> str:
     """Why the data do not determine what a model adds; empty if they do."""
     names = [q.name for q in model.found.problem.parameters]
+    more = "another run" if search.problem.in_time else "more conditions"
     if (noise := beside(search, model)) is not search.noise:
         model = dataclasses.replace(model, found=weighed(model.found, noise.whitening(model.found.problem)))
     for term in model.candidate.terms:
@@ -95,12 +96,12 @@ def left_open(search: Search, model: Model) -> str:
             listed = " and ".join(names[i] for i in ends)
             return (
                 f"The fit ends at a bound of {listed}, along with which the data leave the size of what it adds open: "
-                "more conditions would tell, or a bound that is surer."
+                f"{more} would tell, or a bound that is surer."
             )
         if places and _distance(model, places, shapes, size) <= least:
             bound = search.base.stuck
             looks = f" {', '.join(bound)} ran to a bound in the base: a bound that is wrong looks like this too."
-            told = "The data leave the size of what it adds open: more conditions would tell."
+            told = f"The data leave the size of what it adds open: {more} would tell."
             return told + looks if bound else told
     if model.window is not None and _levels(model) < LEVELS:
         return (

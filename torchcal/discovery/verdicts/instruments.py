@@ -16,7 +16,7 @@ from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.verdicts.explain import stated_sd
 from torchcal.terms import extend
 
-__all__ = ["no_instrument", "only_instruments", "unnatural", "which_instruments"]
+__all__ = ["no_instrument", "only_instruments", "reads_otherwise", "unnatural", "which_instruments"]
 
 #: Noise sd by which an instrument's reading must fall while the true value rises to be no instrument's: a hard limit is
 #: one. And the least sd, in the data's spread.
@@ -37,6 +37,8 @@ FAR, STRAIGHT = 3.0, 1e-9
 NEAR = 0.01
 #: Joint sd of an estimate and of what it is in nature, from which on it is not that.
 APART = 2.0
+#: Sd by which an instrument's size beside other terms is off that alone from which on it is no property of its own.
+OFF = 3.0
 
 
 def unnatural(model: Model) -> str:
@@ -69,6 +71,27 @@ def _worse_at(model: Model, name: str, value: float) -> float:
 def only_instruments(model: Model) -> bool:
     """Whether all that a model adds is instruments."""
     return all(which_instruments(model))
+
+
+def reads_otherwise(model: Model, larger: Model) -> str:
+    """Whether instruments alone are of another size than in a likelier model that adds more, in a sentence; empty if
+    not.
+
+    Its error is no smaller than that of the difference (Hausman 1978, Econometrica 46, 1251-1271).
+    """
+    if not only_instruments(model):
+        return ""
+    sd = dict(zip(larger.found.by_name, stated_sd(larger.found).tolist(), strict=True))
+    names = [q.name for q in model.candidate.problem.parameters]
+    for name in (names[i] for i in model.candidate.amplitudes):
+        alone, beside_others = model.found.by_name[name], larger.found.by_name[name]
+        if abs(alone - beside_others) > OFF * sd[name]:
+            others = " and ".join(other for other in larger.names if other not in model.names)
+            return (
+                f"Alone {name} is {alone:.3g}, and beside {others}, which is likelier, {beside_others:.3g}: no error "
+                "of one instrument, but what none of the terms does."
+            )
+    return ""
 
 
 def which_instruments(model: Model) -> list[bool]:

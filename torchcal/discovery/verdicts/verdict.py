@@ -16,7 +16,7 @@ from torchcal.discovery.verdicts.by_share import decide_exact, nearly
 from torchcal.discovery.verdicts.decision import Decision, certain, groups_of, other_names, tie_other_names, weigh
 from torchcal.discovery.verdicts.doubts import by_hold, doubt, in_common, in_order, unfit
 from torchcal.discovery.verdicts.explain import removed
-from torchcal.discovery.verdicts.instruments import no_instrument, only_instruments
+from torchcal.discovery.verdicts.instruments import no_instrument, only_instruments, reads_otherwise
 from torchcal.discovery.verdicts.proof import prove
 from torchcal.discovery.verdicts.together import only_together
 from torchcal.display import NONE
@@ -162,6 +162,10 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
             _name(search, decision, best, mask)
             return decision
     best = white[0]
+    first = next((model for model in ranked if not model.note), None)
+    if first is not None and not _worth_telling(decision, first):
+        decision.verdict = "unexplained"
+        return decision
     decision.verdict = "ambiguous"
     covered = 0.0
     seen: set[frozenset[str]] = set()
@@ -171,12 +175,12 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
             continue
         if covered >= TIED and seen:
             break
-        behind = math.log(PRIOR["base"]) - model.weight
-        if seen and behind > 0 and (behind > WORSE or decision.probability[id(model)] < WORTH):
-            break  # clearly less likely than the base is no explanation
+        if not _worth_telling(decision, model):
+            break
         seen.add(names)
         covered += groups[names]
-        if any(set(tied) < names for tied in decision.tied):
+        in_windows = [list(m.names) for m in decision.tied_models if m.window is not None]
+        if any(set(tied) < names for tied in decision.tied if tied not in in_windows):
             continue  # one that is listed, and more
         decision.tied.append(list(model.names))
         decision.tied_models.append(model)
@@ -198,6 +202,12 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     if len(decision.tied) < 2 or likely or local or decision.pliant or decision.doubt:
         decision.tied.append(list(NONE))
     return decision
+
+
+def _worth_telling(decision: Decision, model: Model) -> bool:
+    """Whether a hypothesis is an explanation: it may not be clearly less likely than the base."""
+    behind = math.log(PRIOR["base"]) - model.weight
+    return behind <= 0 or (behind <= WORSE and decision.probability[id(model)] >= WORTH)
 
 
 def _perhaps_noise(search: Search, ranked: Sequence[Model], decision: Decision) -> None:
@@ -280,7 +290,8 @@ def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) 
     shown = best if alone else _wherever(search, best)
     decision.doubt = doubt(search, shown)
     if not alone:
-        decision.doubt = decision.doubt or only_together(search, max(holding, key=lambda m: m.weight))
+        likeliest = max(holding, key=lambda m: m.weight)
+        decision.doubt = decision.doubt or only_together(search, likeliest) or reads_otherwise(shown, likeliest)
         _tie_larger(search, decision, holding, sure)
     if sure < SURE or decision.doubt or not shown.physical:
         decision.verdict = "ambiguous"
