@@ -440,3 +440,37 @@ def test_what_is_small_beside_an_offset_is_not_drawn_from():
     recording = tc.Recording(x=X, y=y)
     with pytest.raises(DomainError, match=r"told in torch\.float64.*large offset"):
         tc.calibrate(tc.Simulator(line, AB), recording, num_samples=10, num_starts=4, seed=0, progress=False)
+
+
+def _root(below, **options):
+    """An oscillator whose force has no value where x lies ``below``."""
+    return tc.ODESimulator(
+        lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * torch.sqrt(s["x"] - below)},
+        {"x": "m", "v": "m/s"},
+        [tc.Parameter("k", low=0.0, initial=1.0)],
+        observe=("x",),
+        **options,
+    )
+
+
+def _swing():
+    t = torch.linspace(0.0, 4.0, 41, dtype=torch.float64)
+    return tc.Recording(runs=[tc.Run(time=t, outputs={"x": torch.cos(2 * t)}, initial={"x": 1.0, "v": 0.0})])
+
+
+def test_rates_without_a_value_are_told_before_any_step_is_tried(monkeypatch):
+    solved = []
+    monkeypatch.setattr(tc.simulators.Trajectories, "solve", lambda *arguments: solved.append(arguments))
+    message = r"Got nan for the rate of 'v' at t=0, with states \{'x': 1.0, 'v': 0.0\} and parameters \{'k': 1.0\}"
+    for calibrate in (tc.calibrate, tc.calibrate_additive):
+        with pytest.raises(SimulatorError, match=message):
+            calibrate(_root(100.0), _swing(), num_samples=0, progress=False)
+    assert not solved
+
+
+def test_no_steps_are_sought_where_rates_have_no_value():
+    bound = _root(100.0).bind(_swing())
+    values = torch.ones(1, 1, dtype=torch.float64)
+    assert not bound.begins(values).all()
+    assert tc.simulators.workable(bound, values, torch.full((41,), 1e-3, dtype=torch.float64)) is bound
+    assert _root(0.0).bind(_swing()).begins(values).all()

@@ -230,7 +230,7 @@ def workable(simulator: Trajectories, values: Tensor, allowed: Tensor, *, halvin
     Where it settles with none it is the first with a finite solution, else the simulator itself. Arguments are those of
     `settled`.
     """
-    if not may_change(simulator):
+    if not may_change(simulator) or not bool(simulator.begins(values).all()):
         return simulator
     if simulator.implicit or not _finite(simulator, values):
         other = settled_implicitly(simulator, values, allowed)

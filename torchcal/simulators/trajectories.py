@@ -137,9 +137,10 @@ class Trajectories(Simulator):
         """As for any simulator; rates must also be written elementwise.
 
         Raises:
-            SimulatorError: As `Simulator.check`; if the rates at many times at once differ from those at one time
-                after another.
+            SimulatorError: As `Simulator.check`; if no values give finite rates where runs begin; if the rates at many
+                times at once differ from those at one time after another.
         """
+        self._check_rates(values.detach())
         total = super().check(x, values, outputs)
         wanted = tuple(outputs) if outputs is not None else self.recording.outputs
         good = torch.isfinite(self.outputs_of(values, self.solve(values), wanted)).all(-1)
@@ -300,6 +301,36 @@ class Trajectories(Simulator):
         """Rates of all states at the beginning of every run, ``(H, R, states)``, at states ``(H, R, states)``."""
         u = {name: table[0, :, 0] for name, table in self.grid.u.items()}
         return self.steps.rates(self.grid.t[:, 0], start, self.layout.by_name(values), u)
+
+    def begins(self, values: Tensor) -> Tensor:
+        """Whether rates are finite where runs begin, ``(H, R, states)``: in the middle of the first step at least, for
+        a ratio may have a limit at the beginning itself. Else no steps get through."""
+        with torch.no_grad():
+            start, p = self.layout.start(values), self.layout.by_name(values)
+            found = torch.zeros_like(start, dtype=torch.bool)
+            for place, share in ((0, 0.0), (1, 0.5)):
+                u = {name: table[place, :, 0] for name, table in self.grid.u.items()}
+                rates = self.steps.rates(self.grid.t[:, 0] + share * self.grid.h[:, 0], start, p, u)
+                found |= torch.isfinite(rates)
+        return found
+
+    def _check_rates(self, values: Tensor) -> None:
+        good = self.begins(values)
+        if bool(good.flatten(1).all(-1).any()):
+            return
+        r, i = (~good[0]).nonzero()[0].tolist()
+        with torch.no_grad():
+            start = self.layout.start(values)
+            rate = float(self.slopes(values, start)[0, r, i])
+        states = {name: float(value) for name, value in zip(self._states, start[0, r], strict=True)}
+        point = {name: float(value) for name, value in zip(self.names, values[0], strict=True)}
+        where = f" of run {r}" if len(self.runs) > 1 else ""
+        raise SimulatorError(
+            f"Expected finite rates where runs begin. Got {rate} for the rate of {self._states[i]!r} at "
+            f"t={float(self.grid.t[r, 0]):g}{where}, with states {states} and parameters {point}, and none of "
+            f"{len(values)} parameter values gave finite ones. Check rates(t, s, p, u) there, and the runs' initial "
+            "values, or narrow the parameters' bounds or give initial=."
+        )
 
     def _measure(self, p: dict[str, Tensor], seen: Tensor, outputs: Sequence[str]) -> Tensor:
         s = {name: seen[..., i] for i, name in enumerate(self._states)}
