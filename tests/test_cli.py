@@ -255,3 +255,11 @@ def test_every_file_that_cannot_be_written_is_told_and_the_result_printed(capsys
         cli._finish("the result", [fails("report"), lambda: None, fails("file")])
     assert told.value.__notes__ == ["TorchcalError: no file"]
     assert capsys.readouterr().out == "the result\n"
+
+
+@pytest.mark.parametrize("seed", ["-1", "1.5", "many"])
+def test_a_seed_that_is_none_is_a_wrong_command_line(seed, capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(["diagnose", "problem.py", "--seed", seed])
+    assert ended.value.code == 2
+    assert "argument --seed" in capsys.readouterr().err

@@ -401,11 +401,15 @@ def test_a_bound_of_the_base_may_be_why_a_size_is_open(monkeypatch, stuck):
     problem = SimpleNamespace(parameters=[tc.Parameter("k"), tc.Parameter("drag.a")])
     candidate = SimpleNamespace(terms=[SimpleNamespace(brings="drag.a".__eq__)], own=[1], amplitudes=[1])
     model = SimpleNamespace(candidate=candidate, window=None, found=SimpleNamespace(problem=problem))
-    search = SimpleNamespace(exact=False, base=SimpleNamespace(stuck=stuck), noise=SimpleNamespace(open=False))
+    search = SimpleNamespace(
+        exact=False, base=SimpleNamespace(stuck=stuck), problem=SimpleNamespace(in_time=bool(stuck)),
+        noise=SimpleNamespace(open=False),
+    )  # fmt: skip
     monkeypatch.setattr(doubts, "_distance", lambda *given: 0.0)
     told = doubts.left_open(search, model)
     assert told.startswith("The data leave the size of what it adds open")
     assert ("k ran to a bound in the base" in told) is bool(stuck)
+    assert ("another run would tell" if stuck else "more conditions would tell") in told
 
 
 @pytest.mark.parametrize(
@@ -418,8 +422,9 @@ def test_what_one_of_several_adds_must_be_clearly_there(monkeypatch, count, away
     found = SimpleNamespace(problem=problem, free=[*range(count)])
     model = SimpleNamespace(candidate=candidate, window=None, found=found)
     search = SimpleNamespace(
-        exact=False, base=SimpleNamespace(stuck=[]), problem=None, noise=SimpleNamespace(open=False)
-    )
+        exact=False, base=SimpleNamespace(stuck=[]), problem=SimpleNamespace(in_time=False),
+        noise=SimpleNamespace(open=False),
+    )  # fmt: skip
     monkeypatch.setattr(doubts, "_distance", lambda *given: away)
     monkeypatch.setattr(doubts, "distinct", lambda problem: 100)
     assert doubts.left_open(search, model).startswith("The data leave the size") is is_open

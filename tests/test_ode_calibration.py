@@ -546,6 +546,9 @@ def test_a_model_in_time_with_another_constant_is_not_the_one_that_was_calibrate
         kind.load(tmp_path / "o.nc", simulator=model(1.0, stiff=True))  # other steps
         with pytest.raises(DomainError, match="predicts something else"):
             kind.load(tmp_path / "o.nc", simulator=model(2.0))
+        static = tc.Simulator(lambda x, p: p["k"] * x, [tc.Parameter("k", low=0.0, high=3.0)])
+        with pytest.raises(SimulatorError, match=r"the ODESimulator that was calibrated.*Got a static Simulator"):
+            kind.load(tmp_path / "o.nc", simulator=static)
 
 
 def test_a_static_result_and_a_model_in_time_do_not_mix(tmp_path: Path) -> None:

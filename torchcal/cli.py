@@ -18,6 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from torchcal.checks import as_seed
 from torchcal.discovery import diagnose
 from torchcal.discovery.findings.as_json import text_of
 from torchcal.display import version
@@ -88,6 +89,14 @@ def _line(error: BaseException | None, path: Path | None) -> int | None:
     return found
 
 
+def _seed(text: str) -> int:
+    """A seed of the command line, where a wrong one is told as any other wrong argument is."""
+    try:
+        return as_seed(int(text))
+    except (ValueError, DomainError) as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="torchcal", description=(__doc__ or "").split("\n")[0].replace("``", ""))
     parser.add_argument("--version", action="version", version=f"torchcal {version('torchcal')}")
@@ -102,7 +111,7 @@ def _parser() -> argparse.ArgumentParser:
     diagnosing.add_argument("--out", type=Path, metavar="RESULT.json", help="where the result is written")
     for command in (calibrating, diagnosing):
         command.add_argument("problem", type=Path, help="a Python file that defines simulator and recording")
-        command.add_argument("--seed", type=int, help="of every random number")
+        command.add_argument("--seed", type=_seed, help="of every random number")
         command.add_argument("--quiet", action="store_true", help="show no progress")
     showing = commands.add_parser("show", help="print a result that was written")
     showing.set_defaults(run=_show)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchcal import embeddings, likelihoods, polychaos
 from torchcal.data import Recording, Run
-from torchcal.errors import DomainError, EmbeddingError, RecordingError, TorchcalError
+from torchcal.errors import DomainError, EmbeddingError, RecordingError, SimulatorError, TorchcalError
 from torchcal.prediction import AdditivePrediction, Moments, Prediction, output_moments
 from torchcal.propagation import NISP, PropagationCheck, RuleChoice
 from torchcal.results.diagnostics import Diagnostics, Mode, Quality
@@ -71,10 +71,24 @@ def check_simulator(result: "Calibration") -> None:
     """
     if result.propagate is None or result.stored is None:
         return
-    with torch.no_grad():
+    with torch.no_grad(), _of_its_kind(result.recording, result.propagate.simulator):
         mean, variance = output_moments(result.propagate, result.map.alpha)
     stored = result.stored.map
     _hold_against(result, stored.mean, (mean, stored.mean), (variance.clamp_min(0).sqrt(), stored.sd))
+
+
+@contextlib.contextmanager
+def _of_its_kind(recording: Recording, simulator: Simulator) -> Iterator[None]:
+    """Say what is wrong where a static simulator cannot predict a recording in time; one that reads times can."""
+    try:
+        yield
+    except SimulatorError as error:
+        if recording.runs is None or isinstance(simulator, Trajectories):
+            raise
+        raise SimulatorError(
+            "Expected the ODESimulator that was calibrated, as the file is of a recording in time. Got a static "
+            f"{type(simulator).__name__}, which cannot predict it (give the other)."
+        ) from error
 
 
 def _hold_against(
@@ -109,7 +123,7 @@ def read_additive(
     propagate = _propagation(simulator, embeddings.PolynomialChaos(order=0), recording, meta, options)
     result = cls(propagate=propagate, **parts)
     if propagate is not None and not isinstance(simulator, ExternalSimulator):
-        with torch.no_grad():
+        with torch.no_grad(), _of_its_kind(recording, propagate.simulator):
             mean = propagate.mean(result.map.alpha[:-1])
         stored = kinds["map"].mean
         _hold_against(result, stored, (mean, stored))
