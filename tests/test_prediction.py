@@ -366,8 +366,9 @@ def test_scores_refuse_what_has_no_score():
     y = torch.ones(4, dtype=torch.float64)
     with pytest.raises(ShapeError, match="as the mean"):
         scores(y[:, None], Moments(y, y))
-    with pytest.raises(DomainError, match="level"):
-        scores(y, Moments(y, y), level=2.0)
+    for level in (2.0, "a", True, None):
+        with pytest.raises(DomainError, match="level between 0 and 1"):
+            scores(y, Moments(y, y), level=level)
     with pytest.raises(DomainError, match="sd > 0"):
         scores(y, Moments(y, 0 * y))
     with pytest.raises(DomainError, match=r"finite data\. Got an infinite one"):

@@ -43,6 +43,8 @@ def test_parameter_keeps_what_it_was_given_as_floats():
         ({"low": math.nan}, "finite number for low"),
         ({"high": math.inf}, "finite number for high"),
         ({"initial": "guess"}, "finite number for initial"),
+        ({"initial": True}, "finite number for initial"),
+        ({"per_run": "yes"}, "per_run of parameter 'k' as True or False"),
         ({"neutral": [1.0, 2.0]}, "finite number for neutral"),
         ({"low": 2.0, "high": 1.0}, "low < high"),
         ({"low": 1.0, "high": 1.0}, "low < high"),

@@ -104,6 +104,12 @@ def test_scores_refuse_units_that_a_prediction_does_not_know():
     assert tc.Recording(x=[0.0, 1.0], y=[1.0, 2.0], noise=noise, units={"y": "cm"}).noise.tolist() == [0.1, 0.1]
 
 
+def test_a_guess_with_a_unit_is_refused_with_what_to_give():
+    quantity = pytest.importorskip("pint").UnitRegistry().Quantity
+    with pytest.raises(DomainError, match=r"finite number for initial.*Give its magnitude in the parameter's unit"):
+        tc.Parameter("g", unit="m/s^2", initial=quantity(9.81, "m/s^2"))
+
+
 @pytest.mark.slow
 def test_a_users_own_bounded_model_is_sampled_with_the_defaults_of_nuts():
     """Pyro starts in the middle of the support's coordinates: spreads there are small against the ranges."""

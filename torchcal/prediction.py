@@ -5,6 +5,7 @@ Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 3
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import torch
@@ -333,7 +334,7 @@ def scores(y: Any, moments: Moments | Prediction, *, noise: Any = None, level: f
         raise DomainError(f"Expected moments as a Prediction or Moments. Got {type(moments).__name__}{advice}.")
     if y.shape != moments.mean.shape:
         raise ShapeError(f"Expected y of shape {tuple(moments.mean.shape)}, as the mean. Got {tuple(y.shape)}.")
-    if not 0 < level < 1:
+    if isinstance(level, bool) or not isinstance(level, Real) or not 0 < level < 1:
         raise DomainError(f"Expected level between 0 and 1. Got {level!r}.")
     known = ~torch.isnan(y)
     if bool(y.isinf().any()):

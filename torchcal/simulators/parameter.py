@@ -94,15 +94,19 @@ class Parameter:
             if value is None:
                 continue
             try:
-                number = math.nan if isinstance(value, str | bytes) else float(value)
+                number = math.nan if isinstance(value, str | bytes | bool) else float(value)
             except (TypeError, ValueError):
                 number = math.nan
             if not math.isfinite(number):
+                advice = "Leave it out where there is none."
+                if hasattr(value, "magnitude"):  # a quantity with a unit
+                    advice = "Give its magnitude in the parameter's unit, value.to(unit).magnitude."
                 raise DomainError(
-                    f"Expected a finite number for {field} of parameter {self.name!r}. Got {value!r}. "
-                    "Leave it out where there is none."
+                    f"Expected a finite number for {field} of parameter {self.name!r}. Got {value!r}. {advice}"
                 )
             object.__setattr__(self, field, number)
+        if not isinstance(self.per_run, bool):
+            raise DomainError(f"Expected per_run of parameter {self.name!r} as True or False. Got {self.per_run!r}.")
         if self.low is not None and self.high is not None and not self.low < self.high:
             raise DomainError(
                 f"Expected low < high for parameter {self.name!r}. Got low={self.low}, high={self.high}. "
