@@ -7,7 +7,7 @@ by step.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -66,7 +66,7 @@ class Steps:
             raise SimulatorError(
                 f"Expected rates(t, s, p, u) to return the rates by state. It raised {raised(error)}. "
                 f"It was called with states of shape {tuple(s.shape[:-1])} ({spans(named)}) and parameters "
-                f"of shape {tuple(next(iter(p.values())).shape)} ({spans(p)})."
+                f"of shape {tuple(next(iter(p.values())).shape)} ({spans(p)}).{_unknown(error, named, p, u)}"
             ) from error
         if not isinstance(rates, Mapping) or set(rates) != set(names):
             got = list(rates) if isinstance(rates, Mapping) else type(rates).__name__
@@ -234,6 +234,16 @@ class Steps:
             u = {name: table[:, :, k] for name, table in self.grid.u.items()}
             found.append(self.step(found[-1], self.grid.t[:, k], self.grid.h[:, k], p, u))
         return torch.stack(found, dim=-2)
+
+
+def _unknown(error: Exception, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> str:
+    """What a name that a model asks for in vain is none of, in a sentence; empty for other errors."""
+    if not isinstance(error, KeyError) or not error.args or any(error.args[0] in given for given in (s, p, u)):
+        return ""
+    return (
+        f" There is no {error.args[0]!r} among states {list(s)}, parameters {list(p)} and inputs {list(u)} (inputs "
+        "come with the runs, Run(inputs=...))."
+    )
 
 
 def _ended(states: Tensor) -> Tensor:
