@@ -9,6 +9,7 @@ import threading
 import time
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import nullcontext
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -373,3 +374,31 @@ def test_windows_are_refitted_together_and_are_the_same_from_workers(monkeypatch
     assert [(row.terms, row.region) for row in there.ranking] == [(row.terms, row.region) for row in here.ranking]
     assert [row.probability for row in there.ranking] == pytest.approx([row.probability for row in here.ranking])
     assert max(sizes) > 1
+
+
+def test_no_long_refit_is_gone_on_with_after_ctrl_c(monkeypatch):
+    stages = []
+
+    def refits(jobs, take, executor):
+        stages.append([job.begun is not None for job in jobs])
+        take(0, SimpleNamespace(leads_to=lambda aim: True))
+        if len(stages) == 1 and pressed:
+            signal.raise_signal(signal.SIGINT)
+        for number in range(1, len(jobs)):
+            take(number, SimpleNamespace(leads_to=lambda aim: True))
+
+    monkeypatch.setattr("torchcal.discovery.hypotheses.search.refit_all", refits)
+    problem = SimpleNamespace(guess=lambda warm, begin: None)
+    candidate = SimpleNamespace(problem=problem, own=[], amplitudes=[], free=[], terms=[SimpleNamespace(name="a")])
+    wanted = [SimpleNamespace(candidate=candidate, begin=None) for _ in range(3)]
+    for pressed in (False, True):
+        stages.clear()
+        search = SimpleNamespace(
+            stop=Stop(), models=[], executor=None, tick=lambda text: None, base=SimpleNamespace(warm=None),
+            noise=SimpleNamespace(whitening=lambda problem: None), _aim=lambda models: math.inf,
+            _model=lambda one, fitted: None,
+        )  # fmt: skip
+        with search.stop.listening():
+            found = Search._fits(search, wanted)
+        assert stages == ([[False] * 3] if pressed else [[False] * 3, [True] * 3])
+        assert [one is not None for one in found] == ([True, False, False] if pressed else [True] * 3)

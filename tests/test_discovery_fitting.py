@@ -9,7 +9,7 @@ import torch
 from torch.autograd import forward_ad
 
 import torchcal as tc
-from torchcal.discovery.fits.fitting import fit, refit, starts
+from torchcal.discovery.fits.fitting import FINISH, finished, fit, refit, starts
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses import search
 from torchcal.discovery.hypotheses.base import calibrate_base
@@ -474,6 +474,19 @@ def test_a_fit_ends_early_where_its_pace_does_not_lead_to_where_it_is_wanted(lin
                 finish=40, aim=aim)  # fmt: skip
     assert (found.chi2 > 45.0) is early
     assert (linearised[0] < 30) is early
+
+
+def test_a_fit_that_is_to_be_finished_later_is_not_ended_for_the_steps_that_come_then():
+    problem = valley(1000.0)
+    begin, free = torch.tensor([[-30.0, 901.0]], dtype=F64), [0, 1]
+    whole = fit(problem, white(problem, 1.0), begin, free, aim=480.5)
+    first = fit(problem, white(problem, 1.0), begin, free, aim=480.5, finish=0, later=FINISH)
+    assert first.leads_to(480.5)
+    assert finished(first, 480.5).chi2 == pytest.approx(whole.chi2, rel=1e-3)
+    assert whole.chi2 < 480.5 < first.chi2
+    assert not first.leads_to(-1e9)
+    assert finished(first, -1e9) is first
+    assert finished(finished(first), 0.0).falling == 0.0
 
 
 def test_a_look_ahead_goes_no_farther_than_steps_do_along_a_flat_logarithm():

@@ -187,17 +187,62 @@ def test_estimates_are_in_the_units_of_the_states_whatever_a_library_calls_them(
 
 @pytest.mark.parametrize(
     ("known", "told"),
-    [({"y": "mm"}, "1/mm"), ({"y": "mol/L"}, "1/(mol/L)"), ({"x": "K"}, "1/([y])"), ({"y": None}, "1/([y])")],
+    [
+        ({"y": "mm"}, "1/mm"),
+        ({"y": "mol/L"}, "1/(mol/L)"),
+        ({"y": "kN·m"}, "1/(kN·m)"),
+        ({"y": "m-1"}, "1/(m-1)"),
+        ({"y": "dB(A)"}, "1/(dB(A))"),
+        ({"y": "degC"}, "1/degC"),
+        ({"x": "K"}, "1/([y])"),
+        ({"y": None}, "1/([y])"),
+    ],
 )
 def test_a_unit_that_is_known_takes_the_place_of_its_name(known, told):
-    bend = labelled(tc.terms.sensor(("y",), static=True)[2], known)
+    bend = labelled(tc.terms.sensor(("y",), static=True)[2], known, {})
     assert [q.unit for q in bend.parameters] == [told]
-    offset = labelled(tc.terms.sensor(("y",), static=True)[0], known)
+    offset = labelled(tc.terms.sensor(("y",), static=True)[0], known, {})
     assert [q.unit for q in offset.parameters] == [known.get("y") or "[y]"]
 
 
 def test_own_states_of_a_term_are_in_the_units_of_what_they_follow():
     (second,) = [term for term in tc.terms.hydraulics("h") if term.states]
-    assert [*labelled(second, {"h": "cm"}).states.values()] == ["cm"]
+    assert [*labelled(second, {}, {"h": "cm"}).states.values()] == ["cm"]
     with pytest.raises(DomainError, match=r"labels= of the term 't' as names of units\. Got 'x': 3"):
         tc.Term("t", frees=["a"], labels={"x": 3})
+
+
+def test_axes_in_different_units_and_numbers_without_one_keep_what_they_are_called():
+    drag = tc.terms.mechanics(("x", "y"), ("vx", "vy"))[1]
+    assert labelled(drag, {}, {"x": "mm", "y": "km"}) is drag
+    assert [q.unit for q in labelled(drag, {}, {"x": "mm", "y": "mm"}).parameters] == ["1/mm"]
+    swing = tc.terms.mechanics(length="1")[0]
+    assert labelled(swing, {}, {"x": "rad"}) is swing  # 1/s is no rad/s
+    assert [q.unit for q in labelled(tc.terms.mechanics()[1], {}, {"x": "1"}).parameters] == ["1/[x]"]
+
+
+def test_an_output_that_is_called_as_a_state_has_its_own_unit():
+    t = torch.linspace(0, 4, 30, dtype=F64)
+    model = tc.ODESimulator(
+        lambda t, s, p, u: {"h": -p["k"] * s["h"]},
+        {"h": "m"},
+        [tc.Parameter("k", low=0.0, initial=0.5)],
+        observe={"h": lambda t, s, p, u: 100 * s["h"]},
+    )
+    runs = [tc.Run(time=t, outputs={"h": 100 * torch.exp(-0.5 * t)}, initial={"h": 1.0})]
+    terms = [tc.terms.sensor(("h",))[0], tc.terms.hydraulics("h")[3]]
+    found = diagnose(model, tc.Recording(runs=runs, noise=0.1, units={"h": "cm"}), terms, holdout=False, num_starts=2)
+    assert {row.term: row.unit for row in found.detection_limit} == {"offset of h": "cm", "evaporation": "m/s"}
+
+
+def test_a_term_of_a_class_of_its_own_keeps_it():
+    class Bend(tc.Term):
+        def __init__(self, power):
+            super().__init__(f"bend {power}", outputs={"y": lambda x, p, y: y + p["c"] * x**power},
+                             parameters=[tc.Parameter("c", unit="[y]")])  # fmt: skip
+
+    bend = Bend(2)
+    other = labelled(bend, {"y": "K"}, {})
+    assert type(other) is Bend
+    assert [q.unit for q in (*other.parameters, *bend.parameters)] == ["K", "[y]"]
+    assert labelled(bend, {"x": "m"}, {}) is bend

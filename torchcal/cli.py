@@ -92,8 +92,8 @@ def _line(error: BaseException | None, path: Path | None) -> int | None:
 def _seed(text: str) -> int:
     """A seed of the command line, where a wrong one is told as any other wrong argument is."""
     try:
-        return as_seed(int(text))
-    except (ValueError, DomainError) as error:
+        return as_seed(int(text) if text.lstrip("-").isdecimal() else text)
+    except DomainError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 

@@ -234,16 +234,11 @@ def _check(simulator: Any, recording: Any, candidates: Any, confidence: float) -
             "Expected confidence above 0.5 and at most 0.998, which 1000 simulated residuals can resolve. "
             f"Got {confidence!r}."
         )
-    known = _units(simulator, recording)
-    return [labelled(term, known) for term in by_name.values()]
-
-
-def _units(simulator: Simulator, recording: Recording) -> dict[str, str | None]:
-    """What is known of the units of conditions, states, inputs and outputs."""
-    found: dict[str, str | None] = dict(recording.units)
+    states = {name: unit for name, unit in getattr(simulator, "states", {}).items() if unit}
+    known: dict[str, str | None] = states | dict(recording.units)
     for run in recording.runs or ():
-        found |= run.units
-    return found | {name: unit for name, unit in getattr(simulator, "states", {}).items() if unit}
+        known = run.units | known
+    return [labelled(term, known, states) for term in by_name.values()]
 
 
 def _compare_times(recording: Recording, terms: Sequence[Term]) -> None:

@@ -86,8 +86,8 @@ def _of_its_kind(recording: Recording, simulator: Simulator) -> Iterator[None]:
         if recording.runs is None or isinstance(simulator, Trajectories):
             raise
         raise SimulatorError(
-            "Expected the ODESimulator that was calibrated, as the file is of a recording in time. Got a static "
-            f"{type(simulator).__name__}, which cannot predict it (give the other)."
+            "Expected the simulator that was calibrated, with a recording in time. Got a static "
+            f"{type(simulator).__name__}, which cannot predict it: {error} Give the ODESimulator where it was one."
         ) from error
 
 

@@ -1,5 +1,6 @@
 """Units of what terms estimate, in those of the states, inputs, conditions and outputs that they are made of."""
 
+import copy
 import dataclasses
 import re
 from collections.abc import Mapping
@@ -8,43 +9,52 @@ from torchcal.terms.term import Term
 
 __all__ = ["labelled"]
 
-#: The parts of a unit's text: ``[x]``, which stands for the unit of x, and names.
-PARTS = re.compile(r"\[[^\]]*\]|[^\s/*^()\[\]]+")
-#: Brackets around one name, or around brackets.
-NEEDLESS = re.compile(r"\(([^\s/*^()]+|\([^()]*\))\)")
+#: The parts of a unit's text: ``[x]``, which stands for the unit of x, in brackets of its own or not, and names.
+PARTS = re.compile(r"\(\[[^\[\]]*\]\)|\[[^\[\]]*\]|[^\s/*^()\[\]·]+")
+#: A unit that is one factor as it stands.
+SIMPLE = re.compile(r"[^\W\d_]+|%|°[^\W\d_]*")
 
 
-def labelled(term: Term, known: Mapping[str, str | None]) -> Term:
-    """A term whose parameters' units are by those that are known of what it reads.
+def labelled(term: Term, known: Mapping[str, str | None], states: Mapping[str, str | None]) -> Term:
+    """A term whose parameters' units are by those that are known of what it reads; itself where that changes nothing.
 
     Args:
         term: Of a library, or a user's own.
-        known: Units by the names of states, inputs, conditions and outputs.
+        known: Units by the names of outputs, inputs, conditions and states, for ``[x]``.
+        states: Units of the states, for what the term calls them (its ``labels``).
 
     >>> from torchcal.terms import sensor
     >>> bend = sensor(("y",), static=True)[2]
-    >>> [q.unit for term in (bend, labelled(bend, {"y": "mm"})) for q in term.parameters]
+    >>> [q.unit for term in (bend, labelled(bend, {"y": "mm"}, {})) for q in term.parameters]
     ['1/([y])', '1/mm']
     """
-    units = {f"[{name}]": unit for name, unit in known.items() if unit}
-    units |= {label: unit for name, label in term.labels.items() if (unit := known.get(name))}
-    if not units:
-        return term
+    units = {f"[{name}]": unit for name, unit in known.items() if unit and unit != "1"}
+    for label in {*term.labels.values()} - {"1", term.time}:
+        found = {name: states.get(name) for name, called in term.labels.items() if called == label}
+        if len({*found.values()}) == 1 and all(found.values()):  # not of axes in different units
+            name, unit = next(iter(found.items()))
+            units[label] = f"[{name}]" if unit == "1" else str(unit)
 
     def told(text: str | None) -> str | None:
-        if text is None or not any(part in units for part in PARTS.findall(text)):
-            return text
-        if text in units:
-            return units[text]
-        return NEEDLESS.sub(r"\1", PARTS.sub(lambda part: _factor(units.get(part[0], part[0])), text))
+        return None if text is None else units.get(text) or PARTS.sub(lambda part: _put(part[0], units), text)
 
-    return dataclasses.replace(
-        term,
-        parameters=tuple(dataclasses.replace(q, unit=told(q.unit)) for q in term.parameters),
-        states={name: told(unit) for name, unit in term.states.items()},
-    )
+    changes = {
+        "parameters": tuple(
+            q if told(q.unit) == q.unit else dataclasses.replace(q, unit=told(q.unit)) for q in term.parameters
+        ),
+        "states": {name: told(unit) for name, unit in term.states.items()},
+    }
+    if all(getattr(term, name) == value for name, value in changes.items()):
+        return term
+    other = copy.copy(term)  # of its own class, however that is made
+    for name, value in (changes | {"labels": {x: units.get(label, label) for x, label in term.labels.items()}}).items():
+        object.__setattr__(other, name, value)
+    return other
 
 
-def _factor(unit: str) -> str:
-    """A unit as a part of another one."""
-    return f"({unit})" if re.search(r"[\s/*^]", unit) else unit
+def _put(part: str, units: Mapping[str, str]) -> str:
+    """What stands for a part of a unit's text, as a factor."""
+    unit = units.get(part.removeprefix("(").removesuffix(")"))
+    if unit is None:
+        return part
+    return unit if SIMPLE.fullmatch(unit) or unit.startswith("[") else f"({unit})"

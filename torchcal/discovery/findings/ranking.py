@@ -59,7 +59,7 @@ def ranking(search: Search, decision: Decision, mask: Tensor | None) -> Table[Hy
                    note="the base alone")
     )
     if not search.exact or decision.none:
-        evidence = math.nan if search.exact else decision.none_evidence - math.log(PRIOR["none"])
+        evidence = -math.inf if search.exact else decision.none_evidence - math.log(PRIOR["none"])
         rows.append(Hypothesis(NONE, evidence, decision.none, note=decision.none_note))
     rows.sort(key=lambda row: (-row.probability, -row.log_evidence))
     return Table(rows, COLUMNS)

@@ -223,6 +223,7 @@ def fit(
     max_steps: int = MAX_STEPS,
     finish: int = FINISH,
     aim: float = torch.inf,
+    later: int = 0,
     bend: bool = False,
 ) -> Fitted | None:
     """Minimise χ² over the free parameters from every row of ``begin`` (H, P); None where no start works.
@@ -231,7 +232,8 @@ def fit(
     for the step. Parameters with ``transform="log"`` are stepped in their logarithm. With ``data`` (H, n) every start
     is fitted to data of its own, and ``ends_chi2`` tells how well. A start ends where it has converged, or creeps.
     Where the best has done neither after ``max_steps`` it goes on alone for at most ``finish`` more. A start that falls
-    so slowly that its χ² will be above ``aim`` in the end has no need to get there, and ends too. With ``bend``, as in
+    so slowly that its χ² will be above ``aim`` in the end, with ``later`` steps of `finished` too, has no
+    need to get there, and ends too. With ``bend``, as in
     those last steps, every step follows the valley's curvature (geodesic acceleration; Transtrum & Sethna 2012,
     arXiv:1201.5885), which costs a look ahead and makes bent valleys several times shorter.
     """
@@ -348,7 +350,7 @@ def fit(
         if len(passed) > STEPS:  # along a valley that is nearly flat
             creeping = passed[-1 - STEPS] - chi2 < CREEPING * (chi2 / problem.n).clamp_max(1.0)
             done = done | (creeping & (taken[-1] - taken[-1 - STEPS] >= TAKEN))
-            fall, left_over = passed[-1 - STEPS] - chi2, (max_steps + finish - len(passed) + 1) / STEPS
+            fall, left_over = passed[-1 - STEPS] - chi2, (max_steps + finish + later - len(passed) + 1) / STEPS
             done = done | ((fall < PACE * chi2) & (chi2 - FASTER * left_over * fall > aim))
         if bool(done.all()):
             break

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from torchcal.discovery.fits.fitting import Fitted, finished, fit
+from torchcal.discovery.fits.fitting import FINISH, Fitted, finished, fit
 from torchcal.discovery.fits.problem import Problem, Whitening
 from torchcal.errors import DomainError, MissingDependencyError, SimulatorError, TorchcalError
 from torchcal.simulators import Solution
@@ -55,7 +55,7 @@ class Refit:
                 return None
             begin = first.ends[first.ends_chi2.argsort()[:2]]
             warm = None if first.warm is None else first.warm.repeated(len(begin))
-        return fit(self.problem, self.whitening, begin, self.free, warm=warm, aim=self.aim, finish=0)
+        return fit(self.problem, self.whitening, begin, self.free, warm=warm, aim=self.aim, finish=0, later=FINISH)
 
 
 def refit_all(

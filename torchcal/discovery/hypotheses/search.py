@@ -320,12 +320,13 @@ class Search:
 
         with self.stop.refitting():
             refit_all(jobs, take, self.executor)
+        if self.stop.is_set():
+            return found
         # A long way is gone to its end only where that may matter beside what the others have come to.
         ended = [self._model(one, fitted) for one, fitted in zip(wanted, found, strict=True) if fitted is not None]
         aim = self._aim([*self.models, *ended])
         slow = {k: fitted for k, fitted in enumerate(found) if fitted is not None and fitted.leads_to(aim)}
         longer = [dataclasses.replace(jobs[k], begun=fitted, aim=aim) for k, fitted in slow.items()]
-        found = [None if k in slow else fitted for k, fitted in enumerate(found)]
         if longer:
             with self.stop.refitting():
                 refit_all(longer, lambda index, fitted: found.__setitem__([*slow][index], fitted), self.executor)
@@ -338,7 +339,8 @@ class Search:
         if self.exact or best <= 0:
             return math.inf
         # Where the noise is estimated anew with the best model, the others may come closer to it.
-        return self.base.chi2 - 2 * ((HOPELESS if self.noise.open else 1.0) * best - NEAR)
+        anew = self.noise.open or bool(self.noise.correlation.any())
+        return self.base.chi2 - 2 * ((HOPELESS if anew else 1.0) * best - NEAR)
 
     def _in_short_steps(self, found: Fitted, wanted: float = math.inf) -> Fitted:
         """A fit with time steps that are short enough for it: what a term brings may be faster than the base.

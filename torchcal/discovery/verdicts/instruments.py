@@ -85,7 +85,7 @@ def reads_otherwise(model: Model, larger: Model) -> str:
     names = [q.name for q in model.candidate.problem.parameters]
     for name in (names[i] for i in model.candidate.amplitudes):
         alone, beside_others = model.found.by_name[name], larger.found.by_name[name]
-        if abs(alone - beside_others) > OFF * sd[name]:
+        if sd[name] > 0 and abs(alone - beside_others) > OFF * sd[name]:
             others = " and ".join(other for other in larger.names if other not in model.names)
             return (
                 f"Alone {name} is {alone:.3g}, and beside {others}, which is likelier, {beside_others:.3g}: no error "

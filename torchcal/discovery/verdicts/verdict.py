@@ -199,7 +199,8 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         m.window is not None or (len(m.names) > 1 and not shared) or only_instruments(m) for m in decision.tied_models
     )
     likely = decision.none > min(1 - UNKNOWN, _second(decision, ranked))
-    if len(decision.tied) < 2 or likely or local or decision.pliant or decision.doubt:
+    fewest = [tied for tied in decision.tied if not any({*other} < {*tied} for other in decision.tied)]
+    if len(fewest) < 2 or likely or local or decision.pliant or decision.doubt:
         decision.tied.append(list(NONE))
     return decision
 
@@ -290,8 +291,9 @@ def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) 
     shown = best if alone else _wherever(search, best)
     decision.doubt = doubt(search, shown)
     if not alone:
-        likeliest = max(holding, key=lambda m: m.weight)
-        decision.doubt = decision.doubt or only_together(search, likeliest) or reads_otherwise(shown, likeliest)
+        decision.doubt = decision.doubt or only_together(search, max(holding, key=lambda m: m.weight))
+        more = [m for m in holding if len(m.names) > len(best.names)]
+        decision.doubt = decision.doubt or reads_otherwise(shown, max(more, key=lambda m: m.weight))
         _tie_larger(search, decision, holding, sure)
     if sure < SURE or decision.doubt or not shown.physical:
         decision.verdict = "ambiguous"
