@@ -376,7 +376,7 @@ def test_windows_are_refitted_together_and_are_the_same_from_workers(monkeypatch
     assert max(sizes) > 1
 
 
-def test_no_long_refit_is_gone_on_with_after_ctrl_c(monkeypatch):
+def test_no_long_refit_is_gone_on_with_after_ctrl_c(monkeypatch, terminal):
     stages = []
 
     def refits(jobs, take, executor):
