@@ -232,10 +232,10 @@ def fit(
     for the step. Parameters with ``transform="log"`` are stepped in their logarithm. With ``data`` (H, n) every start
     is fitted to data of its own, and ``ends_chi2`` tells how well. A start ends where it has converged, or creeps.
     Where the best has done neither after ``max_steps`` it goes on alone for at most ``finish`` more. A start that falls
-    so slowly that its χ² will be above ``aim`` in the end, with ``later`` steps of `finished` too, has no
-    need to get there, and ends too. With ``bend``, as in
-    those last steps, every step follows the valley's curvature (geodesic acceleration; Transtrum & Sethna 2012,
-    arXiv:1201.5885), which costs a look ahead and makes bent valleys several times shorter.
+    so slowly that its χ² will be above ``aim`` in the end, with ``later`` steps of `finished` too, has no need to get
+    there, and ends too. With ``bend``, as in those last steps, every step follows the valley's curvature (geodesic
+    acceleration; Transtrum & Sethna 2012, arXiv:1201.5885), which costs a look ahead and makes bent valleys several
+    times shorter.
     """
     low, high = problem.limits()
     low, high = low[free], high[free]
