@@ -55,13 +55,15 @@ def test_the_evidence_of_a_sudden_change_is_the_ratio_of_two_normal_densities():
     white = np.linalg.inv(np.linalg.cholesky(0.01 * toeplitz(rho ** np.arange(60))))
     q = np.linalg.qr(white @ np.stack([np.ones(60), X], axis=1), mode="complete")[0][:, 2:]
     e, each = q.T @ white @ found.residual.numpy(), []
-    for function in sudden.functions.T.numpy():
+    kinds = functions_of(sudden)
+    for function, kind in ((function, kind) for kind in kinds for function in kind.T.numpy()):
         h = q.T @ white @ function
         h = h / np.linalg.norm(h)
         for size in SIZES.tolist():
             larger = np.eye(58) + size**2 * np.outer(h, h)
-            each.append(-0.5 * np.linalg.slogdet(larger)[1] - 0.5 * e @ np.linalg.solve(larger, e) + 0.5 * e @ e)
-    assert evidence == pytest.approx(np.logaddexp.reduce(each) - math.log(len(each)), abs=1e-6)
+            log = -0.5 * np.linalg.slogdet(larger)[1] - 0.5 * e @ np.linalg.solve(larger, e) + 0.5 * e @ e
+            each.append(log - math.log(len(kinds) * kind.shape[1] * len(SIZES)))
+    assert evidence == pytest.approx(np.logaddexp.reduce(each), abs=1e-6)
     assert int((step != 0).sum()) == 24
     assert float(step.max()) == pytest.approx(0.3, abs=0.1)
 
@@ -71,7 +73,7 @@ def test_what_was_taken_out_counts_for_itself_and_for_no_other():
     found, noise = calibrated(stepped(0, size=0.3), noise=0.1)
     sudden, residual = only(found), Residual(found, noise, draws=0)
     evidence, number, _ = sudden.evidence(residual)
-    each = [sudden.evidence_of(residual, k) for k in range(sudden.functions.shape[1])]
+    each = [sudden.evidence_of(residual, k) for k in range(sum(kind.shape[1] for kind in functions_of(sudden)))]
     assert np.logaddexp.reduce(each) == pytest.approx(evidence, abs=1e-9)
     assert int(np.argmax(each)) == number
     lines = Lines.of(found.problem, next(c for c in channels(found.problem, found) if c.kind == "output"), "x", 12)
@@ -84,6 +86,19 @@ def test_what_was_taken_out_counts_for_itself_and_for_no_other():
     assert rough.evidence(Residual(*wave, draws=0)) > 10
     left = dataclasses.replace(wave[0], y=wave[0].y + rough.curve)
     assert rough.evidence(Residual(left, wave[1], draws=0)) < 0
+
+
+def test_what_acted_for_a_while_is_no_noise_with_a_memory():
+    """Seven readings of seventy that are off by eight noise sd: neither one step nor a bump with soft ends is that, and
+    correlated noise would come nearer."""
+    x = np.linspace(0, 10, 70)
+    off = 0.8 * ((x > 4) & (x < 5))
+    found, noise = calibrated(stepped(3, size=0.0, x=x) + off, x)
+    tangents = Tangents.of(found, noise)
+    fresh, evidence = with_unknown(found, None, tangents, noise.unit)
+    assert evidence > settled(found, noise, tangents)[1] + 10
+    assert float(fresh.correlation[0]) == 0
+    assert float(fresh.sd.median()) == pytest.approx(0.1, rel=0.3)
 
 
 def test_noise_alone_has_no_more_evidence_than_it_should():
@@ -99,28 +114,35 @@ def test_noise_alone_has_no_more_evidence_than_it_should():
     assert np.median(ratio) > 0.05
 
 
-def split(functions):
-    """How many steps and bumps there are."""
-    steps = ((functions == 0) | (functions == 1)).all(0)
-    return int(steps.sum()), int((~steps).sum())
+def functions_of(sudden):
+    """Steps, bumps and changes between two steps."""
+    first, last = sudden.between
+    return sudden.steps, sudden.bumps, sudden.steps[:, first] - sudden.steps[:, last]
+
+
+def counts(sudden):
+    return sudden.steps.shape[1], sudden.bumps.shape[1]
 
 
 def test_sudden_changes_are_of_one_output_in_one_run_between_different_conditions():
     found, _ = calibrated(stepped(2), noise=0.1)
-    functions = only(found).functions
-    assert split(functions) == (51, 72)
-    assert int((functions != 0).sum(0).min()) >= LEAST
-    bumps = functions[:, 51:]
+    sudden = only(found)
+    assert counts(sudden) == (51, 72)
+    for functions in functions_of(sudden):
+        assert int((functions != 0).sum(0).min()) >= LEAST
+    first, last = sudden.between.numpy()
+    assert len(first) == (51 - LEAST) * (51 - LEAST + 1) / 2  # all pairs that are five data apart at least
+    bumps = sudden.bumps
     widths = sorted({round(float(w), 2) for w in bumps.sum(0) / math.sqrt(2 * math.pi) * X[1]}, reverse=True)
     assert widths[0] == pytest.approx(8 * 1.5 * X[1] / 2, rel=0.05)  # of whole bumps: 1.5, 3 and 6 gaps
     x = X.copy()
     x[20:24] = x[20]  # replicates are on one side
     found, _ = calibrated(stepped(2, x=x), x, noise=0.1)
-    assert split(only(found).functions)[0] == 51 - 3
+    assert counts(only(found))[0] == 51 - 3
     long = np.linspace(0, 10, 1000)
     found, _ = calibrated(stepped(2, x=long), long, noise=0.1)
-    assert split(only(found).functions)[0] == MOST
-    assert split(only(found).functions)[1] < 1.5 * MOST
+    assert counts(only(found))[0] == MOST
+    assert counts(only(found))[1] < 1.5 * MOST
     few, _ = calibrated(stepped(2)[:9], X[:9], noise=0.1)
     assert sudden_changes(few.problem, channels(few.problem, few)) == []
     two = tc.ODESimulator(
@@ -132,14 +154,14 @@ def test_sudden_changes_are_of_one_output_in_one_run_between_different_condition
                    initial={"T": size, "S": 1.0}) for size in (5.0, 3.0)]  # fmt: skip
     found, _ = calibrate_base(Problem.of(two, tc.Recording(runs=runs, noise=0.1)), {}, 2, 0)
     each = sudden_changes(found.problem, channels(found.problem, found))
-    assert [split(one.functions)[0] for one in each] == [22, 22]
+    assert [counts(one)[0] for one in each] == [22, 22]
     for k, sudden in enumerate(each):
         output, run = found.problem.output_of, found.problem.recording.x["run"][found.problem.condition_of]
-        for column in sudden.functions.T:
+        for column in torch.cat(functions_of(sudden), dim=1).T:
             assert set(output[column != 0].tolist()) == {k}
             assert len(run[column != 0].unique()) == 1
     many, _ = calibrated(stepped(2), np.repeat([1.0, 2.0], 30), noise=0.1)
-    assert split(only(many).functions) == (1, 0)  # between the two
+    assert counts(only(many)) == (1, 0)  # between the two
     same, _ = calibrated(stepped(2), np.repeat([1.0], 60), noise=0.1)
     assert sudden_changes(same.problem, channels(same.problem, same)) == []
     x = {"x": torch.as_tensor(X), "z": torch.as_tensor(np.random.default_rng(0).uniform(0, 1, 60))}

@@ -5,6 +5,7 @@ and what is left beyond smooth curves is hardly larger for it.
 """
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -46,13 +47,17 @@ def _shrink() -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Sudden:
-    """Steps and bumps of one output, each in one of its runs, at any of some places.
+    """Steps of one output, changes between two of them, and bumps, each in one of its runs, at any of some places.
 
     Attributes:
-        functions: 0 before a step, 1 from there on to the end of its run; normal curves; ``(n, K)``.
+        steps: 0 before a step, 1 from there on to the end of its run, ``(n, S)``.
+        bumps: Normal curves, ``(n, B)``.
+        between: Places of two steps of a run with enough data in between, ``(2, P)``.
     """
 
-    functions: Tensor
+    steps: Tensor
+    bumps: Tensor
+    between: Tensor
 
     @classmethod
     def of(cls, problem: Problem, channel: Channel) -> "Sudden | None":
@@ -61,53 +66,87 @@ class Sudden:
             return None
         number, along = problem.recording.outputs.index(channel.target), problem.order[problem.condition_of]
         own = [p for p in problem.sequences if int(problem.output_of[p[0]]) == number and len(p) >= 2 * LEAST]
-        found = [torch.zeros(problem.n, 0, dtype=torch.float64)]
         most = max(MOST // max(len(own) * len(problem.recording.outputs), 1), 1)
+        steps, bumps, between, before = [], [], [torch.zeros(2, 0, dtype=torch.long)], 0
         for places in own:
-            each = torch.cat([_steps(along[places], most), _bumps(along[places], most)], dim=1)
-            found.append(torch.zeros(problem.n, each.shape[1], dtype=torch.float64).index_copy_(0, places, each))
-        functions = torch.cat(found, dim=1)
-        return cls(functions) if functions.shape[1] else None
+            at = _steps(along[places], most)
+            steps.append(_over_run(problem, places, (torch.arange(len(places))[:, None] >= at).double()))
+            bumps.append(_over_run(problem, places, _bumps(along[places], most)))
+            pairs = torch.combinations(torch.arange(len(at))).T
+            between.append(pairs[:, at[pairs[1]] - at[pairs[0]] >= LEAST] + before)
+            before += len(at)
+        found = cls(torch.cat(steps, 1), torch.cat(bumps, 1), torch.cat(between, 1)) if own else None
+        return found if found is not None and found.steps.shape[1] + found.bumps.shape[1] else None
 
     def evidence(self, residual: Residual) -> tuple[float, int, Tensor]:
-        """Log evidence of one of them against none, with all and all `SIZES` as likely.
+        """Log evidence of one of them against none, with every kind, all of a kind and all `SIZES` as likely.
 
         The size is that of its whitened effect beyond what the base's parameters make up for. Also returns the number
         of the likeliest, and that one ``(n,)``.
         """
-        along, norm = self._along(residual, self.functions)
-        logs = _logs(along)
+        along, norm = self._along(residual)
+        logs = _logs(along) + self._prior
         size, number = divmod(int(logs.argmax()), logs.shape[1])
         height = float(_shrink()[size] * along[number] / norm[number])
-        return float(logs.logsumexp((0, 1))) - math.log(logs.numel()), number, height * self.functions[:, number]
+        return float(logs.logsumexp((0, 1))), number, height * self._function(number)
 
     def evidence_of(self, residual: Residual, number: int) -> float:
         """Log evidence of one of them, out of all that are as likely."""
-        logs = _logs(self._along(residual, self.functions[:, number : number + 1])[0])
-        return float(logs.logsumexp((0, 1))) - math.log(len(SIZES) * self.functions.shape[1])
+        columns, norm = _beyond_tangents(residual, self._function(number)[:, None])
+        return float(_logs(columns.T @ residual.e / norm).logsumexp((0, 1))) + float(self._prior[number])
 
-    @staticmethod
-    def _along(residual: Residual, functions: Tensor) -> tuple[Tensor, Tensor]:
-        """The residual along effects of functions ``(n, K)``, of unit norm, 0 where none is seen; and their norms."""
-        whitened = residual.found.whitening(functions)
-        columns = residual.project(whitened)
-        norm = columns.norm(dim=0)
-        seen = norm > SEEN * whitened.norm(dim=0)
-        norm = norm.where(seen, torch.inf)
-        return columns.T @ residual.e / norm, norm
+    @functools.cached_property
+    def _prior(self) -> Tensor:
+        """Log prior of one of them and of one of `SIZES`, ``(S + B + P,)``."""
+        counts = torch.tensor([kind.shape[1] for kind in (self.steps, self.bumps, self.between)])
+        each = -(counts.double() * (counts > 0).sum() * len(SIZES)).log()
+        return each.repeat_interleave(counts)
+
+    def _function(self, number: int) -> Tensor:
+        """One of them, ``(n,)``."""
+        alone = self.steps.shape[1] + self.bumps.shape[1]
+        if number < alone:
+            return torch.cat([self.steps, self.bumps], dim=1)[:, number]
+        first, last = self.between[:, number - alone]
+        return self.steps[:, first] - self.steps[:, last]
+
+    def _along(self, residual: Residual) -> tuple[Tensor, Tensor]:
+        """The residual along their effects, of unit norm, 0 where none is seen; and their norms."""
+        (first, last), count = self.between, self.steps.shape[1]
+        columns, norm = _beyond_tangents(residual, torch.cat([self.steps, self.bumps], dim=1))
+        along = columns.T @ residual.e
+        inner = columns[:, :count].T @ columns[:, :count]
+        own = inner.diagonal()
+        square = own[first] + own[last] - 2 * inner[first, last]
+        seen = square > SEEN * (own[first] + own[last])
+        apart = square.where(seen, torch.inf).sqrt()
+        return torch.cat([along / norm, (along[first] - along[last]) / apart]), torch.cat([norm, apart])
+
+
+def _beyond_tangents(residual: Residual, functions: Tensor) -> tuple[Tensor, Tensor]:
+    """Whitened effects ``(n, K)`` beyond what the base's parameters make up for, and their norms, infinite where none
+    is seen."""
+    whitened = residual.found.whitening(functions)
+    columns = residual.project(whitened)
+    norm = columns.norm(dim=0)
+    return columns, norm.where(norm > SEEN * whitened.norm(dim=0), torch.inf)
+
+
+def _over_run(problem: Problem, places: Tensor, functions: Tensor) -> Tensor:
+    """Functions of a run ``(m, K)``, 0 elsewhere, ``(n, K)``."""
+    return torch.zeros(problem.n, functions.shape[1], dtype=torch.float64).index_copy_(0, places, functions)
 
 
 def sudden_changes(problem: Problem, available: Sequence[Channel]) -> list[Sudden]:
-    """Steps and bumps of all outputs."""
+    """Steps, changes between two, and bumps of all outputs."""
     found = (Sudden.of(problem, channel) for channel in available if channel.kind == "output")
     return [sudden for sudden in found if sudden is not None]
 
 
 def _steps(along: Tensor, most: int) -> Tensor:
-    """Steps between values ``(m,)`` that rise, with enough of them on either side, ``(m, K)``."""
+    """Where steps are between values ``(m,)`` that rise, with enough of them on either side, ``(K,)``."""
     number = torch.arange(LEAST, len(along) - LEAST + 1)
-    number = number[along[number] > along[number - 1]]
-    return (torch.arange(len(along))[:, None] >= _evenly(number, most)).double()
+    return _evenly(number[along[number] > along[number - 1]], most)
 
 
 def _bumps(along: Tensor, most: int) -> Tensor:
