@@ -17,6 +17,7 @@ import torch
 import torchcal as tc
 from torchcal.discovery.fits.refits import Refit
 from torchcal.discovery.fits.stop import Stop
+from torchcal.discovery.hypotheses import refitting
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.errors import DomainError, InterruptionWarning
 from torchcal.simulators import Trajectories
@@ -359,13 +360,13 @@ def test_windows_are_refitted_together_and_are_the_same_from_workers(monkeypatch
         for k in (2, 3)
     ]  # fmt: skip
     data = tc.Recording(x={"x": x}, y=y, noise=0.02)
-    refit, sizes = Search.refit_together, []
+    sizes = []
 
     def spy(search, wanted):
         sizes.append(len([one for one in wanted if one.window is not None]))
-        return refit(search, wanted)
+        return refitting.refit_together(search, wanted)
 
-    monkeypatch.setattr(Search, "refit_together", spy)
+    monkeypatch.setattr("torchcal.discovery.windows.refit_together", spy)
     with ThreadPoolExecutor(2) as pool:
         here, there = (
             tc.diagnose(base, data, terms, seed=0, progress=False, num_starts=4, executor=one) for one in (None, pool)
@@ -387,7 +388,7 @@ def test_no_long_refit_is_gone_on_with_after_ctrl_c(monkeypatch, terminal):
         for number in range(1, len(jobs)):
             take(number, SimpleNamespace(leads_to=lambda aim: True))
 
-    monkeypatch.setattr("torchcal.discovery.hypotheses.search.refit_all", refits)
+    monkeypatch.setattr("torchcal.discovery.hypotheses.refitting.refit_all", refits)
     problem = SimpleNamespace(guess=lambda warm, begin: None)
     candidate = SimpleNamespace(problem=problem, own=[], amplitudes=[], free=[], terms=[SimpleNamespace(name="a")])
     wanted = [SimpleNamespace(candidate=candidate, begin=None) for _ in range(3)]
@@ -395,10 +396,10 @@ def test_no_long_refit_is_gone_on_with_after_ctrl_c(monkeypatch, terminal):
         stages.clear()
         search = SimpleNamespace(
             stop=Stop(), models=[], executor=None, tick=lambda text: None, base=SimpleNamespace(warm=None),
-            noise=SimpleNamespace(whitening=lambda problem: None), _aim=lambda models: math.inf,
-            _model=lambda one, fitted: None,
+            noise=SimpleNamespace(whitening=lambda problem: None), aim=lambda models: math.inf,
+            model=lambda one, fitted: None,
         )  # fmt: skip
         with search.stop.listening():
-            found = Search._fits(search, wanted)
+            found = refitting._fits(search, wanted)
         assert stages == ([[False] * 3] if pressed else [[False] * 3, [True] * 3])
         assert [one is not None for one in found] == ([True, False, False] if pressed else [True] * 3)

@@ -15,7 +15,7 @@ from torchcal.discovery.fits.candidates import prepare
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.ranges import drivers_scale
 from torchcal.discovery.fits.sharpen import accurate, sharpen
-from torchcal.discovery.hypotheses import search as search_module
+from torchcal.discovery.hypotheses import refitting
 from torchcal.discovery.hypotheses.base import calibrate_base
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.verdicts.decision import Decision
@@ -196,7 +196,7 @@ def test_a_refit_that_goes_astray_begins_at_the_base(monkeypatch: pytest.MonkeyP
     wobble = 0.02 * torch.randn(20, generator=torch.Generator().manual_seed(1), dtype=F64)
     base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
     bend = tc.Term("bend", outputs={"y": lambda x, p, y: y + p["q"] * x**2}, parameters=[tc.Parameter("q")])
-    fits = search_module.refit_all
+    fits = refitting.refit_all
     seen = []
 
     def astray(jobs, on_result, executor=None):
@@ -207,7 +207,7 @@ def test_a_refit_that_goes_astray_begins_at_the_base(monkeypatch: pytest.MonkeyP
 
         fits(jobs, take, executor)
 
-    monkeypatch.setattr(search_module, "refit_all", astray)
+    monkeypatch.setattr(refitting, "refit_all", astray)
     d = tc.diagnose(base, tc.Recording(x=x, y=1 + x + wobble, noise=0.02), [bend], progress=False)
     (first,), (second,) = seen[:2]
     assert float(second[0, -1]) == 0.0  # neutral

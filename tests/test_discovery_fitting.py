@@ -11,7 +11,7 @@ from torch.autograd import forward_ad
 import torchcal as tc
 from torchcal.discovery.fits.fitting import FINISH, finished, fit, refit, starts
 from torchcal.discovery.fits.problem import Problem
-from torchcal.discovery.hypotheses import search
+from torchcal.discovery.hypotheses import refitting
 from torchcal.discovery.hypotheses.base import calibrate_base
 from torchcal.discovery.misfit.noise import GRID, Noise
 from torchcal.discovery.misfit.residual import Residual, _noise_draws
@@ -543,9 +543,9 @@ def test_what_shorter_steps_cannot_bring_to_the_best_is_not_refitted_with_them(m
     whitening = white(problem, 1.0)
     coarse = SimpleNamespace(chi2=360.0, y=problem.y, problem=problem, whitening=whitening)
     searched = SimpleNamespace(exact=False, noise=SimpleNamespace(sd=torch.ones(40, dtype=F64)))
-    monkeypatch.setattr(search, "accurate", lambda found, sd: False)
-    monkeypatch.setattr(search, "halved", lambda found: found.y + error)
-    monkeypatch.setattr(search, "sharpen", lambda *given, **options: ("finer", 0.0))
-    found = search.Search._in_short_steps(searched, coarse, 40.0)
+    monkeypatch.setattr(refitting, "accurate", lambda found, sd: False)
+    monkeypatch.setattr(refitting, "halved", lambda found: found.y + error)
+    monkeypatch.setattr(refitting, "sharpen", lambda *given, **options: ("finer", 0.0))
+    found = refitting._in_short_steps(searched, coarse, 40.0)
     assert (found == "finer") is looked
-    assert search.Search._in_short_steps(searched, coarse) == "finer"
+    assert refitting._in_short_steps(searched, coarse) == "finer"

@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 
 import torchcal as tc
 from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.hypotheses.aliases import merge
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.rounds import settle
 from torchcal.discovery.several import _one_fewer, _refit_sets, _swapped, refit_several
@@ -64,8 +65,8 @@ def test_candidates_that_are_one_stay_so_where_only_the_first_is_refitted():
     stuck = {i: dataclasses.replace(m, found=dataclasses.replace(m.found, chi2=m.found.chi2 + 200))
              for i, m in search.merged.items()}  # fmt: skip
     search.merged = stuck
-    search.merge()
-    search.merge()
+    merge(search)
+    merge(search)
     assert search.aliases == {0: [1]}
     assert search.merged == stuck
 
@@ -76,7 +77,7 @@ def test_everything_is_weighed_by_the_noise_that_is_found_later(monkeypatch):
     louder = dataclasses.replace(search.noise, sd=1.2 * search.noise.sd)
     monkeypatch.setattr("torchcal.discovery.hypotheses.search.suited", lambda *given: louder)
     search.reweigh()
-    search.merge()
+    merge(search)
     assert search.aliases == {0: [1]}
     assert abs(search.merged[1].found.chi2 - search.plain[0].found.chi2) < 0.1
     same = [before[key] / w.z for w in search.local if (key := (w.candidate, w.driver, w.low, w.high)) in before]

@@ -44,7 +44,9 @@ def finding(verdict="named", **more):
         "missing": None, "detection_limit": [], "p_detect": 0.5, "confidence": 0.99, "drivers": {"t": T},
         "before": SimpleNamespace(fitted=score, held_out=None, model_error_sd=None),
         "noise": SimpleNamespace(source="given", correlation={}),
-        "recording": SimpleNamespace(runs=[None] * 4, outputs=("y",), split=lambda values: {"y": values}),
+        "recording": SimpleNamespace(
+            runs=[SimpleNamespace(units={})] * 4, outputs=("y",), units={}, split=lambda values: {"y": values}),
+        "simulator": SimpleNamespace(states={"T": "K", "n": None}),
         "base": SimpleNamespace(prediction=2 * T), **more,
     })  # fmt: skip
 
@@ -224,6 +226,9 @@ def test_a_term_in_a_window_is_told_by_its_name_and_steps_by_where_they_are():
     term = where_in_words(finding(where=[Location("parameter", "k", "t", PART, 0.5, 20.0, terms=("drag",))]))
     assert "varies with t (largest at 2 to 5): adding drag there removes 50 % of" in term
     step = Location("output", "y", "t", PART, 0.5, 20.0, edges=(2.0,))
+    timed = finding(where=[step])
+    timed.recording.units = {"time": "min"}
+    assert "jumps with t (at 2 min): one constant change on one side removes" in where_in_words(timed)
     assert "jumps with t (at 2): one constant change on one side removes" in where_in_words(finding(where=[step]))
     steps = Location("output", "y", "t", PART, 0.5, 20.0, extent=10.0, edges=(2.0, 5.0))
     assert "jumps with t (at 2 and 5): one constant change in between removes" in where_in_words(finding(where=[steps]))

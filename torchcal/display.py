@@ -3,9 +3,11 @@
 import math
 from collections.abc import Sequence
 from importlib import metadata
+from typing import Any
 
 __all__ = [
-    "DECADES", "FAR", "NONE", "PATIENCE", "between", "percent", "placed", "raised", "up_to", "version", "with_unit"
+    "DECADES", "FAR", "NONE", "PATIENCE", "between", "percent", "placed", "raised", "units_of", "up_to",
+    "version", "with_unit",
 ]  # fmt: skip
 
 NONE = ("none of these",)
@@ -44,6 +46,16 @@ def with_unit(amount: str, unit: str | None) -> str:
     ('3.2 m/s', '0.06', '0.06')
     """
     return amount if unit in (None, "", "1") else f"{amount} {unit}"
+
+
+def units_of(recording: Any, simulator: Any) -> dict[str, str]:
+    """Units of outputs, states, conditions, inputs and time, by name, of those that have any; ``"t"`` is time."""
+    states: dict[str, str | None] = getattr(simulator, "states", {})
+    units = {name: unit for name, unit in states.items() if isinstance(unit, str)}
+    for run in recording.runs or ():
+        units |= run.units
+    units |= recording.units
+    return ({"t": units["time"]} if "time" in units and recording.runs else {}) | units
 
 
 def percent(share: float | None) -> str:

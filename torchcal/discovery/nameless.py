@@ -22,8 +22,9 @@ from torchcal.discovery.fits.local import is_window
 from torchcal.discovery.fits.readings import threshold_of
 from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.hypotheses.own_noise import likeliest_alone
+from torchcal.discovery.hypotheses.refitting import BETTER, refit_together
 from torchcal.discovery.hypotheses.screen import Window, windows_of
-from torchcal.discovery.hypotheses.search import BETTER, Search
+from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.channels import channels
 from torchcal.discovery.verdicts.verdict import PLAINLY_WHITE
 from torchcal.discovery.windows import long_enough, stepped
@@ -283,7 +284,7 @@ def _refitted(search: Search, wanted: Sequence[Hypothetical]) -> list[Model | No
 def _where_possible(search: Search, wanted: Sequence[Hypothetical]) -> list[Model | None]:
     """Refits: none of the user's terms, they may take a simulator where it raises."""
     try:
-        return search.refit_together(wanted)
+        return refit_together(search, wanted)
     except SimulatorError:
         return [None] if len(wanted) == 1 else [m for one in wanted for m in _where_possible(search, [one])]
 

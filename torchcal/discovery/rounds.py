@@ -23,6 +23,7 @@ from torchcal.discovery.hypotheses.own_noise import (
     outliers_alone,
     pairs_by_chance,
 )
+from torchcal.discovery.hypotheses.refitting import take_over
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.hypotheses.singles import refit_singles
 from torchcal.discovery.misfit.likeliest import log_normal
@@ -86,7 +87,7 @@ def _may_be_alone(fewer: Search, search: Search, confidence: float) -> bool:
     known = dataclasses.replace(fewer)
     known.base, known.noise, known.tangents, known.models = fewer.base, fewer.noise, fewer.tangents, []
     known.screen_all()
-    known.take_over(search.models)
+    take_over(known, search.models)
     return search.stop.is_set() or outliers_alone(known, search, known.p_detect < 1.0 - confidence, short=SHORT)
 
 
@@ -176,7 +177,7 @@ def without_others(search: Search, observed: Problem) -> Search:
         return search
     other = _of(search, observed.keeping(~sticking))
     other.screen_all()
-    other.take_over(search.models)
+    take_over(other, search.models)
     return other if not search.stop.is_set() and other.physical_leader is not None else search
 
 

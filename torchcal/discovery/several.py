@@ -11,10 +11,12 @@ from torch import Tensor
 from torchcal.discovery.fits.candidates import Candidate, prepare, replaces
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.ranges import drivers_scale
+from torchcal.discovery.hypotheses.aliases import merge
 from torchcal.discovery.hypotheses.beginnings import BENT, blind_rows, is_far, make_up
 from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
+from torchcal.discovery.hypotheses.refitting import BETTER, improve, refit_together
 from torchcal.discovery.hypotheses.screen import screen
-from torchcal.discovery.hypotheses.search import BETTER, Search
+from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.verdicts.explain import removed
 from torchcal.discovery.verdicts.instruments import which_instruments
@@ -150,7 +152,7 @@ def _either_way(search: Search, pairs: list[Model]) -> list[Model]:
             wanted.append((pair, dataclasses.replace(one, begin=torch.cat([one.begin, row]))))
     better = {
         id(pair): other
-        for (pair, _), other in zip(wanted, search.refit_together([one for _, one in wanted]), strict=True)
+        for (pair, _), other in zip(wanted, refit_together(search, [one for _, one in wanted]), strict=True)
         if other is not None and other.physical >= pair.physical and other.weight > pair.weight + BETTER
     }
     search.models = [better.get(id(m), m) for m in search.models]
@@ -189,7 +191,7 @@ def _one_fewer(search: Search, three: Model, prior: float) -> None:
             for k in pair.candidate.free:  # what the third term frees stays neutral here
                 row[k] = known[names[k]]
             wanted.append(dataclasses.replace(pair, begin=row[None]))
-    for model in search.refit_together(wanted):
+    for model in refit_together(search, wanted):
         if model is not None:
             old = [m for m in search.models if m.numbers == model.numbers and m.window is None]
             if all(model.weight > m.weight + BETTER for m in old):
@@ -208,8 +210,8 @@ def _alone_again(search: Search, pair: Model) -> None:
         for k in candidate.free:  # what the other term frees stays neutral here
             row[k] = known[names[k]]
         wanted.append(Hypothetical((i,), candidate, row[None], search.prior))
-    search.improve(wanted)
-    search.merge()
+    improve(search, wanted)
+    merge(search)
 
 
 def _enough(search: Search) -> bool:
@@ -330,7 +332,7 @@ def _refit_sets(
 
 
 def _refitted(search: Search, wanted: Sequence[Hypothetical | None]) -> list[Model]:
-    found = search.refit_together([one for one in wanted if one is not None])
+    found = refit_together(search, [one for one in wanted if one is not None])
     return [model for model in found if model is not None]
 
 

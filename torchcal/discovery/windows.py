@@ -10,7 +10,9 @@ from torch import Tensor
 
 from torchcal.discovery.fits.candidates import prepare
 from torchcal.discovery.fits.local import EDGE, ENDS, SHORT, WIDTH_OF_EDGE, WIDTHS, Span, beyond, is_window, localised
+from torchcal.discovery.hypotheses.aliases import duplicate
 from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
+from torchcal.discovery.hypotheses.refitting import refit_together
 from torchcal.discovery.hypotheses.screen import Window, windows_of
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.channels import responses
@@ -61,7 +63,7 @@ def refit_local(search: Search) -> None:
         return
     gains = {model.numbers[0]: 2 * model.log_evidence + math.log(search.problem.n) for model in search.models}
     highest = 2 * max((model.log_evidence for model in search.models if model.physical), default=0.0)
-    same = {i for i in search.gone if search.duplicate(search.twins[i], i)}
+    same = {i for i in search.gone if duplicate(search, search.twins[i], i)}
     promising: dict[int, list[Window]] = {}
     for w in sorted(search.local, key=lambda w: -w.z):
         plain = max(gains.get(w.candidate, 0.0), search.screening.score(w.candidate) ** 2)
@@ -355,7 +357,7 @@ def _begun(
 
 def _refit(search: Search, wanted: Sequence[Hypothetical | None]) -> list[Model | None]:
     """Refit local terms, those that can be; no model where a window has closed."""
-    found = iter(search.refit_together([one for one in wanted if one is not None]))
+    found = iter(refit_together(search, [one for one in wanted if one is not None]))
     return [None if one is None else long_enough(next(found)) for one in wanted]
 
 

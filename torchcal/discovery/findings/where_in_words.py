@@ -4,8 +4,8 @@ import math
 from typing import Any
 
 from torchcal.discovery.fits.local import Span
-from torchcal.discovery.misfit.channels import RUN
-from torchcal.display import between, percent, up_to
+from torchcal.discovery.misfit.channels import ITSELF, RUN
+from torchcal.display import between, percent, units_of, up_to, with_unit
 
 __all__ = ["share_in_words", "where_in_words"]
 
@@ -27,7 +27,8 @@ def where_in_words(d: Any) -> str:
     if not d.where:
         return ""
     place = d.where[0]
-    spans = ", ".join(between(place.spans[:3], "to", place.extent))
+    unit = units_of(d.recording, d.simulator).get(place.driver.removesuffix(ITSELF))
+    spans = with_unit(", ".join(between(place.spans[:3], "to", place.extent)), unit)
     everywhere = _everywhere(d, place)
     if place.driver == RUN:
         if _alike(d, place):
@@ -47,7 +48,7 @@ def where_in_words(d: Any) -> str:
     if place.period is not None:
         return (
             f"The mismatch sits in the {place.kind} {place.target} and oscillates with {place.driver} (period "
-            f"{place.period:.3g}): a wave there {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
+            f"{with_unit(f'{place.period:.3g}', unit)}): a wave there {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
         )
     if place.terms:
         what = f"{' and '.join(place.terms)}{' together' if len(place.terms) > 1 else ''}"
@@ -60,7 +61,7 @@ def where_in_words(d: Any) -> str:
         if len(place.edges) > 1:
             low, high = place.edges
             side = "in between" if any(low < 0.5 * sum(span) < high for span in place.spans) else "outside of these"
-        at = " and ".join(between([(edge, edge) for edge in place.edges], "to", place.extent))
+        at = with_unit(" and ".join(between([(edge, edge) for edge in place.edges], "to", place.extent)), unit)
         return (
             f"The mismatch sits in the {place.kind} {place.target} and jumps with {place.driver} (at {at}): one "
             f"constant change {side} {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
@@ -104,7 +105,7 @@ def _everywhere(d: Any, place: Any) -> bool:
 def _span(d: Any, place: Any) -> Span | None:
     """The range of a place's driver; None where it is not known."""
     values = d.drivers.get(place.driver)
-    own = place.driver.removesuffix(" itself")
+    own = place.driver.removesuffix(ITSELF)
     if values is None and own in d.recording.outputs:
         values = d.recording.split(d.base.prediction)[own]
     if values is None or not bool(values.isfinite().all()):

@@ -21,12 +21,14 @@ from torchcal.discovery.misfit.channels import responses
 from torchcal.discovery.misfit.residual import Residual
 from torchcal.simulators import Trajectories
 
-__all__ = ["Screening", "Window", "contributions", "screen", "windows", "windows_of"]
+__all__ = ["Screening", "Window", "contributions", "screen", "twins", "windows", "windows_of"]
 
 #: A tangent whose projection keeps less than this share of it says nothing new.
 VANISHED = 1e-5
 #: Correlation from which on an effect is that of a parameter of the base that comes off its bound, up to this.
 SAME = 1e-9
+#: Correlation of projected tangents above which two candidates are one.
+ONE = 0.9999
 #: Places at which windows may begin or end, both ends of the driver among them.
 CUTS = 13
 
@@ -125,6 +127,18 @@ def _inward(residual: Residual, columns: Tensor, sides: Tensor) -> Tensor:
     moved = residual.tangent(found.jacobian[:, found.at_bound]) * away
     along = columns.T @ moved / (columns.norm(dim=0)[:, None] * moved.norm(dim=0)).clamp_min(1e-300)
     return (sides[:, None] * along > 1 - SAME).any(1)
+
+
+def twins(candidates: Sequence[Candidate], screening: Screening) -> dict[int, int]:
+    """Candidates that have the same projected tangent as an earlier one, and may have the same sign, and which."""
+    side = {i: c.one_sided(c.amplitudes[0]) for i, c in enumerate(candidates)
+            if len(c.shapes) == 1 and len(c.amplitudes) == 1}  # fmt: skip
+    found: dict[int, int] = {}
+    for i, k in itertools.permutations(side, 2):
+        alike = screening.correlation(i, k) * (side[i] * side[k] or 1)
+        if k < i and i not in found and k not in found and (alike > ONE or (alike < -ONE and not side[i] * side[k])):
+            found[i] = k
+    return found
 
 
 @dataclass(frozen=True)

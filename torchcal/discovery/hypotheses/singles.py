@@ -1,7 +1,9 @@
 """Single terms that act everywhere: those that the screening leaves a chance, refitted."""
 
+from torchcal.discovery.hypotheses.aliases import merge
 from torchcal.discovery.hypotheses.beginnings import BENT, beginnings, first_guess, is_far, learned
 from torchcal.discovery.hypotheses.model import Hypothetical
+from torchcal.discovery.hypotheses.refitting import improve, refit_together
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.errors import SimulatorError
 
@@ -28,14 +30,14 @@ def refit_singles(search: Search, *, detected: bool = True) -> None:
     chances = [*chosen, *search.blind]
     begin = (beginnings(search.residual, search.screening, i, search.candidates[i], guess) for i in chances)
     wanted = [Hypothetical((i,), search.candidates[i], rows, prior) for i, rows in zip(chances, begin, strict=True)]
-    found = search.refit_together(wanted)
+    found = refit_together(search, wanted)
     none = {one.numbers[0] for one, model in zip(wanted, found, strict=True) if model is None}
     search.left = none if search.stop.is_set() else set()
     search.failed = none - search.left
     search.models += [model for model in found if model is not None]
     search.reweigh()
     _learn(search)
-    search.merge()
+    merge(search)
 
 
 def _learn(search: Search) -> None:
@@ -57,5 +59,5 @@ def _learn(search: Search) -> None:
             continue
         if len(rows):
             wanted.append(Hypothetical((i,), search.candidates[i], rows, search.prior))
-    search.improve(wanted)
+    improve(search, wanted)
     search.reweigh()

@@ -15,13 +15,15 @@ from torchcal.discovery.fits.local import is_window
 from torchcal.discovery.fits.problem import Problem
 from torchcal.simulators import Trajectories
 
-__all__ = ["RUN", "Channel", "channels", "responses"]
+__all__ = ["ITSELF", "RUN", "Channel", "channels", "responses"]
 
 #: Moments that a trajectory is cut into, over all runs.
 BINS = 150
 
 #: The driver of what differs from run to run.
 RUN = "run"
+#: What the driver of an output that varies with its own value ends with, after the output's name.
+ITSELF = " itself"
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,8 +231,8 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
     time = _time(problem)
     for number, name in enumerate(problem.recording.outputs):
         mine = (problem.output_of == number).double()
-        own_drivers = {**at_data, f"{name} itself": found.y}
+        own_drivers = {**at_data, f"{name}{ITSELF}": found.y}
         if name in at_data or (not problem.in_time and problem.order is not None):  # it is seen along another
-            own_drivers.pop(f"{name} itself")
+            own_drivers.pop(f"{name}{ITSELF}")
         list_.append(Channel("output", name, problem.recording.units.get(name), own_drivers, time, mine))
     return [c for c in list_ if math.isfinite(float(c.matrix.abs().sum()))]

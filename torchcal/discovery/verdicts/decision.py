@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 
+from torchcal.discovery.hypotheses.aliases import duplicate
 from torchcal.discovery.hypotheses.model import PRIOR, Model
 from torchcal.discovery.hypotheses.search import Search
 
@@ -96,7 +97,7 @@ def other_names(search: Search, model: Model) -> list[tuple[int, str, str]]:
     for i in model.numbers:
         own = search.candidates[i].name
         for j in search.aliases.get(i, []):
-            if model.window is None or search.duplicate(i, j):
+            if model.window is None or duplicate(search, i, j):
                 found.append((j, search.candidates[j].name, own))
     return found
 

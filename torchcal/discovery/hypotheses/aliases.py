@@ -1,0 +1,42 @@
+"""Candidates that no data of this kind tell apart: one hypothesis, under the first name."""
+
+from torchcal.discovery.hypotheses.model import Model
+from torchcal.discovery.hypotheses.search import Search
+
+__all__ = ["duplicate", "merge"]
+
+
+def merge(search: Search) -> None:
+    """Candidates whose tangents and refits cannot be told apart become one hypothesis, under the first name."""
+    plain, before = search.plain, search.merged
+    search.aliases, search.merged = {}, {}
+    for i, k in search.twins.items():
+        a, b = plain.get(i), plain.get(k)
+        own = a or before.get(i)  # once merged it is refitted no more, so that its fit says nothing against it
+        if i in search.failed or (own is not None and b is None) or (own is None and not _follows(search, i, k, b)):
+            continue
+        if a is not None and b is not None and (a.physical != b.physical or abs(a.found.chi2 - b.found.chi2) > 0.5):
+            continue
+        search.aliases.setdefault(k, []).append(i)
+        search.merged |= {i: own} if own is not None else {}
+    search.gone = {i for alike in search.aliases.values() for i in alike}
+    search.models = [m for m in search.models if not search.gone & set(m.numbers)]
+
+
+def _follows(search: Search, i: int, k: int, model: Model | None) -> bool:
+    """Whether a candidate that was not refitted may have the sign with which it does what another one's model does.
+    """
+    own, other = search.candidates[i], search.candidates[k]
+    side = own.one_sided(own.amplitudes[0])
+    if model is None or not side:
+        return True
+    place = other.amplitudes[0]
+    size = float(model.found.values[place]) - float(other.neutral[other.own.index(place)])
+    return side * search.screening.correlation(i, k) * size >= 0
+
+
+def duplicate(search: Search, i: int, j: int) -> bool:
+    """Whether two candidates do the same whatever is calibrated beside them, to first order."""
+    u, v = (search.candidates[k].tangents[0, :, 0] for k in (i, j))
+    size = float(u.norm() * v.norm())
+    return size > 0 and float((u @ v).abs()) >= (1 - 1e-9) * size
