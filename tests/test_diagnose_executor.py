@@ -394,12 +394,14 @@ def test_no_long_refit_is_gone_on_with_after_ctrl_c(monkeypatch, terminal):
     wanted = [SimpleNamespace(candidate=candidate, begin=None) for _ in range(3)]
     for pressed in (False, True):
         stages.clear()
+        ticks: list[str] = []
         search = SimpleNamespace(
-            stop=Stop(), models=[], executor=None, tick=lambda text: None, base=SimpleNamespace(warm=None),
+            stop=Stop(), models=[], executor=None, tick=ticks.append, base=SimpleNamespace(warm=None),
             noise=SimpleNamespace(whitening=lambda problem: None), aim=lambda models: math.inf,
             model=lambda one, fitted: None,
         )  # fmt: skip
         with search.stop.listening():
             found = refitting._fits(search, wanted)
         assert stages == ([[False] * 3] if pressed else [[False] * 3, [True] * 3])
+        assert len(ticks) == (1 if pressed else 6)  # a bar that stands still looks hung
         assert [one is not None for one in found] == ([True, False, False] if pressed else [True] * 3)

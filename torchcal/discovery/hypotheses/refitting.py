@@ -125,7 +125,7 @@ def _fits(search: Search, wanted: Sequence[Hypothetical]) -> list[Fitted | None]
     longer = [dataclasses.replace(jobs[k], begun=fitted, aim=aim) for k, fitted in slow.items()]
     if longer:
         with search.stop.refitting():
-            refit_all(longer, lambda index, fitted: found.__setitem__([*slow][index], fitted), search.executor)
+            refit_all(longer, lambda index, fitted: take([*slow][index], fitted), search.executor)
     return found
 
 
