@@ -324,7 +324,7 @@ def test_residuals_are_data_minus_model_against_the_driver():
     np.testing.assert_allclose(points.get_ydata(), d.recording.y - d.base.prediction)
     np.testing.assert_allclose(curve(ax, "accepted model").get_ydata(), d.recording.y - d.base.prediction - 1)
     shapes = {patch.get_label(): patch.get_extents().transformed(ax.transData.inverted()) for patch in ax.patches}
-    located = shapes["mismatch largest here (50 % of it goes with x)"]
+    located = shapes["needed change largest here (50 % of the misfit)"]
     assert (located.x0, located.x1) == (40, 60)
     assert shapes["±2 noise sd"].y1 == pytest.approx(0.6)
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [min]", "data − model, y [°C]")
@@ -519,6 +519,70 @@ def test_spans_are_cut_to_the_data():
     ax = plots.residual_map(d.recording, d.base, spans=[(-math.inf, 10.0), (500, 600), (100.0, math.inf)])
     located = [p.get_extents().transformed(ax.transData.inverted()) for p in ax.patches]
     np.testing.assert_allclose([(box.x0, box.x1) for box in located], [(0, 10), (100, 120)], atol=1e-9)
+
+
+def drawn(d, key):
+    """The axes of one figure of a diagnosis."""
+    (part,) = [part for part in discovery.figure_parts(d) if part.key == key]
+    figure = plt.figure(figsize=(part.width, part.height), layout="constrained")
+    part.place(figure)
+    figure.canvas.draw()
+    return figure.axes[0]
+
+
+@pytest.mark.parametrize(
+    ("place", "told"),
+    [
+        (Location("equation", "v", "v", ((2.0, 4.0),), 0.81, 9.0), "missing rate of dv/dt"),
+        (Location("output", "x", "t", ((0.0, 3.0),), 0.81, 9.0), "missing shift of x"),
+        (Location("parameter", "k", "x", ((0.0, 1.0),), 0.81, 9.0), "needed shift of k"),
+        (Location("equation", "v", "v", ((2.0, 4.0),), 0.81, 9.0, terms=("lag",)), "effect of lag"),
+    ],
+)
+def test_what_is_shaded_is_called_what_it_is(place, told):
+    """Residuals may be largest elsewhere: later, say."""
+    d = oscillator()
+    d.where = [place]
+    ax = drawn(d, "residuals")
+    assert f"{told} largest here (81 % of the misfit)" in labels(ax)
+    (part,) = [part for part in discovery.figure_parts(d) if part.key == "residuals"]
+    assert f"Shaded: where the {told} is largest." in part.caption
+    assert part.name.startswith(f"Mismatch in the {place.kind} {place.target}, along ")
+
+
+def test_a_wave_is_everywhere_and_shaded_nowhere():
+    d = oscillator()
+    d.where = [Location("equation", "v", "t", ((0.0, 10.0),), 0.8, 9.0, period=2.0)]
+    assert not any("largest" in name for name in labels(drawn(d, "residuals")))
+
+
+def test_panels_of_one_diagnosis_tell_of_one_place_where_they_can():
+    d = oscillator()
+    d.where = [Location("parameter", "k", "hidden", ((0.0, 1.0),), 0.8, 9.0),
+               Location("parameter", "c", "v", ((2.0, 4.0),), 0.7, 8.0)]  # fmt: skip
+    first = d.shifts[0]
+    other = NeededShift("k", "1/s^2", "t", first.values, first.shift, first.sd, 0.1)
+    d.shifts = [other, first]
+    assert drawn(d, "residuals").get_xlabel() == "v [m/s]"  # nothing is known of the other driver
+    assert drawn(d, "shift").get_ylabel() == "needed shift of c [1/s], ±1 sd"
+
+
+def test_an_output_that_changes_with_its_own_size_has_an_axis_with_its_unit():
+    d = cooling()
+    d.where = [Location("output", "y", "y itself", ((30.0, 40.0),), 0.8, 9.0)]
+    d.missing = MissingRate("output", "y", "y itself", *torch.rand(3, 9), "°C", torch.arange(9.0), torch.zeros(9))
+    residuals = drawn(d, "residuals")
+    np.testing.assert_array_equal(curve(residuals, "base model").get_xdata(), d.base.prediction.sort().values)
+    assert residuals.get_xlabel() == drawn(d, "missing").get_xlabel() == "y itself [°C]"
+
+
+def test_a_span_of_one_level_is_as_wide_as_half_way_to_the_next():
+    x = torch.tensor([1.0, 2.0, 4.0, 8.0, 9.0], dtype=F64).repeat_interleave(8)
+    recording = Recording(x={"v": x}, y={"f": 2.0 * (x == 4.0) + 0.1 * noise(40)}, noise=0.1)
+    ax = plots.residual_map(recording, torch.zeros(40), spans=[(1.0, 1.0), (4.0, 4.0), (8.5, 9.0)])
+    located = [patch for patch in ax.patches if "noise" not in patch.get_label()]
+    boxes = [patch.get_extents().transformed(ax.transData.inverted()) for patch in located]
+    np.testing.assert_allclose([(box.x0, box.x1) for box in boxes], [(1.0, 1.5), (3.0, 6.0), (8.5, 9.0)])
 
 
 # --- ranking ---------------------------------------------------------------------------------------------
@@ -855,7 +919,7 @@ def test_values_of_a_hidden_driver_come_from_the_diagnosis():
     assert part.name == "Residuals"
     d.drivers = {"hidden": torch.linspace(0, 1, 120, dtype=F64)}
     (part,) = [part for part in discovery.figure_parts(d) if part.key == "residuals"]
-    assert part.name == "Where the mismatch sits"
+    assert part.name == "Mismatch in the equation v, along hidden"
     figure = plt.figure()
     part.draw(figure)
     assert figure.axes[0].get_xlabel() == "hidden"

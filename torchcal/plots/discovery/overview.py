@@ -17,6 +17,9 @@ from torchcal.plots.discovery.residuals import driver_values, residual_map
 from torchcal.plots.discovery.shifts import missing_rate, needed_shift
 from torchcal.plots.selection import conditions_of
 
+#: Letters of a name in a title, beside which there is a second one.
+TITLED = 18
+
 
 def discovery_overview(diagnosis: Any, fig: Any = None) -> Any:
     """One figure with every panel that this diagnosis has.
@@ -144,13 +147,16 @@ def figure_parts(diagnosis: Any) -> list[FigurePart]:
         )
     )
 
-    best = where[0] if where else None
-    driver = best.driver if best is not None else None
-    values = None if driver is None else _driver_of(diagnosis, driver, final if after is not None else base)
-    if values is None:
-        driver = None
-    spans = best.spans if best is not None and driver is not None else ()
-    told = {} if best is None or driver is None else {"edges": best.edges, "period": best.period}
+    best, values = None, None
+    for place in where:  # the likeliest whose driver is known
+        values = _driver_of(diagnosis, place.driver, final if after is not None else base)
+        if values is not None:
+            best = place
+            break
+    driver = None if best is None else best.driver
+    waves = best is not None and best.period is not None
+    spans = () if best is None or waves else best.spans  # a wave is everywhere
+    told = {} if best is None else {"edges": best.edges, "period": best.period, "change": _change(best)}
     output = best.target if best is not None and best.target in recording.outputs else None
 
     def mismatch(fig: Any) -> None:
@@ -160,10 +166,17 @@ def figure_parts(diagnosis: Any) -> list[FigurePart]:
             set_aside=getattr(diagnosis, "set_aside", None), ax=fig.subplots(), **told,
         )  # fmt: skip
 
-    said = "What the models leave of the data"
-    said += f", against {called(driver)}." if driver is not None else "."
-    said += " Shaded: where the mismatch sits." if spans else ""
-    parts.append(FigurePart("residuals", "Where the mismatch sits" if spans else "Residuals", said, mismatch, 6.0, 3.8))
+    name, said = "Residuals", "What the models leave of the data"
+    said += "." if driver is None else f", against {called(driver)}."
+    if best is not None and driver is not None:
+        by = plain(called(driver), TITLED, middle=True)
+        name = f"Mismatch in the {best.kind} {plain(best.target, TITLED, middle=True)}, along {by}"
+    if spans:
+        said += (
+            f" Shaded: where the {_change(best)} is largest. What that does to the output may be largest elsewhere: "
+            "later, or where no calibrated parameter takes it up."
+        )
+    parts.append(FigurePart("residuals", name, said, mismatch, 6.0, 3.8))
 
     hypotheses = list(diagnosis.ranking)
     if hypotheses:
@@ -183,17 +196,18 @@ def figure_parts(diagnosis: Any) -> list[FigurePart]:
                     )
                 ),
                 7.0,
-                max(3.2, 1.4 + 0.3 * bars),
+                max(3.2, 1.7 + 0.3 * bars),
             )
         )
-    if shifts:
+    if shifts:  # of the parameter that the residuals' panel tells of, where there is one, else against its driver
+        shift = min(shifts, key=lambda item: (best is None or item.parameter != best.target, item.driver != driver))
         parts.append(
             FigurePart(
                 "shift",
-                f"Shift that {plain(shifts[0].parameter)} would need",
-                f"The shift of {shifts[0].parameter} that each stretch of data needs by itself, ±1 sd, against "
-                f"{called(shifts[0].driver)}. Were the base model complete, it would scatter around zero.",
-                lambda fig: _ignore(needed_shift(shifts[0], ax=fig.subplots(), units=units)),
+                f"Shift that {plain(shift.parameter)} would need",
+                f"The shift of {shift.parameter} that each stretch of data needs by itself, ±1 sd, against "
+                f"{called(shift.driver)}. Were the base model complete, it would scatter around zero.",
+                lambda fig: _ignore(needed_shift(shift, ax=fig.subplots(), units=units)),
                 6.0,
                 3.3,
             )
@@ -263,7 +277,20 @@ def figure_parts(diagnosis: Any) -> list[FigurePart]:
 def _driver_of(diagnosis: Any, driver: str, fit: Any) -> Any:
     """A driver's values ``(n,)``: those that the diagnosis keeps, or the recording's."""
     kept = getattr(diagnosis, "drivers", None) or {}
-    return kept[driver] if driver in kept else driver_values(diagnosis.recording, driver, fit)
+    if driver in kept:
+        return kept[driver]
+    own = driver.removesuffix(" itself")
+    return driver_values(diagnosis.recording, own, fit if own == driver else diagnosis.base)
+
+
+def _change(place: Any) -> str:
+    """What is largest in the spans of a place, in words."""
+    if terms := getattr(place, "terms", ()):
+        return f"effect of {join_terms(terms)}"
+    target = plain(place.target, TITLED, middle=True)
+    if place.kind == "equation":
+        return f"missing rate of d{target}/dt"
+    return f"{'needed' if place.kind == 'parameter' else 'missing'} shift of {target}"
 
 
 def _ignore(_: Any) -> None:

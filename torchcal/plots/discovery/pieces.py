@@ -47,6 +47,7 @@ class Look:
 
     def unit(self, name: str) -> str | None:
         """A quantity's unit, where it has one."""
+        name = name.removesuffix(" itself")  # an output that changes with its own size
         other = {"t": "time", "time": "t"}.get(name, name)
         unit = self.units.get(name) or self.units.get(other)
         return plain(unit) if unit else None

@@ -1,6 +1,7 @@
 """Where the mismatch sits: residuals against what they vary with."""
 
-from collections.abc import Iterable, Mapping
+import textwrap
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcal.data import Recording
+from torchcal.display import percent
 from torchcal.errors import DomainError
 from torchcal.plots import style
 from torchcal.plots.discovery.panels import curves_of, groups_of
@@ -37,6 +39,8 @@ UNEVEN = 5.0
 MOST_LEVELS, NAMED_LEVELS = 6, 3
 #: Data up to which their dots hide each other so little that these need not be transparent.
 OPAQUE = 200
+#: Letters on a line of the legend: a longer one would widen the panel.
+ENTRY = 60
 #: Local means in one period of an oscillation: fewer would not show it.
 PER_PERIOD = 6
 
@@ -72,6 +76,7 @@ def residual_map(
     driver: str | None = None,
     values: Any = None,
     spans: Iterable[tuple[float, float]] = (),
+    change: str = "needed change",
     edges: Iterable[float] = (),
     period: float | None = None,
     share: float | None = None,
@@ -97,7 +102,9 @@ def residual_map(
         after: The accepted model's, or None.
         driver: What is on the abscissa: see `driver_values`; the first condition (time) by default.
         values: The driver's values ``(n,)``, where the recording does not hold them.
-        spans: Ranges of the driver in which the mismatch sits, shaded.
+        spans: Ranges of the driver in which a change is largest that would remove the misfit, shaded. What it does to
+            the output may be largest elsewhere: later in time, or where no calibrated parameter takes it up.
+        change: What is largest there, in words.
         edges: Values of the driver at which a constant change begins or ends, drawn as vertical lines.
         period: Of an oscillation, in the driver's unit: the means are then finer than it, or left out where the data
             are too few for that.
@@ -144,15 +151,15 @@ def residual_map(
     x = as_numbers(values, "values", recording.n)
     part = places_of(recording, output)
     ax = style.new_axes(ax)
-    goes = "" if share is None else f" ({100 * share:.0f} % of it goes with {look.shown(driver)})"
-    located = f"mismatch largest here{goes}"
+    takes = "" if share is None else f" ({percent(share)} of the misfit)"
+    located = textwrap.fill(f"{change} largest here{takes}", ENTRY)
     seen = np.isfinite(y[part]) & np.isfinite(x)
     aside = np.zeros_like(seen) if mask is None else mask[part] & seen
     shown = seen & ~aside
     if is_log(x[seen]):
         ax.set_xscale("log")
     low, high = float(x[seen].min()), float(x[seen].max())
-    inside = [(start, end) for start, end in spans if end >= low and start <= high]
+    inside = _widened([(start, end) for start, end in spans if end >= low and start <= high], np.unique(x[seen]))
     for i, (start, end) in enumerate(inside):
         ax.axvspan(
             max(start, low), min(end, high), facecolor=LOCATED, edgecolor=EDGE, ls=":", lw=0.8, zorder=0,
@@ -207,6 +214,14 @@ def residual_map(
     if legend:
         draw_key(ax)
     return ax
+
+
+def _widened(spans: Sequence[tuple[float, float]], levels: np.ndarray) -> list[tuple[float, float]]:
+    """Spans that end at a level of the driver, half way to the next one: of a single level they have no width."""
+    middles = (levels[1:] + levels[:-1]) / 2
+    below = dict(zip(levels[1:], middles, strict=True))
+    above = dict(zip(levels[:-1], middles, strict=True))
+    return [(below.get(start, start), above.get(end, end)) for start, end in spans]
 
 
 def _bins(x: np.ndarray, keep: np.ndarray, period: float | None) -> list[np.ndarray]:
