@@ -748,7 +748,7 @@ def test_missing_rate_has_a_band_of_two_sd():
 def test_held_out_draws_the_predictions_of_the_scores():
     d = oscillator()
     ax = plots.held_out(d.recording, d.before, d.after, d.held_out)
-    np.testing.assert_array_equal(curve(ax, "base model").get_ydata(), d.before.prediction[60:120])
+    np.testing.assert_array_equal(curve(ax, "base model").get_ydata(), d.before.prediction[180:])  # farther off
     assert "held out" in labels(ax)
     d = ignition()
     ax = plots.held_out(d.recording, d.before, d.after, d.held_out)
@@ -756,6 +756,37 @@ def test_held_out_draws_the_predictions_of_the_scores():
     assert ax.get_ylabel() == "predicted ln tau"
     with pytest.raises(DomainError, match="Got none"):
         plots.held_out(d.recording, d.before, d.after, torch.zeros(77, dtype=torch.bool))
+
+
+def test_of_several_runs_the_one_that_differs_most_is_drawn():
+    t = torch.linspace(0, 1, 40, dtype=F64)
+    recording = Recording(runs=[Run(t, outputs={"a": t, "b": 9.0 * t}) for _ in range(4)])
+    mask = (recording.x["time"] > 0.7).repeat(2)
+    before, after = torch.zeros(320, dtype=F64), torch.zeros(320, dtype=F64)
+    after[80:120], after[280:320] = 0.3, 0.4  # of b, in its spread, less
+    before[40:60] = 5.0  # not held out
+    ax = plots.held_out(recording, before, after, mask)
+    assert ax.get_ylabel() == "a"
+    assert ax.get_legend().get_title().get_text() == "run 2 (one of 4 with held-out data)"
+    before = recording.y.clone()
+    before[155] += 0.1
+    alone = plots.held_out(recording, before, None, mask, legend=False)
+    assert alone.get_title(loc="left") == "run 3 (one of 4 with held-out data)"
+    mask[:40] = mask[80:160] = mask[160:200] = mask[240:] = False
+    only = plots.held_out(recording, before, None, mask, legend=False)
+    assert only.get_title(loc="left") == "run 1"
+
+
+def test_the_axes_of_scores_have_ticks_that_do_not_overlap():
+    for ratio in (6.0, 13.0, 25.0, 1e4):
+        parts = [Score(0.0193 * scale, 2.0, 0.5, 9) for scale in (1.0, ratio)]
+        ax = plots.held_out_scores(Scores(parts[1], None, None, None), Scores(parts[0], None, None, None))[0]
+        ax.figure.canvas.draw()
+        low, high = ax.get_xlim()
+        shown = [text for text in ax.get_xticklabels() if low <= text.get_position()[0] <= high]
+        assert len(shown) >= 2
+        boxes = [text.get_window_extent() for text in shown]
+        assert all(left.x1 < right.x0 for left, right in itertools.pairwise(boxes))
 
 
 def test_scores_are_drawn_before_and_after():

@@ -235,7 +235,8 @@ def figure_parts(diagnosis: Any) -> list[FigurePart]:
             FigurePart(
                 "held out",
                 "Prediction of held-out data",
-                "What the models, fitted without the held-out data, predict for them.",
+                "What the models, fitted without the held-out data, predict for them; of several runs, the one where "
+                "the two predictions, or the one and the data, are farthest apart.",
                 lambda fig: _ignore(
                     held_out(
                         recording, scores[0], second, mask, ax=fig.subplots(), along=along, names=names, units=units

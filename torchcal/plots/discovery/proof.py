@@ -44,8 +44,9 @@ def held_out(
 ) -> "Axes":
     """What models fitted without the held-out data predict there.
 
-    The run and output with most held-out data is drawn, over time or against the condition; held-out data that
-    lie scattered among the others are drawn as predicted against measured.
+    Of the runs and outputs with held-out data, the one is drawn where the two predictions differ most there, or the
+    only one differs most from the data, over time or against the condition; held-out data that lie scattered among the
+    others are drawn as predicted against measured.
 
     Args:
         recording: The data.
@@ -73,7 +74,14 @@ def held_out(
         raise DomainError("Expected a mask with observed data that were held out. Got none.")
     look = Look(units={**recording.units, **(units or {})}, labels=labels or {})
     panels = panels_of(recording, fits[0].values, along, None, None, 10**6, look)
-    panel = max(panels, key=lambda item: int((held & seen)[item.places].sum()))
+    wanted = held & seen
+    apart = (fits[-1].values if len(fits) > 1 else recording.y.cpu().numpy()) - fits[0].values
+    apart = np.where(wanted, apart / recording.spread.cpu().numpy(), 0.0)
+    panels = [item for item in panels if wanted[item.places].any()]
+    panel = max(panels, key=lambda item: float(np.square(apart[item.places]).sum()))
+    titles = {item.title for item in panels if item.output == panel.output}
+    if len(titles) > 1:
+        panel = replace(panel, title=f"{panel.title} (one of {len(titles)} with held-out data)")
     there = seen[panel.places]
     spans = [] if panel.x is None else held_spans(panel.x[there], held[panel.places][there])
     ax = style.new_axes(ax)
@@ -149,7 +157,7 @@ def held_out_scores(before: Any, after: Any = None, *, ax: Any = None, unit: str
             place.set_xscale("log")
         _room(place, found)
         if field == "coverage":
-            place.set_xlim(min([0.5, *(value - 0.15 for value in found)]), 1.08)
+            place.set_xlim(min([0.5, *(value - 0.2 for value in found)]), 1.08)
         place.set_yticks(range(len(parts)), [name.replace("_", " ").replace("held ", "held-") for name in parts])
         place.set_ylim(len(parts) - 0.4, -0.6)
         place.set_xlabel(head, fontsize="small")
@@ -168,9 +176,11 @@ def _room(ax: "Axes", values: Sequence[float]) -> None:
 
     low, high = min(values), max(values)
     if ax.get_xscale() == "log":
-        room = (high / low) ** 0.25
-        ax.set_xlim(low / room, high * room)
-        ax.xaxis.set_major_locator(LogLocator(numticks=4))
+        room = (high / low) ** 0.3
+        low, high = low / room, high * room
+        ax.set_xlim(low, high)
+        ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if high < 70 * low else (1.0,), numticks=4))
+        ax.xaxis.set_major_formatter(lambda value, _: style.number(value))
         ax.xaxis.set_minor_formatter(NullFormatter())
         return
     room = 0.25 * ((high - low) or abs(high) or 1.0)
