@@ -849,12 +849,47 @@ def test_detection_limits_show_the_number_beside_what_there_is_to_say():
     told = dict(zip([name.get_text() for name in ax.get_yticklabels()], ax.texts, strict=False))
     assert {name: text.get_text() for name, text in told.items()} == {
         "yield stress": "0.28 Pa, also: offset of tau",
-        "hidden": "calibration hides effects of\n310, the largest that was…",
-        "blind": "its tangent tells nothing new:\nonly large effects can",
+        "hidden": "calibration hides effects of 310, the largest that was\ntried",
+        "blind": "its tangent tells nothing new: only large effects can",
         "lag": "∞",
-        "loss": "2.8e−05 W/(m^2 K), also: some\nother loss of heat",
+        "loss": "2.8e−05 W/(m^2 K), also: some other loss of heat",
         "price": r"2 \$",
     }
+
+
+@pytest.mark.parametrize("width", [5.5, 6.4, 11.0])
+def test_names_and_notes_of_detection_limits_stand_on_the_figure_in_whole_words(width):
+    name = "adsorption that follows Freundlich instead of Henry"
+    rows = [Limit(name, "m", 0.11, "mol/(m^3 s)", 0.9, 2.3, "at y0 = 0.569 mol/(m^3 s); also: offset of the rate")]
+    rows.append(Limit("lag", "tau", 1.0, "s", 0.9))
+    figure = plt.figure(figsize=(width, 3.2), layout="constrained")
+    ax = plots.detection_limits(rows, ax=figure.subplots())
+    figure.canvas.draw()
+    box = ax.get_tightbbox()
+    assert box.x0 >= 0
+    assert box.x1 <= figure.bbox.x1
+    assert ax.bbox.width > 1.2 * figure.dpi
+    shown = ax.get_yticklabels()[0].get_text()
+    assert shown.replace("\n", " ") == name
+    note = max((text.get_text() for text in ax.texts), key=len)
+    assert all(unit in note for unit in ("0.11 mol/(m^3 s)", "y0 = 0.569 mol/(m^3 s)"))
+
+
+@pytest.mark.parametrize("middle", [False, True])
+def test_what_is_left_out_of_a_text_are_whole_words(middle):
+    text = "heat that is lost through the wall of the left chamber, which nobody insulated"
+    for most in range(20, len(text)):
+        short = discovery.pieces.plain(text, most, middle=middle)
+        head, tail = short.split("…")
+        assert len(short) <= most
+        assert text.startswith(head + " ")
+        assert not tail or text.endswith(" " + tail)
+    assert discovery.pieces.plain("x" * 50, 9, middle=middle) == ("xxxx…xxxx" if middle else "xxxxxxxx…")
+
+
+def test_an_sd_in_an_upright_label_is_not_broken():
+    needed = NeededShift("k", "1/s^2", "t", *torch.rand(3, 5), 0.1)
+    assert plots.needed_shift(needed).get_ylabel().endswith("±1 sd")
 
 
 # --- overview --------------------------------------------------------------------------------------------

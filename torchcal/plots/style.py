@@ -188,7 +188,7 @@ def wrapped(text: str) -> str:
     """An upright axis label, in lines that a small panel has room for; units and mathematics are not broken."""
     if len(text) <= 30 or "\n" in text or "$" in text.replace(r"\$", ""):
         return text
-    held = re.sub(r"\[[^\[\]]*\]", lambda unit: re.sub(r"\s", "\xa0", unit[0]), text)
+    held = re.sub(r"\[[^\[\]]*\]|±\d+ sd", lambda unit: re.sub(r"\s", "\xa0", unit[0]), text)
     return textwrap.fill(held, 30).replace("\xa0", " ")
 
 

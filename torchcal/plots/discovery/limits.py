@@ -1,6 +1,7 @@
 """The smallest effects that a recording could have shown."""
 
 import math
+import re
 import textwrap
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
@@ -9,13 +10,27 @@ import numpy as np
 
 from torchcal.errors import DomainError
 from torchcal.plots import style
-from torchcal.plots.discovery.pieces import ACCEPTED, NOISE, beside, draw_key, finite, listed, plain, told_apart
+from torchcal.plots.discovery.pieces import (
+    ACCEPTED,
+    LINESPACING,
+    NOISE,
+    beside,
+    draw_key,
+    finite,
+    listed,
+    plain,
+    told_apart,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Letters on a line beside a row: more would leave no room for the axes.
-LINE = 30
+#: Letters of a name up to which it stands on one line; longer ones have two.
+NAME = 28
+#: Inches of a letter, and of what stands beside the names and the notes: the axes, and some air.
+LETTER, AXES = 0.07, 1.7
+#: Letters on a line of a note: as many as there is room for, within these.
+LEAST, MOST = 20, 60
 
 
 def detection_limits(limits: Iterable[Any], *, most: int = 16, ax: "Axes | None" = None, legend: bool = True) -> "Axes":
@@ -60,8 +75,12 @@ def detection_limits(limits: Iterable[Any], *, most: int = 16, ax: "Axes | None"
     ax.axvline(1.0, color="0.25", lw=1.0, zorder=2)
     terms = [item.term for item in rows]
     names = told_apart(
-        [item.term if terms.count(item.term) == 1 else f"{item.term}.{item.parameter}" for item in rows]
+        [item.term if terms.count(item.term) == 1 else f"{item.term}.{item.parameter}" for item in rows], 2 * NAME
     )
+    names = [_in_two(name) for name in names]
+    longest = max(len(line) for name in names for line in name.split("\n"))
+    room = ax.get_window_extent().width / ax.figure.dpi / ax.get_position().width - AXES - LETTER * longest
+    across = int(min(max(room / LETTER, LEAST), MOST))
     for i, (item, value) in enumerate(zip(rows, ratios, strict=True)):
         if math.isfinite(value):
             place = min(max(value, low), high)
@@ -75,11 +94,11 @@ def detection_limits(limits: Iterable[Any], *, most: int = 16, ax: "Axes | None"
         smallest = f"{style.number(float(f'{item.smallest:.2g}'))}{unit}" if math.isfinite(item.smallest) else ""
         note = str(getattr(item, "note", "") or "")
         text = ", ".join(part for part in (smallest, note) if part)
-        lines = textwrap.wrap(text or "∞", LINE, max_lines=2, placeholder="…")
-        beside(ax, i, 6, "\n".join(map(plain, lines)), "left")
+        lines = textwrap.wrap(_held(text) or "∞", across, max_lines=2, placeholder=" …")
+        beside(ax, i, 6, "\n".join(plain(line, MOST) for line in lines), "left")
     beside(ax, None, 6, "smallest", "left")
     ax.plot([], [], "o", ms=5.5, mfc=ACCEPTED, mec=ACCEPTED, label="estimate, where fitted")
-    ax.set_yticks(range(len(rows)), names)
+    ax.set_yticks(range(len(rows)), names, linespacing=LINESPACING)
     ax.set_ylim(len(rows) - 0.4, -0.6)
     more = f"\n({left_out} more not shown)" if left_out > 0 else ""
     ax.set_xlabel("|estimate| / smallest detectable effect [1]" + more)
@@ -88,3 +107,18 @@ def detection_limits(limits: Iterable[Any], *, most: int = 16, ax: "Axes | None"
     if legend:
         draw_key(ax, right=True)
     return ax
+
+
+def _in_two(name: str) -> str:
+    """A name on one line, or on two as even as its words allow."""
+    if len(name) <= NAME:
+        return name
+    tries = (textwrap.fill(name, width) for width in range(NAME // 2, len(name) + 1))
+    return next(text for text in tries if text.count("\n") < 2)
+
+
+def _held(text: str) -> str:
+    """A note whose units and equations are not broken between lines."""
+    for pattern in (r"\([^()]*\)", r"[^ ]+ = [^ ]+( [^ ]+)?"):
+        text = re.sub(pattern, lambda found: found[0].replace(" ", "\xa0"), text)
+    return text

@@ -24,6 +24,7 @@ LOCATED, EDGE = style.ADDITIVE_BAND, style.ADDITIVE
 DENSE = 80  # data in one panel above which each is a dot instead of a circle
 LINESPACING = 1.1  # of two lines in one row
 MOST_LETTERS = 44  # of a user's text on a figure
+WORD = 10  # letters of a word that are left out rather than breaking it
 MOST_POINTS = 2000  # drawn in one panel; more cannot be told apart
 
 
@@ -175,8 +176,20 @@ def plain(text: Any, most: int = MOST_LETTERS, *, middle: bool = False) -> str:
     text = " ".join(str(text).split())
     if len(text) > most:
         end = (most - 1) // 2 if middle else 0
-        text = text[: most - 1 - end].rstrip() + "…" + text[len(text) - end :].lstrip()
+        text = _begin(text, most - 1 - end) + "…" + _end(text, len(text) - end)
     return text.replace("$", r"\$")
+
+
+def _begin(text: str, stop: int) -> str:
+    """A text up to a place, or to the end of a word shortly before."""
+    space = text.rfind(" ", max(stop - WORD, 1), stop + 1)
+    return text[: stop if space < 0 else space].rstrip()
+
+
+def _end(text: str, start: int) -> str:
+    """A text from a place on, or from the beginning of a word shortly behind."""
+    space = text.find(" ", max(start - 1, 0), start + WORD)
+    return text[start if space < 0 else space :].lstrip()
 
 
 def told_apart(texts: Sequence[str], most: int = MOST_LETTERS) -> list[str]:
@@ -188,8 +201,8 @@ def told_apart(texts: Sequence[str], most: int = MOST_LETTERS) -> list[str]:
         others = [other for other, name in zip(texts, short, strict=True) if name == alike and other != text]
         if others:  # they differ in the middle alone: begin shortly before that
             place = max(_alike(text, other) for other in others)
-            head = text[: most // 4].rstrip()
-            alike = plain(f"{head}…{text[max(place - most // 4, len(head)) :]}", most)
+            head = _begin(text, most // 4)
+            alike = plain(f"{head}…{_end(text, max(place - most // 4, len(head)))}", most)
         shown.append(alike)
     return [
         name if all(text == other for other, same in zip(texts, shown, strict=True) if same == name)
