@@ -671,6 +671,35 @@ def test_contours_hold_their_share_of_the_draws():
     assert path.contains_points(draws).mean() == pytest.approx(0.9, abs=0.015)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_density_ends_where_a_coefficient_whose_sign_means_nothing_does(sign):
+    draws = sign * normal(4000).abs().numpy()
+    points, density = densities.curve(draws)
+    assert (sign * points).min() == 0.0
+    assert area(density, points) == pytest.approx(1.0, abs=2e-3)
+    at_zero = density[np.abs(points).argmin()]
+    assert at_zero == pytest.approx(math.sqrt(2 / math.pi), rel=0.05)  # a half-normal's; unreflected it would be half
+    far, few = densities.curve(draws + 30.0 * sign), densities.curve(draws[:20])
+    assert np.abs(far[0]).min() > 20
+    assert (sign * few[0]).min() < 0  # so few may lie on one side by chance
+    assert densities.side_of_zero(np.append(draws, -sign)) == 0
+
+
+def test_contours_end_where_a_coefficient_does():
+    z = normal(20_000, 3)
+    draws = torch.stack([z[:, 0].abs(), 2 + 0.3 * z[:, 1] + z[:, 0].abs(), -z[:, 2].abs()], -1)
+    axes = plots.corner(draws, ["a", "b", "c"], levels=(0.6,))
+    assert axes[-1, 0].get_xlim()[0] == 0.0
+    assert axes[-1, 1].get_xlim()[0] > 0.0
+    assert axes[-1, -1].get_xlim()[1] == 0.0
+    for row, column in ((1, 0), (2, 0), (2, 1)):
+        lines = axes[row, column].collections[-1].get_paths()[0]
+        pair = draws[:, [column, row]].numpy()
+        assert lines.contains_points(pair).mean() == pytest.approx(0.6, abs=0.02)
+        nearest = np.abs(pair).min(0) < 1e-2  # those that end at 0
+        assert (np.sign(lines.vertices) != np.sign(pair[0])).any(0)[nearest].all()  # no line along the bound
+
+
 def test_a_factor_leaves_the_label_with_its_ticks():
     figure, ax = plt.subplots()
     ax.plot([0, 1, 2], [0, 1e9, 3e9])

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchcal.errors import ShapeError
 from torchcal.plots import style
-from torchcal.plots.densities import check_levels, contour_heights, curve, pair_density
+from torchcal.plots.densities import check_levels, contour_heights, curve, pair_density, side_of_zero
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,7 +30,8 @@ def corner(
 ) -> np.ndarray:
     """Marginals on the diagonal, contours of the pairs below it, the MAP marked.
 
-    Pairs are estimated along their principal axes, so that strongly correlated ones are resolved. Where the
+    Pairs are estimated along their principal axes, so that strongly correlated ones are resolved. Densities are
+    reflected at 0 where all draws of a quantity lie on one side of it, and its axis ends there. Where the
     values of a quantity differ only far behind the decimal point, its ticks count from a number that stands in
     the label.
 
@@ -63,7 +64,8 @@ def corner(
     if point is not None and len(point) != size:
         raise ShapeError(f"Expected map_point of shape ({size},). Got ({len(point)},).")
     axes = _axes(axes, size)
-    limits = [_limits(values[:, i], None if point is None else float(point[i])) for i in range(size)]
+    sides = [side_of_zero(values[:, i] if point is None else np.append(values[:, i], point[i])) for i in range(size)]
+    limits = [_limits(values[:, i], None if point is None else float(point[i]), sides[i]) for i in range(size)]
     for i in range(size):
         for j in range(size):
             ax = axes[i, j]
@@ -73,7 +75,8 @@ def corner(
             if i == j:
                 _draw_marginal(ax, values[:, i], None if point is None else float(point[i]))
             else:
-                _draw_pair(ax, values[:, [j, i]], None if point is None else point[[j, i]], levels)
+                marked = None if point is None else point[[j, i]]
+                _draw_pair(ax, values[:, [j, i]], marked, levels, (sides[j], sides[i]))
                 ax.set_ylim(limits[i])
             ax.set_xlim(limits[j])
             style.dress(ax)
@@ -107,14 +110,15 @@ def _axes(axes: Any, size: int) -> np.ndarray:
     return array
 
 
-def _limits(values: np.ndarray, point: float | None) -> tuple[float, float]:
+def _limits(values: np.ndarray, point: float | None, side: int) -> tuple[float, float]:
     low, high = (float(value) for value in np.quantile(values, [0.001, 0.999]))
     if point is not None:
         low, high = min(low, point), max(high, point)
     span = high - low
     if not span > 1e-12 * max(abs(low), abs(high)):
         span = max(abs(low), 1e-6) * 1e-3
-    return low - 0.08 * span, high + 0.08 * span
+    low, high = low - 0.08 * span, high + 0.08 * span
+    return max(low, 0.0) if side > 0 else low, min(high, 0.0) if side < 0 else high
 
 
 def _draw_marginal(ax: "Axes", values: np.ndarray, point: float | None) -> None:
@@ -129,9 +133,14 @@ def _draw_marginal(ax: "Axes", values: np.ndarray, point: float | None) -> None:
         ax.axvline(point, color=style.MAP, lw=1.2, ls=(0, (4, 2)))
 
 
-def _draw_pair(ax: "Axes", values: np.ndarray, point: np.ndarray | None, levels: Sequence[float]) -> None:
-    found = pair_density(values, bins=72)
-    heights = [] if found is None else contour_heights(found[2], levels)
+def _draw_pair(
+    ax: "Axes", values: np.ndarray, point: np.ndarray | None, levels: Sequence[float], sides: tuple[int, int]
+) -> None:
+    found = pair_density(values, bins=72, sides=sides)
+    heights = []
+    if found is not None:
+        inside = (found[0] * sides[0] >= 0) & (found[1] * sides[1] >= 0)  # the limits cut off what is beyond
+        heights = contour_heights(found[2][inside], levels)
     if found is None or not heights:
         ax.plot(*values.T, ".", ms=1.5, color=style.POSTERIOR, rasterized=True)
     else:
