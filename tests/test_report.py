@@ -143,6 +143,25 @@ def test_settings_come_with_versions_and_seed(pages):
     assert rows["library (2 candidates)"] == "quadratic drag, cubic drag"
 
 
+def test_flags_among_the_settings_are_told_in_words():
+    d = cooling()
+    d.settings = {
+        "seed": 3, "withdrawn": "", "unknown_beside": (), "pliant": False, "nearly": True, "set_aside": ("lag", "leak"),
+        "region": None, "feasible": {"T": (None, 400.0)},
+    }  # fmt: skip
+    rows = {row["setting"]: row["value"] for row in Reader(report.page(d)).rows("Settings")}
+    told = {name: value for name, value in rows.items() if not name.startswith(("version", "library"))}
+    assert told == {
+        "seed": "3",
+        "all that is tied may stand for what is in no list": "no",
+        "the name rests on the share of the misfit removed": "yes",
+        "these may explain the outliers": "lag, leak",
+        "feasible values of T": "–, 400",
+        "run time": "1 s",
+        "recording": "30 conditions; outputs y; 30 data",
+    }
+
+
 def test_tied_hypotheses_come_with_the_experiment(pages):
     reader = Reader(pages["ignition"])
     words = " ".join(reader.words)

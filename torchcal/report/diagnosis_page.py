@@ -38,6 +38,21 @@ MEANING = {
     "unexplained": "something was left out that is not in this library",
 }
 
+SETTINGS = {
+    "withdrawn": "why a name was withdrawn",
+    "doubt": "why there is no name",
+    "depends": "what an estimate rests on",
+    "unknown_beside": "beside these, something unknown is likelier than alone",
+    "pliant": "all that is tied may stand for what is in no list",
+    "nearly": "the name rests on the share of the misfit removed",
+    "lost": "the base explains no more than a constant would",
+    "unlike": "some runs, sweeps or outliers are unlike the others",
+    "set_aside": "these may explain the outliers",
+    "interrupted": "left undone at an interruption",
+    "region": "where the named term acts",
+}
+"""What the settings of a diagnosis are called; the others speak for themselves."""
+
 
 def write(diagnosis: Any, path: str | os.PathLike[str]) -> Path:
     """Write a diagnosis as an HTML page that needs no other file, no network and no script.
@@ -333,7 +348,11 @@ def _noise(diagnosis: Any, units: Mapping[str, str]) -> str:
 
 def _settings(diagnosis: Any) -> str:
     flat = _flat(getattr(diagnosis, "settings", None) or {})
-    rows = [{"setting": name, "value": in_words(value)} for name, value in flat.items()]
+    rows = [
+        {"setting": SETTINGS.get(name, name).replace("feasible.", "feasible values of "), "value": told}
+        for name, value in flat.items()
+        if (told := in_words(value)) not in ("", "–")  # there is nothing to tell
+    ]
     known = " ".join(flat)
     rows += [
         {"setting": f"version {name}", "value": version(name)}
