@@ -460,6 +460,8 @@ def test_residuals_of_each_level_of_another_condition_are_told_apart():
     assert shades == sorted(set(shades))
     np.testing.assert_allclose(curve(ax, "base model, local mean").get_ydata()[1:-1], 0.0, atol=1.0)
     assert len(curve(ax, "_points").get_xdata()) == 96  # of the accepted model, which should leave no levels
+    four = Recording(x={"a": a, "load": torch.arange(96) % 4}, y=a)
+    assert sum("load" in name for name in labels(plots.residual_map(four, torch.zeros(96), driver="a"))) == 4
     five = Recording(x={"a": a, "load": torch.arange(96) % 5}, y=a)
     named = [name for name in labels(plots.residual_map(five, torch.zeros(96), driver="a")) if "load" in name]
     assert named == ["base model, load = 0", "base model, load = 4"]
@@ -742,6 +744,28 @@ def test_missing_rate_has_a_band_of_two_sd():
         plots.missing_rate(SimpleNamespace(**{**vars(missing), "sd": missing.sd[1:]}))
 
 
+@pytest.mark.parametrize(("sd", "drawn"), [(0.2, ["estimate"]), (0.01, ["run 0", "run 1", "run 2"])])
+def test_runs_that_differ_by_less_than_an_sd_are_one_curve(sd, drawn):
+    t = torch.linspace(0, 1, 20, dtype=F64)
+    time, along = t.repeat(3), torch.cat([t + shift for shift in (-0.1, 0.0, 0.1)])
+    order = time.argsort(stable=True)
+    missing = MissingRate("equation", "v", "t", time[order], along[order], torch.full((60,), sd), "1/s", time, along)
+    ax = plots.missing_rate(missing)
+    lines = [line for line in ax.lines if not line.get_label().startswith("_")]
+    assert [line.get_label() for line in lines] == drawn
+    np.testing.assert_allclose(lines[len(lines) // 2].get_xydata(), torch.stack([t, t], -1))
+
+
+def test_runs_are_whole_numbers():
+    d = oscillator()
+    d.where = [Location("equation", "v", "run", ((0.0, 0.0),), 0.81, 9.0)]
+    d.drivers = {"run": d.recording.x["run"]}
+    ax = drawn(d, "residuals")
+    assert {text.get_text() for text in ax.get_xticklabels()} <= {"−1", "0", "1", "2"}
+    box = next(patch for patch in ax.patches if "largest" in patch.get_label()).get_extents()
+    assert box.transformed(ax.transData.inverted()).x1 == pytest.approx(0.5)
+
+
 # --- proof -----------------------------------------------------------------------------------------------
 
 
@@ -855,6 +879,9 @@ def test_detection_limits_show_the_number_beside_what_there_is_to_say():
         "loss": "2.8e−05 W/(m^2 K), also: some other loss of heat",
         "price": r"2 \$",
     }
+    note = "also: " + "some other loss of heat, " * 5 + "end"
+    ax = plots.detection_limits([Limit("lag", "a", 1.0, "s", 0.9, None, note)])
+    assert ax.texts[0].get_text().endswith("end")  # one row has room for more than two lines
 
 
 @pytest.mark.parametrize("width", [5.5, 6.4, 11.0])

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 NAME = 28
 #: Inches of a letter, and of what stands beside the names and the notes: the axes, and some air.
 LETTER, AXES = 0.07, 1.7
+#: Inches of a line of a note, and of the legend.
+LINE, KEY = 0.15, 0.5
 #: Letters on a line of a note: as many as there is room for, within these.
 LEAST, MOST = 20, 60
 
@@ -81,6 +83,7 @@ def detection_limits(limits: Iterable[Any], *, most: int = 16, ax: "Axes | None"
     longest = max(len(line) for name in names for line in name.split("\n"))
     room = ax.get_window_extent().width / ax.figure.dpi / ax.get_position().width - AXES - LETTER * longest
     across = int(min(max(room / LETTER, LEAST), MOST))
+    down = max(2, int((ax.get_window_extent().height / ax.figure.dpi - KEY) / len(rows) / LINE))
     for i, (item, value) in enumerate(zip(rows, ratios, strict=True)):
         if math.isfinite(value):
             place = min(max(value, low), high)
@@ -94,7 +97,7 @@ def detection_limits(limits: Iterable[Any], *, most: int = 16, ax: "Axes | None"
         smallest = f"{style.number(float(f'{item.smallest:.2g}'))}{unit}" if math.isfinite(item.smallest) else ""
         note = str(getattr(item, "note", "") or "")
         text = ", ".join(part for part in (smallest, note) if part)
-        lines = textwrap.wrap(_held(text) or "∞", across, max_lines=2, placeholder=" …")
+        lines = textwrap.wrap(_held(text) or "∞", across, max_lines=down, placeholder=" …")
         beside(ax, i, 6, "\n".join(plain(line, MOST) for line in lines), "left")
     beside(ax, None, 6, "smallest", "left")
     ax.plot([], [], "o", ms=5.5, mfc=ACCEPTED, mec=ACCEPTED, label="estimate, where fitted")

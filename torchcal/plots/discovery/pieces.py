@@ -98,6 +98,10 @@ def finish(ax: "Axes", x_label: str, y_label: str, title: str) -> None:
     if title:
         ax.set_title(title, fontsize="small", loc="left")
     ax.margins(x=0.03)
+    if x_label == "run":
+        from matplotlib.ticker import MaxNLocator
+
+        ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     style.dress(ax)
 
 

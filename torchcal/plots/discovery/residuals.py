@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 #: Largest noise sd over the smallest, above which residuals are drawn in units of it.
 UNEVEN = 5.0
 #: Levels of another condition up to which the residuals of each have their own shade, and up to which all are named.
-MOST_LEVELS, NAMED_LEVELS = 6, 3
+MOST_LEVELS, NAMED_LEVELS = 6, 4
 #: Data up to which their dots hide each other so little that these need not be transparent.
 OPAQUE = 200
 #: Letters on a line of the legend: a longer one would widen the panel.

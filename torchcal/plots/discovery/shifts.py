@@ -22,8 +22,8 @@ from torchcal.plots.discovery.pieces import (
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-#: Difference of the runs at the same time, as a share of the range, up to which one curve shows them all; and how many
-#: runs the legend names.
+#: Difference of the runs at the same time, as a share of the range, up to which one curve shows them all, as up to an
+#: sd; and how many runs the legend names.
 SAME, NAMED_RUNS = 0.02, 6
 #: Times the sd of the better known quarter of the stretches up to which one tells something, and sd of its own from
 #: which on its shift does.
@@ -138,7 +138,7 @@ def missing_rate(
 def _by_run(
     missing: Any, x: np.ndarray, rate: np.ndarray, sd: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Curves along time of runs that differ at the same time; otherwise the one."""
+    """Curves along time of runs that differ at the same time; otherwise their mean."""
     if missing.driver != "t":
         return [(x, rate, sd)]
     time, along = as_numbers(missing.time, "time", len(x)), as_numbers(missing.along, "along", len(x))
@@ -147,8 +147,10 @@ def _by_run(
     first = pieces[0]
     apart = max((np.max(np.abs(a - np.interp(t, *first))[(t >= first[0][0]) & (t <= first[0][-1])], initial=0.0)
                  for t, a in pieces), default=0.0)  # fmt: skip
-    if apart <= SAME * np.ptp(rate):
-        return [(x, rate, sd)]
+    if apart <= max(SAME * np.ptp(rate), float(np.median(sd))):
+        at, which = np.unique(x, return_inverse=True)
+        count = np.bincount(which)
+        return [(at, np.bincount(which, rate) / count, np.bincount(which, sd) / count)]
     wide = np.empty_like(sd)
     wide[np.argsort(time, kind="stable")] = sd
     return [(t, a, w) for (t, a), w in zip(pieces, np.split(wide, ends), strict=True)]
