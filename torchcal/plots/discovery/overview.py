@@ -196,7 +196,7 @@ def figure_parts(diagnosis: Any) -> list[FigurePart]:
                     )
                 ),
                 7.0,
-                max(3.2, 1.7 + 0.3 * bars),
+                max(3.2, 1.5 + 0.35 * bars),
             )
         )
     if shifts:  # of the parameter that the residuals' panel tells of, where there is one, else against its driver

@@ -151,8 +151,8 @@ def residual_map(
     x = as_numbers(values, "values", recording.n)
     part = places_of(recording, output)
     ax = style.new_axes(ax)
-    takes = "" if share is None else f" ({percent(share)} of the misfit)"
-    located = textwrap.fill(f"{change} largest here{takes}", ENTRY)
+    takes = "" if share is None else f"({percent(share)} of the misfit)".replace(" ", "\xa0")  # is not broken
+    located = textwrap.fill(f"{change} largest here {takes}", ENTRY).replace("\xa0", " ")
     seen = np.isfinite(y[part]) & np.isfinite(x)
     aside = np.zeros_like(seen) if mask is None else mask[part] & seen
     shown = seen & ~aside
