@@ -650,6 +650,21 @@ def test_limits_stay_within_a_parameters_bounds():
     assert hidden.sign == 0
 
 
+def test_the_estimate_beside_a_limit_is_as_far_from_neutral():
+    """An order of 1 that stays at 1 is not many times what could have been seen."""
+    x = torch.linspace(1, 10, 40, dtype=torch.float64)
+    base = tc.Simulator(
+        lambda x, p: p["k"] * x ** p["order"],
+        [tc.Parameter("k", low=0.0, initial=1.0), tc.Parameter("order", low=0.0, high=4.0, neutral=1.0)],
+    )
+    noise = 0.05 * np.random.default_rng(2).standard_normal(40)
+    for order, times in ((1.0, 1.0), (1.2, 10.0)):
+        recording = tc.Recording(x=x, y=2.0 * x.numpy() ** order + noise, noise=0.05)
+        (limit,) = diagnose(base, recording, [tc.Term("reaction order", frees=("order",))]).detection_limit
+        assert limit.estimate == pytest.approx(order - 1.0, abs=0.01)
+        assert (abs(limit.estimate) < times * limit.smallest) is (order == 1.0)
+
+
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_limit_is_of_the_sign_that_can_be_seen(sign):
     x = torch.linspace(0, 1, 40, dtype=torch.float64)

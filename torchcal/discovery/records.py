@@ -228,7 +228,8 @@ class Limit:
     Attributes:
         term: The candidate.
         parameter: Its amplitude.
-        smallest: Smallest detectable magnitude, in ``unit``; infinite where the data cannot tell at all.
+        smallest: Smallest detectable magnitude, in ``unit``; infinite where the data cannot tell at all. As of the
+            estimate, the distance from the amplitude's neutral value counts (of a reaction order of 1.2, 0.2).
         unit: Unit of the amplitude.
         power: Probability with which an effect of this size is detected.
         estimate: What the term takes up where it alone is fitted beside the base: what others do as well, so that it is

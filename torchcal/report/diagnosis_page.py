@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from torchcal.display import between, percent, up_to, version
+from torchcal.display import between, percent, units_of, up_to, version
 from torchcal.files import check_target, replacing
 from torchcal.plots.discovery import FigurePart, figure_parts
 from torchcal.plots.discovery.pieces import likeliest_with
@@ -90,7 +90,7 @@ def page(diagnosis: Any) -> str:
     """
     figures = {part.key: (part, drawing(part)) for part in figure_parts(diagnosis)}
     headline = _headline(diagnosis)
-    units = dict(diagnosis.recording.units)
+    units = units_of(diagnosis.recording, diagnosis.simulator)
     body = [
         f"<h1>{escaped(headline)}</h1>",
         f'<p class="meaning">{escaped(_meaning(diagnosis))}</p>',
@@ -196,7 +196,7 @@ def _where(diagnosis: Any, units: Mapping[str, str]) -> str:
             "where": f"{item.kind} {item.target}",
             "varies with": "time" if item.driver == "t" and "time" in units else item.driver,
             "from … to": _spans(item),
-            "unit": _unit(units, item.driver),
+            "unit": units.get(item.driver, ""),
             "share of misfit": Right(percent(item.share)),
             "log evidence": Right(in_digits(item.evidence)),
         }
@@ -415,12 +415,10 @@ def _accepted(diagnosis: Any) -> bool:
 
 def _rmse_unit(diagnosis: Any) -> str:
     """Of errors, which are in units of each output's spread where there are several; empty where nobody told it."""
-    recording = diagnosis.recording
-    return recording.units.get(recording.outputs[0], "") if len(recording.outputs) == 1 else "spread"
+    outputs = diagnosis.recording.outputs
+    return units_of(diagnosis.recording, diagnosis.simulator).get(outputs[0], "") if len(outputs) == 1 else "spread"
 
 
-def _unit(units: Mapping[str, str], name: str) -> str:
-    return units.get(name) or (units.get("time", "") if name == "t" else "")
 
 
 def _comparable(value: float) -> float:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from torchcal.data import Recording
+from torchcal.display import units_of
 from torchcal.errors import DomainError
 from torchcal.plots.discovery.fits import both_fits
 from torchcal.plots.discovery.hypotheses import ranking
@@ -98,11 +99,7 @@ def figure_parts(diagnosis: Any) -> list[FigurePart]:
                 f"{name!r}."
             )
     recording: Recording = diagnosis.recording
-    states = getattr(diagnosis.simulator, "states", {})
-    units = {name: unit for name, unit in states.items() if isinstance(unit, str)}
-    for run in recording.runs or ():
-        units |= run.units
-    units |= recording.units
+    units = units_of(recording, diagnosis.simulator)
     base, final = diagnosis.base, diagnosis.final
     after = final if tuple(final.terms) != tuple(base.terms) else None
     mask = diagnosis.held_out
