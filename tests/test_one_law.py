@@ -201,6 +201,8 @@ def test_estimates_are_in_the_units_of_the_states_whatever_a_library_calls_them(
 def test_a_unit_that_is_known_takes_the_place_of_its_name(known, told):
     bend = labelled(tc.terms.sensor(("y",), static=True)[2], known, {})
     assert [q.unit for q in bend.parameters] == [told]
+    if known.get("y"):
+        assert [q.unit for q in tc.terms.sensor(("y",), units=known, static=True)[2].parameters] == [told]
     offset = labelled(tc.terms.sensor(("y",), static=True)[0], known, {})
     assert [q.unit for q in offset.parameters] == [known.get("y") or "[y]"]
 

@@ -8,7 +8,17 @@ from torch import Tensor
 
 from torchcal.errors import DomainError
 from torchcal.simulators import Parameter
-from torchcal.terms.pieces import amplitude, check_name, check_positive, own_name, quantity, shape, timed, titled
+from torchcal.terms.pieces import (
+    amplitude,
+    check_name,
+    check_positive,
+    factor,
+    own_name,
+    quantity,
+    shape,
+    timed,
+    titled,
+)
 from torchcal.terms.term import Term
 
 __all__ = ["kinetics"]
@@ -188,7 +198,7 @@ class _Law:
                       "The rate goes with another power of the concentration than the model's.",
                       constants={ref: a if reference is None else reference}),
             self.term("saturation", lambda t, s, p, u: -torch.log1p(p[big] * torch.relu(s[a])),
-                      amplitude(big, f"1/({amount})", low=0.0), f"1/(1 + {big} {a})",
+                      amplitude(big, f"1/{factor(amount)}", low=0.0), f"1/(1 + {big} {a})",
                       "Catalyst or enzyme is fully occupied at high concentration (Michaelis-Menten, Langmuir)."),
             self.term("deactivation", lambda t, s, p, u: -p[r] * t, amplitude(r, f"1/{time}", low=0.0),
                       f"exp(-{r} t)", "The catalyst loses its activity with time.", elapsed="run"),
@@ -196,7 +206,7 @@ class _Law:
         if b is not None:
             found.append(
                 self.term("product inhibition", lambda t, s, p, u: -torch.log1p(p[big] * torch.relu(s[b])),
-                          amplitude(big, f"1/({amount})", low=0.0), f"1/(1 + {big} {b})",
+                          amplitude(big, f"1/{factor(amount)}", low=0.0), f"1/(1 + {big} {b})",
                           "The product occupies the catalyst and slows the reaction.")
             )  # fmt: skip
         return found

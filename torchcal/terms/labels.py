@@ -5,14 +5,13 @@ import dataclasses
 import re
 from collections.abc import Mapping
 
+from torchcal.terms.pieces import factor
 from torchcal.terms.term import Term
 
 __all__ = ["labelled"]
 
 #: The parts of a unit's text: ``[x]``, which stands for the unit of x, in brackets of its own or not, and names.
 PARTS = re.compile(r"\(\[[^\[\]]*\]\)|\[[^\[\]]*\]|[^\s/*^()\[\]·]+")
-#: A unit that is one factor as it stands.
-SIMPLE = re.compile(r"[^\W\d_]+|%|°[^\W\d_]*")
 
 
 def labelled(term: Term, known: Mapping[str, str | None], states: Mapping[str, str | None]) -> Term:
@@ -57,4 +56,4 @@ def _put(part: str, units: Mapping[str, str]) -> str:
     unit = units.get(part.removeprefix("(").removesuffix(")"))
     if unit is None:
         return part
-    return unit if SIMPLE.fullmatch(unit) or unit.startswith("[") else f"({unit})"
+    return unit if unit.startswith("[") else factor(unit)

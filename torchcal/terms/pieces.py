@@ -23,6 +23,7 @@ __all__ = [
     "check_names",
     "check_positive",
     "excess",
+    "factor",
     "lagging",
     "magnitude",
     "own_name",
@@ -128,6 +129,19 @@ def check_positive(value: Any, what: str) -> float:
     if not (math.isfinite(number) and number > 0):
         raise DomainError(f"Expected {what} as a positive number. Got {value!r}.")
     return number
+
+
+#: A unit that is one factor as it stands.
+SIMPLE = re.compile(r"[^\W\d_]+|%|°[^\W\d_]*")
+
+
+def factor(unit: str) -> str:
+    """A unit as one factor of another one.
+
+    >>> factor("mm"), factor("mol/L"), factor("[y]")
+    ('mm', '(mol/L)', '([y])')
+    """
+    return unit if SIMPLE.fullmatch(unit) else f"({unit})"
 
 
 class Units:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchcal.errors import DomainError
 from torchcal.simulators import Parameter
-from torchcal.terms.pieces import amplitude, check_name, check_names, excess, shape, timed
+from torchcal.terms.pieces import amplitude, check_name, check_names, excess, factor, shape, timed
 from torchcal.terms.term import Term, outer
 
 __all__ = ["sensor"]
@@ -112,7 +112,7 @@ def _instant(output: str, unit: str, static: bool) -> list[Term]:
             "+ b", "The instrument's zero is off."),
         add("gain error", lambda p, y: y + p["g"] * y, [amplitude("g", "1")],
             f"+ g {output}", "The instrument's scale is off by the fraction g."),
-        add("non-linearity", lambda p, y: y + p["q"] * y.square(), [amplitude("q", f"1/({unit})")],
+        add("non-linearity", lambda p, y: y + p["q"] * y.square(), [amplitude("q", f"1/{factor(unit)}")],
             f"+ q {output}²", "The instrument's response bends."),
         add("saturation", lambda p, y: y - p["c"] * y.sign() * excess(y.abs(), p["y0"]),
             # 1 is a hard limit; room above, so that noise does not push the estimate against a bound.
