@@ -18,6 +18,7 @@ from torchcal.errors import (
     SimulatorError,
     TorchcalWarning,
 )
+from torchcal.inference import tangent
 from torchcal.inference.setup import check_inputs
 from torchcal.simulators.static import _copied
 
@@ -172,6 +173,36 @@ def test_parameters_that_are_known_as_a_product_alone_are_told(additive):
     calibrate = tc.calibrate_additive if additive else tc.calibrate
     with pytest.warns(IdentifiabilityWarning, match="The data determine a, c only together"):
         calibrate(product, recording, num_samples=0)
+
+
+def test_a_product_is_told_of_a_code_whose_starts_all_end_at_one_point():
+    """Where starts that end alike share one end, and others are given up, no two ends show the ridge."""
+    product = tc.ExternalSimulator(lambda x, p: p["a"] * p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    x = np.linspace(0, 2, 6)
+    simplest = tc.embeddings.PolynomialChaos(order=0)
+    with pytest.warns(IdentifiabilityWarning, match="The data determine a, b only together"):
+        mode(product, 3 * x, x, embedding=simplest, likelihood="abc_mean", starts=torch.tensor([[0.5, 0.0]]))
+
+
+def test_a_product_is_told_where_the_maximum_of_it_lies_at_a_bound():
+    bounded = [tc.Parameter(name, low=0.1, high=10.0) for name in "ab"]
+    product = tc.Simulator(lambda x, p: p["a"] * p["b"] * x, bounded)
+    x = np.linspace(0, 2, 12)
+    y = 3 * x**1.1 + 0.1 * torch.randn(12, generator=torch.Generator().manual_seed(0), dtype=torch.float64).numpy()
+    with pytest.warns(IdentifiabilityWarning, match="The data determine a, b only together"):
+        mode(product, y, x, embedding=tc.embeddings.Gaussian(("a",)))
+
+
+def test_starts_that_were_given_up_are_not_held_against_the_best(monkeypatch):
+    monkeypatch.setattr(tangent, "_DISTINCT", 1)
+    monkeypatch.setattr(tangent, "_SAME", -1.0)  # each start counts as one that ends elsewhere on the tangents
+    code = tc.ExternalSimulator(lambda x, p: p["a"] * x, [tc.Parameter("a")])
+    told = (
+        r"Only 1 of 4 starts was followed to the end, to the objective .*; the 3 others were given up on the way, "
+        r"behind it\. The maximum may not be the global one\. Give the parameters bounds or initial= near"
+    )
+    with pytest.warns(ConvergenceWarning, match=told):
+        mode(code, 0.5 * X + 0.1 * np.sin(X), num_starts=4)
 
 
 def test_places_of_one_ridge_are_one_maximum():

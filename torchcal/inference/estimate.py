@@ -113,21 +113,13 @@ def maximise(
                 f"Expected a finite posterior at some starting point. Got none at {len(starts)}. Check the "
                 "simulator over the parameters' ranges, or pass starts=."
             )
-        agreeing, ends = _agreeing(found), found.values
+        agreeing, ends, given_up = _agreeing(found), found.values, found.given_up
         found = _refined(problem, found, show)
     best, ties = _first_of_the_tied(problem, found)
     if agreeing < 2 <= len(ends):
-        warn(
-            f"Only 1 of {len(ends)} starts reached the best objective {float(ends[0]):.6g}; the next ended at "
-            f"{float(ends[1]):.6g}. The maximum may not be the global one. Raise num_starts=.",
-            ConvergenceWarning,
-        )
-    piece = pieces(problem.propagate, len(problem.y))
-    curvature = hessian(lambda a: -problem.log_prob(a), _inside(problem, best)[None], piece=piece)[0]
-    values, vectors = torch.linalg.eigh(torch.nan_to_num(curvature))
-    top = float(values.abs().max().clamp_min(1e-300))
-    # Flat beside the steepest direction and flat in itself: at a spike every other direction is only the former.
-    null = vectors.T[values.abs() <= min(NULL_CURVATURE * top, max(1.0, 1e-9 * top))]
+        warn(_lonely(problem, ends, given_up), ConvergenceWarning)
+    curvature = _curvature(problem, best)
+    null = _flat_directions(curvature)
     unseen = _unseen_means(problem, best, curvature)
     if unseen:
         warn(
@@ -135,7 +127,9 @@ def maximise(
             "record conditions in which it matters.",
             IdentifiabilityWarning,
         )
-    together = () if unseen else _known_together(problem, found, null)
+    middle = _middle_of_the_tied(problem, found, best)
+    along = null if middle is best else _flat_directions(_curvature(problem, middle))
+    together = () if unseen else _known_together(problem, found, middle, along)
     if together:
         warn(
             f"The data determine {', '.join(together)} only together: other values of them give the same maximum, as "
@@ -152,7 +146,7 @@ def maximise(
         agreeing=agreeing,
         ties=ties,
         null_directions=null,
-        improper=_unheld(problem, unseen) or _endless(problem, best, null, together),
+        improper=_unheld(problem, unseen) or _endless(problem, middle, along, together),
         others=problem.prior.transform.bound(found.points[found.values - found.values[0] < MODE_GAP]),
     )
 
@@ -216,6 +210,22 @@ def _objective(problem: Problem) -> Callable[[NISP, Tensor], Tensor]:
     return objective
 
 
+def _curvature(problem: Problem, alpha: Tensor) -> Tensor:
+    """Of the negative log-posterior, ``(P, P)``."""
+    piece = pieces(problem.propagate, len(problem.y))
+    return torch.nan_to_num(hessian(lambda a: -problem.log_prob(a), _inside(problem, alpha)[None], piece=piece)[0])
+
+
+def _flat_directions(curvature: Tensor) -> Tensor:
+    """Unit vectors ``(k, P)`` along which there is none.
+
+    Flat beside the steepest direction and flat in itself: at a spike every other direction is only the former.
+    """
+    values, vectors = torch.linalg.eigh(curvature)
+    top = float(values.abs().max().clamp_min(1e-300))
+    return vectors.T[values.abs() <= min(NULL_CURVATURE * top, max(1.0, 1e-9 * top))]
+
+
 def _unseen_means(problem: Problem, alpha: Tensor, curvature: Tensor) -> tuple[str, ...]:
     """Parameters whose means can move by one scaled unit at no cost.
 
@@ -223,7 +233,7 @@ def _unseen_means(problem: Problem, alpha: Tensor, curvature: Tensor) -> tuple[s
     """
     pattern = problem.propagate.pattern
     rows = pattern.leading.nonzero()[:, 0].to(alpha.device)
-    values, vectors = torch.linalg.eigh(torch.nan_to_num(curvature)[rows][:, rows])
+    values, vectors = torch.linalg.eigh(curvature[rows][:, rows])
     flat = vectors.T[values.abs() <= NULL_CURVATURE * values.abs().max().clamp_min(1e-300)]
     names: list[str] = []
     with torch.no_grad():
@@ -237,47 +247,74 @@ def _unseen_means(problem: Problem, alpha: Tensor, curvature: Tensor) -> tuple[s
     return tuple(dict.fromkeys(names))
 
 
-def _known_together(problem: Problem, found: Minima, null: Tensor) -> tuple[str, ...]:
+def _known_together(problem: Problem, found: Minima, point: Tensor, null: Tensor) -> tuple[str, ...]:
     """Parameters whose means differ between maxima of the same objective that a flat direction of means joins.
 
-    Such a ridge may be bent, so that no straight step along it is free.
+    Such a ridge may be bent, so that no straight step along it is free. Where all starts ended at one point of it, or
+    were given up for the one that did, another is sought a step away.
     """
     rows = problem.propagate.pattern.leading.nonzero()[:, 0].to(null.device)
     flat = (null[:, rows].abs() > SAME_MEANS).any(0)
+    if int(flat.sum()) < 2:
+        return ()
     means = _tied(problem, found)[:, rows]
+    if not bool((means.amax(0) - means.amin(0) > SAME_MEANS).any()):
+        along = _along_means(null, rows)
+        ahead = (_ahead(problem, point, sign * along, 1.0) for sign in (1.0, -1.0))  # one way may lead out of bounds
+        means = torch.stack([point, next((there for there in ahead if there is not None), point)])[:, rows]
     apart = flat & (means.amax(0) - means.amin(0) > SAME_MEANS)
     names = [name for name, far in zip(problem.propagate.pattern.names, apart.tolist(), strict=True) if far]
     return tuple(names) if len(names) > 1 else ()
 
 
-def _endless(problem: Problem, best: Tensor, null: Tensor, together: tuple[str, ...]) -> tuple[str, ...]:
+def _along_means(null: Tensor, rows: Tensor) -> Tensor:
+    """The means' part of the flat direction that has most of them, ``(P,)``."""
+    means = torch.zeros_like(null).index_copy(1, rows, null[:, rows])
+    return torch.linalg.svd(means, full_matrices=False).Vh[0]
+
+
+def _ahead(problem: Problem, point: Tensor, along: Tensor, step: float) -> Tensor | None:
+    """The maximum that is found from a step along a ridge; None where it is lower, or the way back to where it began.
+
+    Args:
+        problem: Of which ``point`` is a maximum.
+        point: ``(P,)``.
+        along: The direction ``(P,)``, of means alone.
+        step: Its length.
+    """
+    objective, piece = _objective(problem), pieces(problem.propagate, len(problem.y))
+    rows = problem.propagate.pattern.leading.nonzero()[:, 0].to(point.device)
+    start = point + step * along / along.norm()
+    start = torch.maximum(torch.minimum(start, problem.prior.high), problem.prior.low)
+    found = minimise(
+        lambda u: objective(problem.propagate, u), problem.prior.transform.unbound(start[None]), piece=piece
+    )
+    there = problem.prior.transform.bound(found.points)[0]
+    highest = -float(problem.log_prob(point).detach())
+    lower = float(found.values[0]) > highest + AGREEMENT * (1 + abs(highest))
+    return None if lower or float((there - point)[rows].norm()) < FORTH * step else there
+
+
+def _endless(problem: Problem, point: Tensor, null: Tensor, together: tuple[str, ...]) -> tuple[str, ...]:
     """Parameters that are known together alone, where the ridge of their maxima goes on far beyond the scale.
 
     One that is closed, as where a model has the sum of two squares, has a finite integral.
     """
     if not together or len(_unheld(problem, together)) < len(together):
         return ()
-    propagate, prior = problem.propagate, problem.prior
-    rows = propagate.pattern.leading.nonzero()[:, 0].to(null.device)
-    means = null[:, rows]
-    begin = torch.zeros_like(best)
-    begin[rows] = means[means.norm(dim=-1).argmax()]
-    objective, piece = _objective(problem), pieces(propagate, len(problem.y))
-    highest = -float(problem.log_prob(best).detach())
-    highest += AGREEMENT * (1 + abs(highest))
-    scaling = propagate.scaling
-    size = (scaling.physical(best[rows]) / scaling.scale.to(best))[~scaling.log.to(best.device)]
+    scaling = problem.propagate.scaling
+    rows = problem.propagate.pattern.leading.nonzero()[:, 0].to(null.device)
+    size = (scaling.physical(point[rows]) / scaling.scale.to(point))[~scaling.log.to(point.device)]
     far = FAR * max(1.0, float(size.norm()))
+    begin = _along_means(null, rows)
     for sign in (1.0, -1.0):
-        point, along, step = best, sign * begin, 1.0
-        while float((point - best)[rows].norm()) < far:
-            start = torch.maximum(torch.minimum(point + step * along / along.norm(), prior.high), prior.low)
-            found = minimise(lambda u: objective(propagate, u), prior.transform.unbound(start[None]), piece=piece)
-            gone = prior.transform.bound(found.points)[0] - point
-            along = torch.zeros_like(best).index_copy(0, rows, gone[rows])
-            if float(found.values[0]) > highest or float(along.norm()) < FORTH * step:
+        here, along, step = point, sign * begin, 1.0
+        while float((here - point)[rows].norm()) < far:
+            ahead = _ahead(problem, here, along, step)
+            if ahead is None:
                 break
-            point, step = point + gone, LONGER * step
+            along = torch.zeros_like(point).index_copy(0, rows, (ahead - here)[rows])
+            here, step = ahead, LONGER * step
         else:
             return together
     return ()
@@ -289,6 +326,22 @@ def _unheld(problem: Problem, unseen: tuple[str, ...]) -> tuple[str, ...]:
     bounded = {p.name for p in problem.propagate.free if p.low is not None and p.high is not None}
     plain = bounded - set(problem.propagate.pattern.embedded)
     return tuple(name for name in unseen if name not in plain)
+
+
+def _lonely(problem: Problem, ends: Tensor, given_up: int) -> str:
+    """What to say of a best objective that one start alone reached, of those whose ``ends`` came best first."""
+    best, followed = float(ends[0]), len(ends) - given_up
+    others = f"{given_up} others were given up on the way, behind it" if given_up else ""
+    if followed < 2:
+        told = f"Only 1 of {len(ends)} starts was followed to the end, to the objective {best:.6g}; the {others}."
+    else:
+        of = f"{followed} starts that were followed to the end" if given_up else f"{followed} starts"
+        told = f"Only 1 of {of} reached the best objective {best:.6g}; the next ended at {float(ends[1]):.6g}"
+        told += f", and {others}." if given_up else "."
+    # A dear model's starts meet on its tangents: more of them end at the same few points.
+    more = "" if problem.propagate.simulator.dear else "Raise num_starts=, or give "
+    more = f"{more or 'Give '}the parameters bounds or initial= near their values."
+    return f"{told} The maximum may not be the global one. {more}"
 
 
 def _agreeing(found: Minima) -> int:
@@ -318,6 +371,17 @@ def _first_of_the_tied(problem: Problem, found: Minima) -> tuple[Tensor, int]:
         if len(apart) and bool(means[i, apart[0, 0]] > means[best, apart[0, 0]]):
             best = i
     return alpha[best], len(different)
+
+
+def _middle_of_the_tied(problem: Problem, found: Minima, best: Tensor) -> Tensor:
+    """Of the densities that tie for the best objective, the one nearest the middle of the scales, ``(P,)``.
+
+    At a bound, or far out, a ridge on which they lie is hard to see in the curvature. ``best`` itself where it is one.
+    """
+    rows = problem.propagate.pattern.leading.nonzero()[:, 0].to(best.device)
+    alpha = _tied(problem, found)
+    middle = alpha[alpha[:, rows].norm(dim=-1).argmin()]
+    return middle if float((middle - best)[rows].abs().max()) > SAME_MEANS else best
 
 
 def _inside(problem: Problem, alpha: Tensor) -> Tensor:

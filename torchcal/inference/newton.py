@@ -40,11 +40,13 @@ class Minima:
         points: ``(S, P)``.
         values: Objective there, ``(S,)``; +inf where it was never finite.
         iterations: Iterations of the longest run.
+        given_up: Starts that were left on the way for better ones, and have ended nowhere.
     """
 
     points: Tensor
     values: Tensor
     iterations: int
+    given_up: int = 0
 
 
 def gradient(objective: Objective, points: Tensor, *, piece: int | None = None) -> tuple[Tensor, Tensor]:
@@ -125,6 +127,7 @@ def minimise(
     stalls = torch.zeros(len(points), dtype=torch.long, device=points.device)
     active = torch.isfinite(values)
     leader = torch.arange(len(points), device=points.device)
+    left = torch.zeros_like(active)
     iteration = 0
     for iteration in range(1, max_iterations + 1):
         rows = active.nonzero()[:, 0]
@@ -147,14 +150,15 @@ def minimise(
             join(values, active, leader, None if places is None else points[:, places])
         if keep is not None and iteration % _ROUND == 0:
             rows = active.nonzero()[:, 0]
-            active[rows[values[rows].argsort()[max(keep, -(-len(rows) // 2)) :]]] = False
+            worse = rows[values[rows].argsort()[max(keep, -(-len(rows) // 2)) :]]
+            active[worse], left[worse] = False, True
         if progress is not None:
             progress(iteration, values)
     for _ in range(len(points)):  # a leader may itself have joined another
         leader = leader[leader]
     points, values = points[leader], values[leader]
     order = values.argsort(stable=True)
-    return Minima(points[order], values[order], iteration)
+    return Minima(points[order], values[order], iteration, given_up=int(left[leader].sum()))
 
 
 def directions(slope: Tensor, curvature: Tensor) -> Tensor:

@@ -138,6 +138,8 @@ def search(
     best = values.argsort(stable=True)
     best = best[torch.isfinite(values[best])]
     apart = values[best].diff() > _SAME * (1 + values[best][1:].abs())
+    place = torch.cat([torch.zeros_like(best[:1]), apart.cumsum(0)])
+    followed = torch.zeros_like(values, dtype=torch.bool).index_copy(0, best, place < _FINISHED)
     best = best[torch.cat([torch.ones_like(best[:1], dtype=torch.bool), apart])][:_FINISHED]
     for row in best.tolist():
         # What the tangents leave out, the model's curvature times its error, makes the end of the way slow.
@@ -147,10 +149,11 @@ def search(
     ends = rough.points.clone()
     results = torch.full_like(rough.values, torch.inf)
     ends[kept], results[kept] = points[group[kept]], values[group[kept]]
+    arrived = kept.index_put((kept,), followed[group[kept]])
     if bool(values[-1] < results.min()):  # the plane led astray
-        ends[-1], results[-1] = points[-1], values[-1]
+        ends[-1], results[-1], arrived[-1] = points[-1], values[-1], True
     order = results.argsort(stable=True)
-    return Minima(ends[order], results[order], rough.iterations + iterations)
+    return Minima(ends[order], results[order], rough.iterations + iterations, given_up=int((~arrived).sum()))
 
 
 def few_nodes(propagate: NISP) -> NISP | None:
