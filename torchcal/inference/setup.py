@@ -1,5 +1,6 @@
 """From a simulator, a recording and choices to a well-posed problem, with every check before any long work."""
 
+import copy
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -21,7 +22,7 @@ from torchcal.errors import (
     TorchcalWarning,
     warn,
 )
-from torchcal.inference.fitting import allowed_solver_error
+from torchcal.inference.fitting import allowed_solver_error, plain_propagation
 from torchcal.models import Problem
 from torchcal.polychaos import Rule
 from torchcal.priors import CoefficientPrior
@@ -45,8 +46,11 @@ def check_inputs(
     """Raise for what cannot be calibrated, before any long work.
 
     Returns:
-        The simulator, in time bound to the recording and with time steps that work at the first guess; and its free
-        parameters.
+        The simulator, in time bound to the recording and with time steps that work at the first guess, and without a
+        degree that does not hold; and its free parameters.
+
+    Warns:
+        PropagationWarning: Where the degree does not hold.
     """
     if not isinstance(simulator, Simulator):
         raise DomainError(
@@ -94,6 +98,9 @@ def check_inputs(
     # In the middle of the scales; and for what tells nothing there, ever farther off.
     asked = torch.cat([values[:1], values[len(values) // 2 :: 4]])
     check_slopes(simulator, recording.x, asked, columns, recording.outputs, kept=recording.observed)
+    if simulator.degree is not None and plain_propagation(simulator, recording, fixed, scaling).degree is None:
+        simulator = copy.copy(simulator)  # which has told of it; every propagation to come would again
+        simulator.degree = None
     return simulator, free
 
 
