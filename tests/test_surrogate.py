@@ -435,6 +435,11 @@ def test_a_failing_point_is_named_and_what_was_done_is_kept(pool, tmp_path):
         assert isinstance(caught.value.__cause__, ValueError)
 
 
+def test_a_function_that_raises_is_not_told_to_return_what_is_refused():
+    with pytest.raises(SimulatorError, match=r"Mend it there, or narrow the bounds so that it has an answer"):
+        build(fails)
+
+
 def test_a_point_that_is_not_finite_is_named():
     def bad(x, p):
         return math.nan if p["a"] > 2.8 else cubic(x, p)

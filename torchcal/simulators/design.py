@@ -116,7 +116,7 @@ def evaluate_points(
             _check_same(call, known, store, executor)
         run_tasks(call, tasks, executor=executor, on_result=take)
     except TaskError as failure:
-        error = failed_evaluation(failure, call.describe(tasks[failure.index]))
+        error = failed_evaluation(failure, call.describe(tasks[failure.index]), everywhere=True)
         _attach_partial(error, store)
         raise error from failure.error
     except (SimulatorError, KeyboardInterrupt) as interruption:
@@ -212,7 +212,7 @@ def _check_same(call: PointCall, key: bytes, store: _Store, executor: Executor |
     try:
         run_tasks(call, [row], executor=executor, on_result=found.__setitem__)
     except TaskError as failure:
-        raise failed_evaluation(failure, point) from failure.error
+        raise failed_evaluation(failure, point, everywhere=True) from failure.error
     names, value = found[0]
     known = store.values[key]
     if names != store.outputs or not np.all(np.abs(value - known) <= _SAME * np.abs(known) + 1e-300):

@@ -133,8 +133,8 @@ def describe_point(row: Sequence[float], conditions: tuple[str, ...] | None, par
     return f"x = {x!r}, p = {p!r}"
 
 
-def failed_evaluation(failure: TaskError, point: str) -> SimulatorError:
-    """The error of an evaluation that failed, named with its point."""
+def failed_evaluation(failure: TaskError, point: str, *, everywhere: bool = False) -> SimulatorError:
+    """The error of an evaluation that failed, named with its point; ``everywhere`` where NaN would be no answer."""
     error = failure.error
     if worker_died(error):
         others = f" or one of the {failure.suspects - 1} pieces of work sent after it" if failure.suspects > 1 else ""
@@ -144,9 +144,12 @@ def failed_evaluation(failure: TaskError, point: str) -> SimulatorError:
         )
     if isinstance(error, SimulatorError):
         return SimulatorError(f"{error} This happened at {point}.")
+    otherwise = "let it return float('nan') where it has no answer"
+    if everywhere:
+        otherwise = "narrow the bounds so that it has an answer everywhere between them"
     return SimulatorError(
         f"Expected the function to return a number. It raised {raised(error)}. It was called "
-        f"with {point}. Mend it there, or let it return float('nan') where it has no answer."
+        f"with {point}. Mend it there, or {otherwise}."
     )
 
 
