@@ -236,6 +236,11 @@ def test_options(options, error):
         pytest.param({"prior": "flat"}, id="prior in words"),
         pytest.param({"fixed": {"a": "one"}}, id="fixed in words"),
         pytest.param({"fixed": {"a": None}}, id="fixed at nothing"),
+        pytest.param({"fixed": {"a": True}}, id="fixed at a bool"),
+        pytest.param({"fixed": {"a": np.True_}}, id="fixed at a bool of NumPy's"),
+        pytest.param({"fixed": {"a": torch.tensor(True)}}, id="fixed at a bool of torch's"),
+        pytest.param({"fixed": {"a": b"1"}}, id="fixed in bytes"),
+        pytest.param({"fixed": {"a": np.array("1")}}, id="fixed at a string of NumPy's"),
         pytest.param({"fixed": ["a"]}, id="fixed as a list"),
         pytest.param({"seed": 1.5}, id="seed as float"),
         pytest.param({"seed": -1}, id="negative seed"),
@@ -248,6 +253,18 @@ def test_options(options, error):
 def test_options_that_fall_through(options):
     with pytest.raises(TorchcalError):
         attempt(**options)
+
+
+def test_a_fixed_value_is_no_string():
+    told = r"finite number for the fixed parameter 'a'. Got '1' \(str\). Give one, as in fixed=\{'a': 1.0\}"
+    with pytest.raises(DomainError, match=told):
+        attempt(fixed={"a": "1"})
+
+
+@pytest.mark.parametrize("value", [1, np.float32(1), np.array(1.0), torch.tensor(1), torch.tensor([1.0])])
+def test_a_fixed_value_may_be_any_real_number(value):
+    held = tc.simulators.free_parameters(AB, {"a": value})[1]
+    assert held == {"a": 1.0}
 
 
 def test_a_prior_that_is_already_made_is_refused():

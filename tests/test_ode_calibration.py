@@ -142,6 +142,8 @@ def test_per_run_parameters_are_inferred_but_not_embedded() -> None:
     assert found.map.parameters == ("k", "room[0]", "room[1]")
     assert found.propagate.pattern.embedded == ("k",)
     assert float(found.map.mean[2] - found.map.mean[1]) == pytest.approx(0.5, abs=0.2)
+    rooms = found.predict([0.0], function=lambda x, p: (p["room[1]"] - p["room[0]"]) * (1 + x))
+    assert float(rooms.mean) == pytest.approx(float(found.map.mean[2] - found.map.mean[1]))
     one = tc.calibrate(model, tc.Recording(runs=runs[:1]), num_samples=0, num_starts=8, seed=0)
     assert one.propagate.pattern.embedded == ("k", "room")  # of one run, it is a parameter like any other
 

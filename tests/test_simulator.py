@@ -3,6 +3,7 @@
 import math
 import warnings
 
+import numpy as np
 import pytest
 import torch
 
@@ -35,6 +36,12 @@ def test_parameter_keeps_what_it_was_given_as_floats():
         parameter.low = 0.0
 
 
+@pytest.mark.parametrize("kind", [tc.Simulator, tc.ExternalSimulator])
+def test_a_parameter_of_each_run_is_refused_where_there_are_no_runs(kind):
+    with pytest.raises(DomainError, match=r"Got per_run=True for \['k'\]: a static recording has no runs"):
+        kind(lambda x, p: p["a"] + p["k"] * x, [tc.Parameter("a"), tc.Parameter("k", per_run=True)])
+
+
 @pytest.mark.parametrize(
     ("bad", "message"),
     [
@@ -44,6 +51,9 @@ def test_parameter_keeps_what_it_was_given_as_floats():
         ({"high": math.inf}, "finite number for high"),
         ({"initial": "guess"}, "finite number for initial"),
         ({"initial": True}, "finite number for initial"),
+        ({"initial": np.True_}, "finite number for initial"),
+        ({"low": np.array("1")}, "finite number for low"),
+        ({"high": torch.tensor(True)}, "finite number for high"),
         ({"per_run": "yes"}, "per_run of parameter 'k' as True or False"),
         ({"neutral": [1.0, 2.0]}, "finite number for neutral"),
         ({"low": 2.0, "high": 1.0}, "low < high"),
@@ -75,7 +85,7 @@ def test_free_parameters_refuses_what_it_cannot_hold():
         free_parameters(AB, {"z": 1.0})
     with pytest.raises(EmbeddingError, match="at least one free parameter"):
         free_parameters(AB, {"a": 1.0, "b": 1.0})
-    with pytest.raises(DomainError, match="finite value"):
+    with pytest.raises(DomainError, match="finite number"):
         free_parameters(AB, {"a": math.inf})
 
 

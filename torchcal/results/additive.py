@@ -15,7 +15,7 @@ from torchcal.prediction import (
 )
 from torchcal.propagation import NISP
 from torchcal.results import reading, storage
-from torchcal.results.base import Result, conditions, indent, thin
+from torchcal.results.base import Result, another_output, conditions, indent, thin
 from torchcal.results.diagnostics import Diagnostics, table
 from torchcal.results.estimate import MapEstimate
 from torchcal.results.in_time import propagation_in_time
@@ -89,7 +89,7 @@ class AdditiveCalibration(Result):
             propagate = propagation_in_time(propagate, self.recording, x, self.map.alpha[:-1])
         elif x is not None or function is not None:
             where = propagate.x if x is None else conditions(x, None if function else self.recording)
-            other = None if function is None else Simulator(function, propagate.simulator.parameters)
+            other = None if function is None else another_output(function, propagate.simulator)
             propagate = propagate.at(where, simulator=other)
         return additive_prediction(
             propagate,

@@ -1,8 +1,9 @@
 """What all results can do: print themselves, be saved and be exported."""
 
+import dataclasses
 import html
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import torch
@@ -14,9 +15,9 @@ from torchcal.data.conditions import checked
 from torchcal.files import check_target
 from torchcal.results import storage
 from torchcal.results.estimate import MapEstimate
-from torchcal.simulators import Conditions
+from torchcal.simulators import Conditions, Simulator
 
-__all__ = ["Result", "conditions", "indent", "thin"]
+__all__ = ["Result", "another_output", "conditions", "indent", "thin"]
 
 
 class Result:
@@ -72,6 +73,13 @@ def conditions(x: Any, recording: Recording | None) -> Conditions:
     if recording is None:
         return checked(x, tuple(x) if isinstance(x, Mapping) else None)
     return checked(x, tuple(recording.x) if isinstance(recording.x, Mapping) else None, recording.units)
+
+
+def another_output(function: Callable[[Any, dict[str, Tensor]], Any], simulator: Simulator) -> Simulator:
+    """Another function of a simulator's parameters, ``function(x, p)``; of one in time those of each run too."""
+    made = Simulator(function, [dataclasses.replace(q, per_run=False) for q in simulator.parameters])
+    made.parameters = simulator.parameters
+    return made
 
 
 def indent(text: str) -> str:

@@ -21,7 +21,7 @@ from torchcal.prediction import (
 from torchcal.propagation import NISP
 from torchcal.propagation.convergence import SETTLED
 from torchcal.results import reading, storage
-from torchcal.results.base import Result, conditions, indent, thin
+from torchcal.results.base import Result, another_output, conditions, indent, thin
 from torchcal.results.diagnostics import Diagnostics, table
 from torchcal.results.estimate import MapEstimate
 from torchcal.results.in_time import NODE_TOLERANCE, check_nodes_in_time, propagation_in_time
@@ -96,7 +96,7 @@ class Calibration(Result):
             other = propagation_in_time(self.propagate, self.recording, x, self.map.alpha)
         else:
             where = self.propagate.x if x is None else conditions(x, None if function else self.recording)
-            simulator = None if function is None else Simulator(function, self.propagate.simulator.parameters)
+            simulator = None if function is None else another_output(function, self.propagate.simulator)
             other = self.propagate.at(where, simulator=simulator)
         if other.pattern.num_germs:  # nodes that were enough at the data may not be elsewhere
             alpha = self.map.alpha.to(other.nodes)

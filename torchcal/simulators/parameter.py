@@ -4,13 +4,37 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchcal.errors import DomainError, EmbeddingError, ShapeError
 
-__all__ = ["Parameter", "Scaling", "free_parameters", "in_run", "is_value_of", "spans"]
+__all__ = ["Parameter", "Scaling", "free_parameters", "in_run", "is_value_of", "real_number", "spans"]
+
+QUANTITY = "Give its magnitude in the parameter's unit, value.to(unit).magnitude."
+"""What to do with a number that has a unit."""
+
+
+def real_number(value: Any) -> float:
+    """One real number, Python's, NumPy's or torch's, as a float; NaN of a string, a flag or anything else.
+
+    >>> [real_number(value) for value in (2, torch.tensor(0.5), "1", True, [1.0])]
+    [2.0, 0.5, nan, nan, nan]
+    """
+    dtype = getattr(value, "dtype", None)
+    if isinstance(dtype, torch.dtype):
+        value = value.tolist() if value.numel() == 1 else None
+        value = value[0] if isinstance(value, list) and len(value) == 1 else value
+    elif dtype is not None and getattr(dtype, "kind", "f") not in "iuf":
+        return math.nan
+    if isinstance(value, str | bytes | bytearray | bool):
+        return math.nan
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
 
 
 def in_run(parameter: str, run: int) -> str:
@@ -93,14 +117,9 @@ class Parameter:
             value = getattr(self, field)
             if value is None:
                 continue
-            try:
-                number = math.nan if isinstance(value, str | bytes | bool) else float(value)
-            except (TypeError, ValueError):
-                number = math.nan
+            number = real_number(value)
             if not math.isfinite(number):
-                advice = "Leave it out where there is none."
-                if hasattr(value, "magnitude"):  # a quantity with a unit
-                    advice = "Give its magnitude in the parameter's unit, value.to(unit).magnitude."
+                advice = QUANTITY if hasattr(value, "magnitude") else "Leave it out where there is none."
                 raise DomainError(
                     f"Expected a finite number for {field} of parameter {self.name!r}. Got {value!r}. {advice}"
                 )
@@ -171,7 +190,7 @@ def free_parameters(
 
     Raises:
         EmbeddingError: If ``fixed`` names a parameter that does not exist, or nothing is left free.
-        DomainError: If a fixed value is not finite.
+        DomainError: If a fixed value is no finite number, or lies outside its parameter's bounds.
     """
     if fixed is not None and not isinstance(fixed, Mapping):
         raise DomainError(f"Expected fixed as a dict from parameter names to values. Got {fixed!r}.")
@@ -185,12 +204,13 @@ def free_parameters(
     named_last = sorted(fixed.items(), key=lambda item: item[0] in names)
     each = {one: value for name, value in named_last for one in called[name]}
     for name, value in each.items():
-        try:
-            number = float(value)
-        except (TypeError, ValueError):
-            number = math.nan
+        number = real_number(value)
         if not math.isfinite(number):
-            raise DomainError(f"Expected a finite value for the fixed parameter {name!r}. Got {value!r}.")
+            advice = QUANTITY if hasattr(value, "magnitude") else f"Give one, as in fixed={{{name!r}: 1.0}}."
+            raise DomainError(
+                f"Expected a finite number for the fixed parameter {name!r}. Got {value!r} "
+                f"({type(value).__name__}). {advice}"
+            )
         parameter = parameters[names.index(name)]
         if not parameter.contains(number):
             bounds = "positive values" if parameter.transform == "log" else f"[{parameter.low}, {parameter.high}]"

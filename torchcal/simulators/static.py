@@ -93,7 +93,7 @@ class Simulator:
             exact with the fewest nodes; without it the number of nodes is found by trial.
 
     Raises:
-        DomainError: If there is no parameter, or one is named twice.
+        DomainError: If there is no parameter, one is named twice, or one has ``per_run=True``: there are no runs.
 
     >>> line = Simulator(lambda x, p: p["a"] + p["b"] * x, [Parameter("a"), Parameter("b")])
     >>> line.at(torch.tensor([0.0, 1.0]))(torch.tensor([2.0, 3.0]))
@@ -117,6 +117,11 @@ class Simulator:
             raise DomainError(f"Expected a callable f(x, p). Got {type(function).__name__}.")
         self.function = function
         self.parameters = check_parameters(parameters)
+        if each := [parameter.name for parameter in self.parameters if parameter.per_run]:
+            raise DomainError(
+                f"Expected parameters with one value for all conditions. Got per_run=True for {each}: a static "
+                "recording has no runs (drop it and give each table a parameter of its own, or use an ODESimulator)."
+            )
         self.degree = None if degree is None else whole("degree", degree, 0, also="or None")
         self.seen: set[int] = set()
 
