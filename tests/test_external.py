@@ -368,8 +368,12 @@ def test_outputs_must_be_the_same_everywhere(values):
 def test_bad_arguments():
     with pytest.raises(DomainError, match="callable"):
         ExternalSimulator(3.0, PARAMETERS)
-    with pytest.raises(DomainError, match="step"):
-        ExternalSimulator(scalar, PARAMETERS, step=0.0)
+    for step in (0.0, "1e-4", True):
+        with pytest.raises(DomainError, match="step"):
+            ExternalSimulator(scalar, PARAMETERS, step=step)
+    assert ExternalSimulator(scalar, PARAMETERS, step=np.float32(0.5)).step == 0.5
+    with pytest.raises(DomainError, match=r"vectorized as True or False\. Got 'no'"):
+        ExternalSimulator(scalar, PARAMETERS, vectorized="no")
     with pytest.raises(DomainError, match="executor"):
         ExternalSimulator(scalar, PARAMETERS, executor=2)
     with pytest.raises(ShapeError, match="one length"):
@@ -441,6 +445,13 @@ def test_a_function_that_returns_nan_itself_is_not_said_to_raise(values):
     with pytest.raises(SimulatorError, match=r"everywhere\. Check the simulator") as caught:
         ExternalSimulator(lambda x, p: math.nan, PARAMETERS).check(X, values)
     assert caught.value.__cause__ is None
+
+
+def test_random_numbers_in_a_code_are_told_as_such(values):
+    random = np.random.default_rng(0)
+    simulator = ExternalSimulator(lambda x, p: scalar(x, p) + random.normal(), PARAMETERS)
+    with pytest.raises(SimulatorError, match="same numbers for the same arguments: seed random numbers"):
+        simulator.check(X, values)
 
 
 def test_a_black_box_is_searched_on_its_tangents():

@@ -638,13 +638,22 @@ def test_what_an_ode_simulator_refuses() -> None:
         tc.ODESimulator(rates, ["x"], k, observe=())
     with pytest.raises(DomainError, match=r"observe as \{output: function"):
         tc.ODESimulator(rates, ["x"], k, observe={"x": 1.0})
-    with pytest.raises(DomainError, match="max_step > 0"):
-        tc.ODESimulator(rates, ["x"], k, max_step=0.0)
+    for step in (0.0, math.nan, "a", True, [0.1]):
+        with pytest.raises(DomainError, match="max_step as a number > 0"):
+            tc.ODESimulator(rates, ["x"], k, max_step=step)
+    with pytest.raises(DomainError, match="states as a dict"):
+        tc.ODESimulator(rates, 3, k)
+    with pytest.raises(DomainError, match="initial as a dict"):
+        tc.ODESimulator(rates, ["x"], k, initial=[2.0])
+    with pytest.raises(DomainError, match="observed states among"):
+        tc.ODESimulator(rates, ["x"], k, observe=3)
     with pytest.raises(DomainError, match="initial values of states"):
         tc.ODESimulator(rates, ["x"], k, initial={"z": 0.0})
-    for value in ("z", "x", [1.0]):
-        with pytest.raises(DomainError, match="initial value of 'x' as a number, another state's name or a function"):
+    for value in ("z", "x", [1.0], True, math.nan, math.inf):
+        with pytest.raises(DomainError, match=r"initial value of 'x' as a .*number, another state's name or a"):
             tc.ODESimulator(rates, ["x"], k, initial={"x": value})
+    for value in (2, np.float32(2), np.array(2), torch.tensor(2.0)):
+        assert tc.ODESimulator(rates, ["x"], k, initial={"x": value}).initial == {"x": 2.0}
     with pytest.raises(DomainError, match="at least one parameter"):
         tc.ODESimulator(rates, ["x"], [])
     with pytest.raises(SimulatorError, match=r"recording in time for an ODESimulator.*bind"):

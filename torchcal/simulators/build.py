@@ -5,7 +5,7 @@ Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 4
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from typing import Any
 
@@ -21,7 +21,7 @@ from torchcal.simulators.design import Evaluations, evaluate_points
 from torchcal.simulators.executor import check_executor
 from torchcal.simulators.external import ExternalSimulator
 from torchcal.simulators.held_out import HeldOutError, mean_and_sd, root_mean_square
-from torchcal.simulators.parameter import Parameter, Scaling
+from torchcal.simulators.parameter import Parameter, Scaling, real_number
 from torchcal.simulators.points import PointCall, describe_point
 from torchcal.simulators.scattered import check_points, fit_scattered, scatter
 from torchcal.simulators.static import Conditions, Simulator, check_parameters
@@ -105,17 +105,18 @@ def build_surrogate(
     0.250000
     """
     parameters = _choose_parameters(simulator, parameters)
-    outputs = None if outputs is None else tuple(outputs)
+    outputs = None if outputs is None else _check_outputs(outputs)
     names, bounds = check_box(conditions, parameters)
     dim = len(bounds) + len(parameters)
     order = whole("order", order, 1)
     if points is not None and nodes is not None:
         raise DomainError("Expected nodes= of a grid, or points= instead of one. Got both.")
+    limit_rows("the polynomial", math.comb(dim + order, order), advice="use a lower order= or fewer dimensions")
     counts = _check_nodes(nodes, order, dim) if points is None else []
     if points is not None:
         points = check_points(points, math.comb(dim + order, order))
     holdout, seed = whole("holdout", holdout, 10), as_seed(seed)
-    if not (isinstance(threshold, int | float) and threshold > 0):
+    if not real_number(threshold) > 0:
         raise DomainError(f"Expected threshold > 0. Got {threshold!r}.")
     external = not isinstance(simulator, Simulator) or isinstance(simulator, ExternalSimulator)
     if not external and (executor is not None or cache is not None):
@@ -310,6 +311,13 @@ def _choose_parameters(simulator: Any, parameters: Sequence[Parameter] | None) -
             "parameters=, or give them neutral=."
         )
     return tuple(chosen)
+
+
+def _check_outputs(outputs: Sequence[str]) -> tuple[str, ...]:
+    names = () if isinstance(outputs, str) or not isinstance(outputs, Iterable) else tuple(outputs)
+    if not names or not all(isinstance(name, str) for name in names) or len(set(names)) < len(names):
+        raise DomainError(f"Expected outputs as a list of different names. Got {outputs!r} (one too, in brackets).")
+    return names
 
 
 def _check_nodes(nodes: int | Sequence[int] | None, order: int, dim: int) -> list[int]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchcal.errors import DomainError, ShapeError, SimulatorError
 from torchcal.simulators.executor import TaskError, check_executor, run_tasks
-from torchcal.simulators.parameter import Parameter
+from torchcal.simulators.parameter import Parameter, real_number
 from torchcal.simulators.points import ArrayCall, Forgiving, PointCall, Value, failed_evaluation, raised_at
 from torchcal.simulators.static import Conditions, Simulator, check_values
 
@@ -68,6 +68,8 @@ class ExternalSimulator(Simulator):
 
     dear = True
 
+    unlike = "Let the function give the same numbers for the same arguments: seed random numbers, or leave them out."
+
     def __init__(
         self,
         function: Callable[[Any, dict[str, float]], Any],
@@ -80,13 +82,15 @@ class ExternalSimulator(Simulator):
     ) -> None:
         if not callable(function):
             raise DomainError(f"Expected a callable f(x, p). Got {type(function).__name__}.")
-        if not (isinstance(step, int | float) and 0 < step < 1):
+        if not isinstance(vectorized, bool):
+            raise DomainError(f"Expected vectorized as True or False. Got {vectorized!r}.")
+        if not 0 < real_number(step) < 1:
             raise DomainError(f"Expected step between 0 and 1 (a relative step). Got {step!r}.")
         super().__init__(self._call, parameters, degree=degree)
         self.external = function
         self.executor = executor
-        self.vectorized = bool(vectorized)
-        self.step = float(step)
+        self.vectorized = vectorized
+        self.step = real_number(step)
         check_executor(executor, function)
 
     def __getstate__(self) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """Simulators in time: ordinary differential equations with inputs, several runs and unknown initial states."""
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from torchcal.data import Recording, same_unit
 from torchcal.errors import DomainError, SimulatorError, UnitWarning, warn
-from torchcal.simulators.parameter import Parameter
+from torchcal.simulators.parameter import Parameter, real_number
 from torchcal.simulators.static import Conditions, Simulator, check_parameters
 from torchcal.simulators.trajectories import Trajectories
 
@@ -62,13 +63,13 @@ class ODESimulator(Simulator):
         if not callable(rates):
             raise DomainError(f"Expected rates as a function f(t, s, p, u). Got {type(rates).__name__}.")
         if not isinstance(states, str | Mapping):
-            states = () if states is None else tuple(states)
+            states = tuple(states) if isinstance(states, Iterable) else ()
         if isinstance(states, str) or not states or any(not isinstance(name, str) or not name for name in states):
             raise DomainError(f"Expected states as a dict from names to units. Got {states!r}.")
         if len(set(states)) < len(states):
             raise DomainError(f"Expected states of different names. Got {list(states)}.")
-        if max_step is not None and not max_step > 0:
-            raise DomainError(f"Expected max_step > 0 or None. Got {max_step!r}.")
+        if max_step is not None and not real_number(max_step) > 0:
+            raise DomainError(f"Expected max_step as a number > 0 or None. Got {max_step!r}.")
         if stiff is not None and not isinstance(stiff, bool):
             raise DomainError(f"Expected stiff=True, False or None. Got {stiff!r}.")
         self.rates = rates
@@ -76,8 +77,10 @@ class ODESimulator(Simulator):
         self.parameters = check_parameters(parameters)
         self.degree = None
         self.seen = set()
+        if initial is not None and not isinstance(initial, Mapping):
+            raise DomainError(f"Expected initial as a dict from states to values, or None. Got {initial!r}.")
         self.initial = dict(initial or {})
-        self.max_step = max_step
+        self.max_step = None if max_step is None else real_number(max_step)
         self.stiff = stiff
         if unknown := [name for name in self.initial if name not in self.states]:
             raise DomainError(f"Expected initial values of states {list(self.states)}. Got {unknown}.")
@@ -87,10 +90,13 @@ class ODESimulator(Simulator):
                     f"Expected the initial value of {name!r} as a number, another state's name or a function f(s, p). "
                     f"Got {value!r} with states {list(self.states)}."
                 )
-            if not (callable(value) or isinstance(value, str | float | int)):
+            if callable(value) or isinstance(value, str):
+                continue
+            self.initial[name] = number = real_number(value)
+            if not math.isfinite(number):
                 raise DomainError(
-                    f"Expected the initial value of {name!r} as a number, another state's name or a function f(s, p). "
-                    f"Got {type(value).__name__}."
+                    f"Expected the initial value of {name!r} as a finite number, another state's name or a function "
+                    f"f(s, p). Got {value!r} ({type(value).__name__})."
                 )
         self.observe = self._observed(observe)
 
@@ -103,7 +109,7 @@ class ODESimulator(Simulator):
             if not observe or not all(callable(function) for function in observe.values()):
                 raise DomainError("Expected observe as {output: function(t, s, p, u)}. Got something else in it.")
             return dict(observe)
-        observe = tuple(observe)
+        observe = tuple(observe) if isinstance(observe, Iterable) else (observe,)
         if unknown := [name for name in observe if name not in self.states]:
             raise DomainError(f"Expected observed states among {list(self.states)}. Got {unknown}.")
         if not observe:

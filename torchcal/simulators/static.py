@@ -103,6 +103,12 @@ class Simulator:
     dear: bool = False
     """Whether there is much to do for each call, whatever it is given: then all is asked for at once."""
 
+    unlike = (
+        "Write the simulator elementwise: p[name] has shape (*batch, 1), x has shape (n,), the result (*batch, n); and "
+        "leave random numbers out of it."
+    )
+    """What to do where outputs differ from call to call."""
+
     extended: tuple[Any, tuple[Any, ...]] | None = None
     """Of a simulator that terms were added to: the one without them, and the terms (`torchcal.terms.extend`)."""
 
@@ -304,8 +310,7 @@ class Simulator:
         if not bool((difference <= (1e-6 * own).clamp_min(CANCELLED * float(size.max()))).all()):
             raise SimulatorError(
                 "Expected the same outputs for parameter values in a batch as one at a time. Got a difference "
-                f"of {float(difference.max()):.3g}. Write the simulator elementwise: p[name] has shape "
-                "(*batch, 1), x has shape (n,), the result (*batch, n); and leave random numbers out of it."
+                f"of {float(difference.max()):.3g}. {self.unlike}"
             )
         return together.shape[-1]
 

@@ -19,7 +19,7 @@ from torchcal.checks import whole
 from torchcal.errors import DomainError, ExtrapolationWarning, ShapeError, SimulatorError, warn
 from torchcal.simulators.design import read_npz, write_npz
 from torchcal.simulators.held_out import NUMBERS, HeldOutError
-from torchcal.simulators.parameter import Parameter, Scaling
+from torchcal.simulators.parameter import Parameter, Scaling, real_number
 from torchcal.simulators.static import Conditions, Simulator, check_values
 
 __all__ = ["Box", "PolynomialSurrogate", "check_box", "warned_once"]
@@ -283,7 +283,7 @@ def check_box(conditions: Box, parameters: Sequence[Parameter]) -> tuple[tuple[s
         raise DomainError("Expected at least one condition. Got none. Pass conditions={name: (low, high)}.")
     for name, pair in zip(names or ("x",), pairs, strict=True):
         try:
-            low, high = (float(end) for end in pair)
+            low, high = (real_number(end) for end in pair)
         except (TypeError, ValueError):
             low = high = math.nan
         if not (math.isfinite(low) and math.isfinite(high) and low < high):
