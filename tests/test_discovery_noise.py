@@ -261,6 +261,18 @@ def test_neighbours_on_one_curve_of_a_grid_that_are_set_aside_are_told(apart):
         assert "probability of 0.075" in told[0]
 
 
+def test_both_data_at_one_level_of_a_grid_that_are_set_aside_are_told():
+    """Where the other condition has two levels, these two have no other neighbours than each other."""
+    a, b = (v.ravel() for v in np.meshgrid(np.linspace(1, 2, 20), [40.0, 60.0], indexing="ij"))
+    y = 0.1 * b * a**2 + 0.05 * np.random.default_rng(1).standard_normal(40)
+    y[[22, 23]] += 0.5
+    base = tc.Simulator(lambda x, p: p["k"] * x["b"] * x["a"] ** 2, [tc.Parameter("k", low=0.0, initial=0.2)])
+    d = tc.diagnose(base, tc.Recording(x={"a": a, "b": b}, y=y, noise=0.05), [], seed=0, progress=False)
+    assert d.set_aside.nonzero()[:, 0].tolist() == [22, 23]
+    (told,) = [line for line in d.symptoms if "are neighbours" in line]
+    assert "b = 40 and output 'y' at a = 1.579, b = 60" in told
+
+
 @pytest.mark.parametrize("noise", [0.05, None])
 def test_two_neighbours_alone_that_are_set_aside_are_told(noise):
     x = torch.linspace(0, 10, 50, dtype=F64)

@@ -16,8 +16,10 @@ from torchcal.discovery.misfit.likeliest import Tangents, settled, with_unknown
 from torchcal.discovery.misfit.lines import Lines
 from torchcal.discovery.misfit.places import SIZES
 from torchcal.discovery.misfit.residual import Residual
-from torchcal.discovery.misfit.steps import LEAST, MOST, SURER, Sudden, stepwise, sudden_changes
+from torchcal.discovery.misfit.steps import LEAST, MOST, SURER, Sudden, in_one_run, stepwise, sudden_changes
 from torchcal.discovery.misfit.structure import analyse, evidences
+from torchcal.plots.discovery.overview import figure_parts
+from torchcal.report.diagnosis_page import page
 
 X = np.linspace(0, 10, 60)
 
@@ -312,3 +314,45 @@ def test_a_source_that_begins_at_some_time_is_told_with_the_time_and_its_rate():
     assert "one constant change on one side removes" in text
     wanted = source * (d.missing.time > begins).double()
     assert float((d.missing.along - wanted).norm() / wanted.norm()) < 0.25
+
+
+def cooling(off, place, seed=0):
+    """Three bodies that cool, with readings that are off by something at some times of some runs."""
+    simulator = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"T": -p["k"] * s["T"]}, states={"T": "K"},
+        parameters=[tc.Parameter("k", unit="1/h", low=0.0, initial=0.3)],
+    )  # fmt: skip
+    t, rng = np.linspace(0, 8, 60), np.random.default_rng(seed)
+    runs = [tc.Run(time=t, outputs={"T": first * np.exp(-0.3 * t) + off * place(t, r) + 0.05 * rng.standard_normal(60)},
+                   initial={"T": first}) for r, first in enumerate((5.0, 10.0, 15.0))]  # fmt: skip
+    return simulator, tc.Recording(runs=runs, noise=0.05, units={"time": "h", "T": "K"})
+
+
+def test_what_happens_in_one_run_alone_is_placed_there():
+    """No function of time, of the state or of the run is that."""
+    given = cooling(0.4, lambda t, r: (r == 1) & (t > 3) & (t < 5))
+    d = tc.diagnose(*given, tc.terms.sensor(("T",), dynamic=False, time="h"), seed=0, progress=False)
+    assert d.verdict == "unexplained"
+    place = d.where[0]
+    assert (place.kind, place.target, place.driver, place.run) == ("output", "T", "t", 1)
+    assert place.edges == pytest.approx((3.0, 5.0), abs=0.1)
+    assert place.share > 0.95
+    text = " ".join(str(d).split())
+    assert "sits in the output T of run 1 (counted from 0) and jumps with t (at 3.051 and 4.949 h)" in text
+    assert "change of T against t in run 1 spans 0.4" in text
+    assert d.missing.run == 1
+    assert len(d.missing.values) == 60
+    assert "run" in str(d.where).splitlines()[0].split()
+    assert any("in run 1" in part.caption for part in figure_parts(d))
+    assert "output T of run 1" in page(d)
+
+
+def test_what_all_runs_have_is_placed_in_none_of_them():
+    simulator, recording = cooling(0.4, lambda t, r: t > 3)
+    found, noise = calibrate_base(Problem.of(simulator, recording), {}, 2, 0)
+    residual = Residual(found, noise, draws=10)
+    every = analyse(residual, every=True)
+    best = max(place.evidence for place in every.places)
+    alone = in_one_run(residual, every.channels)
+    assert {place.run for place in alone if place.channel.kind == "output"} == {0, 1, 2}
+    assert all(place.evidence < best for place in alone)

@@ -4,7 +4,7 @@ import copy
 import dataclasses
 import math
 import sys
-import types
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 import torchcal as tc
+from torchcal.discovery import windows as windows_module
 from torchcal.discovery.begun_in_windows import wanted_changes
 from torchcal.discovery.fits.local import Span, localised
 from torchcal.discovery.fits.problem import Problem
@@ -560,6 +561,38 @@ def test_the_windows_of_a_base_are_no_parameters_that_change():
     assert shifted == {"in", "k", "out", "second channel.k2"}
 
 
+@pytest.mark.parametrize("moved", [True, False])
+def test_the_range_that_sharp_edges_put_first_is_that_of_its_rivals_too(monkeypatch, moved):
+    """In a range of a wall's temperature evaporation led, and with edges to fit another term in a span of time: where
+    the right one had not been tried."""
+    def model(driver, weight):
+        return SimpleNamespace(numbers=(0,), log_evidence=weight, weight=weight, window=SimpleNamespace(driver=driver),
+                               physical=True)  # fmt: skip
+
+    search = SimpleNamespace(
+        exact=False, problem=SimpleNamespace(n=100), models=[], gone=(), local=[], candidates=[None], twins={},
+        screening=SimpleNamespace(best=[0]), examine=lambda model: SimpleNamespace(p_value=1.0), reweigh=lambda: None,
+    )  # fmt: skip
+    asked = []
+
+    def put(models):
+        search.models = models
+        search.leader = search.physical_leader = max(models, key=lambda model: model.weight)
+
+    def rivals(search, prior, **options):
+        asked.append((search.leader.window.driver, options))
+        return True
+
+    put([model("W", 250.0), model("t", 245.0)])
+    sharp = [model("W", 264.0), model("t", 281.0 if moved else 250.0)]
+    monkeypatch.setattr(windows_module, "_rivals", rivals)
+    monkeypatch.setattr(windows_module, "_refine_edges", lambda search, prior: put(sharp))
+    monkeypatch.setattr(windows_module, "_turn", lambda search, prior: None)
+    monkeypatch.setattr(windows_module, "_keep_all", lambda search, wanted: None)
+    windows_module.refit_local(search)
+    assert asked == [("W", {})] + [("t", {"edge": True})] * moved
+
+
 def test_a_nameless_change_that_the_simulator_does_not_take_is_left_out(monkeypatch):
     def together(search, wanted):
         if "efficiency above 1" in wanted:
@@ -589,9 +622,9 @@ def test_a_window_is_named_for_the_shape_of_its_term_alone(reaction):
 
 @pytest.mark.parametrize(("side", "amplitude"), [(0, -0.3), (1, 0.3), (-1, -0.3)])
 def test_beyond_an_edge_a_term_begins_with_the_other_sign_where_it_may(side, amplitude):
-    candidate = types.SimpleNamespace(one_sided=lambda place: side)
-    search = types.SimpleNamespace(
-        candidates=[candidate], screening=types.SimpleNamespace(acting=[0]), amplitude=lambda column: 0
+    candidate = SimpleNamespace(one_sided=lambda place: side)
+    search = SimpleNamespace(
+        candidates=[candidate], screening=SimpleNamespace(acting=[0]), amplitude=lambda column: 0
     )
     lead = Window(0, "T", 18.25, math.inf, 5.0, 0.3)
     beyond = _beyond_the_edge(search, lead, lead)
@@ -664,8 +697,8 @@ def projected(n, *, seed=0, draws=20):
         return values - basis @ (basis.T @ values)
 
     noise = tangent(torch.randn(n, 1 + draws, generator=generator, dtype=F64))
-    found = types.SimpleNamespace(problem=types.SimpleNamespace(is_time=lambda driver: False))
-    return types.SimpleNamespace(e=noise[:, 0], null=noise[:, 1:], tangent=tangent, found=found)
+    found = SimpleNamespace(problem=SimpleNamespace(is_time=lambda driver: False))
+    return SimpleNamespace(e=noise[:, 0], null=noise[:, 1:], tangent=tangent, found=found)
 
 
 @pytest.mark.parametrize("sign", [-1, 0, 1])

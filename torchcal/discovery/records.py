@@ -207,6 +207,7 @@ class Location:
         extent: How far the driver extends in the recording; None where nobody knows.
         edges: Of a change in steps, the values of the driver where it begins or ends; none of any other change.
         terms: Where it is that some terms act, their names: the share is what they remove, and the evidence theirs.
+        run: Of a change in one run of several alone, which, counted from 0.
     """
 
     kind: str
@@ -219,6 +220,12 @@ class Location:
     extent: float | None = None
     edges: tuple[float, ...] = ()
     terms: tuple[str, ...] = ()
+    run: int | None = None
+
+    @property
+    def called(self) -> str:
+        """What it is a place in, in words."""
+        return f"{self.kind} {self.target}" + ("" if self.run is None else f" of run {self.run} (counted from 0)")
 
 
 @dataclass(frozen=True)
@@ -324,6 +331,7 @@ class MissingRate:
         time: Times of the grid along the calibrated trajectory, ``(T,)``; the conditions' rows in the
             recording for a static one.
         along: Estimate along that grid, ``(T,)``.
+        run: Of a change in one run of several alone, which, counted from 0; the grid is that run's then.
     """
 
     kind: str
@@ -335,6 +343,7 @@ class MissingRate:
     unit: str | None
     time: Tensor
     along: Tensor
+    run: int | None = None
 
 
 @dataclass(frozen=True)

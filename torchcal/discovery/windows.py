@@ -89,7 +89,10 @@ def refit_local(search: Search) -> None:
     search.reweigh()
     if _rivals(search, prior):
         search.reweigh()
+    before = _drivers_of_leads(search)
     _refine_edges(search, prior)
+    if not _drivers_of_leads(search) <= before and _rivals(search, prior, edge=True):  # sharp edges put another first
+        search.reweigh()
     _turn(search, prior)
 
 
@@ -116,7 +119,17 @@ def _turn(search: Search, prior: float) -> None:
         _keep(search, turned)
 
 
-def _rivals(search: Search, prior: float) -> bool:
+def _leads(search: Search) -> list[Model]:
+    """The leader, and the physical one if that is another."""
+    return list({id(model): model for model in (search.leader, search.physical_leader) if model is not None}.values())
+
+
+def _drivers_of_leads(search: Search) -> set[str]:
+    """Along which the leading models have a window."""
+    return {model.window.driver for model in _leads(search) if model.window is not None}
+
+
+def _rivals(search: Search, prior: float, *, edge: bool = False) -> bool:
     """Hold what leads in a window against the other candidates in that window, where many do the same if it is short,
     and beyond its edge, if it has one.
 
@@ -124,12 +137,11 @@ def _rivals(search: Search, prior: float) -> bool:
 
     Returns whether there was any.
     """
-    leads = {id(model): model for model in (search.leader, search.physical_leader) if model is not None}
-    return any([_rivals_of(search, prior, lead) for lead in leads.values()])
+    return any([_rivals_of(search, prior, lead, edge=edge) for lead in _leads(search)])
 
 
-def _rivals_of(search: Search, prior: float, lead: Model) -> bool:
-    """The other candidates in the window of one."""
+def _rivals_of(search: Search, prior: float, lead: Model, *, edge: bool = False) -> bool:
+    """The other candidates in the window of one; with edges to fit where its own have been."""
     if lead.window is None:
         return False
     w = lead.window
@@ -144,7 +156,7 @@ def _rivals_of(search: Search, prior: float, lead: Model) -> bool:
     wanted = [dataclasses.replace(one, low=w.low, high=w.high) for i, one in others.items() if i not in tried][:MOST]
     if math.isfinite(w.low) != math.isfinite(w.high):
         wanted += [_beyond_the_edge(search, other, w) for other in list(others.values())[:MOST_BEYOND]]
-    _keep_all(search, [_begun(search, one, prior) for one in wanted])
+    _keep_all(search, [_begun(search, one, prior, edge=edge) for one in wanted])
     return bool(wanted)
 
 

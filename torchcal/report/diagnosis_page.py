@@ -193,7 +193,7 @@ def _spans(item: Any) -> str:
 def _where(diagnosis: Any, units: Mapping[str, str]) -> str:
     rows = [
         {
-            "where": f"{item.kind} {item.target}",
+            "where": item.called,
             "varies with": "time" if item.driver == "t" and "time" in units else item.driver,
             "from … to": _spans(item),
             "unit": units.get(item.driver, ""),

@@ -58,7 +58,7 @@ def _curves(problem: Problem) -> list[tuple[Tensor, Tensor]]:
         curve = others.unique(dim=0, return_inverse=True)[1]
         along = columns[:, k].argsort(stable=True)
         along = along[curve[along].argsort(stable=True)]  # curve by curve
-        found += [(each, columns[:, k]) for each in along.split(torch.bincount(curve).tolist()) if len(each) > 2]
+        found += [(each, columns[:, k]) for each in along.split(torch.bincount(curve).tolist()) if len(each) > 1]
     return found
 
 

@@ -62,9 +62,15 @@ def called(d: Any, terms: Sequence[str]) -> str:
         return "something that is not in this library"
     if not terms:
         return "the base alone"
+    region = _region(d, terms)
+    return " with ".join(terms) + (f" where {region}" if region else "")
+
+
+def _region(d: Any, terms: Sequence[str]) -> str | None:
+    """Where a hypothesis acts likeliest; None where that is everywhere."""
     rows = [row for row in d.ranking if (row.refitted or row.region) and set(row.terms) == set(terms)]
     best = max(rows, key=lambda row: row.probability, default=None)
-    return " with ".join(terms) + (f" where {best.region}" if best is not None and best.region else "")
+    return None if best is None else best.region
 
 
 def accepted(d: Any) -> Any:
@@ -98,4 +104,7 @@ def experiment_told(d: Any) -> list[str]:
     untold = [f"{a} from {b}" for a, b in d.experiment.untold]
     if len(untold) > UNTOLD + 1:
         untold = [*untold[:UNTOLD], f"{len(untold) - UNTOLD} other pairs apart"]
-    return [text + (f"; none that was tried in thought tells {', or '.join(untold)}." if untold else ".")]
+    text += f"; none that was tried in thought tells {', or '.join(untold)}." if untold else "."
+    if any("t" in (_region(d, tied) or "").split() for tied in d.tied):
+        text += " It takes for granted that what acts in a span of time does so again."
+    return [text]

@@ -179,13 +179,17 @@ def unexplained(d: Any) -> list[str]:
     parts = [where_in_words(d)]
     best = next((row for row in d.ranking if row.terms and row.refitted), None)
     if best is not None and not best.misfit_removed < LITTLE:
+        # Beside noise that another hypothesis tells, what it leaves is larger than a share near all of it sounds.
+        much = best.misfit_removed >= REMOVED and best.p_white is not None and best.p_white < WHITE
+        share = "most" if much else share_in_words(min(best.misfit_removed, NEARLY_ALL))
         parts.append(
-            f"The best of the library, {called(d, best.terms)}, removes "
-            f"{share_in_words(min(best.misfit_removed, NEARLY_ALL))} of the misfit beyond noise{_no_name(d, best)}."
+            f"The best of the library, {called(d, best.terms)}, removes {share} of the misfit beyond noise"
+            f"{_no_name(d, best)}."
         )
     if d.missing is not None:
         size = with_unit(f"{float(d.missing.rate.max() - d.missing.rate.min()):.3g}", d.missing.unit)
         along = "from run to run" if d.missing.driver == RUN else f"against {d.missing.driver}"
+        along += "" if d.missing.run is None else f" in run {d.missing.run}"
         what = "part of the rate of" if d.missing.kind == "equation" else "change of"
         parts.append(
             f"The missing {what} {d.missing.target} {along} spans {size} from its lowest to its highest value, beside "

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.places import Place
-from torchcal.discovery.misfit.steps import SURER, stepwise
+from torchcal.discovery.misfit.steps import SURER, in_one_run, stepwise
 from torchcal.discovery.records import Location, MissingRate, NeededShift, Table
 from torchcal.discovery.verdicts.explain import removed
 from torchcal.errors import TorchcalError
@@ -71,6 +71,8 @@ def sharpened(search: Search) -> list[Place]:
         if place.evidence >= LEAST_EVIDENCE else place
         for place in search.structure.places
     ]  # fmt: skip
+    best = max((place.evidence for place in found), default=0.0)
+    found += [p for p in in_one_run(search.residual, search.structure.channels) if p.evidence > best + SURER]
     # Steps along two drivers that rise together are one: then the smooth change tells which of the two.
     return sorted(found, key=lambda place: -round(place.evidence, TIED))
 
@@ -132,10 +134,12 @@ def locate(
             continue
         seen.add(key[:2])
         extent = _extent(place.channel.drivers[place.driver])
-        rows.append(Location(*key, _spans(place), place.share, place.evidence, place.period, extent, place.edges))
+        rows.append(Location(*key, _spans(place), place.share, place.evidence, place.period, extent, place.edges,
+                             run=place.run))  # fmt: skip
         if len(seen) >= LISTED:
             break
-    return Table(rows[:LISTED], ("kind", "target", "driver", "spans", "share", "evidence"))
+    run = ("run",) if any(row.run is not None for row in rows[:LISTED]) else ()
+    return Table(rows[:LISTED], ("kind", "target", *run, "driver", "spans", "share", "evidence"))
 
 
 def _own_places(search: Search, model: Model) -> set[tuple[str, str]]:
@@ -330,6 +334,6 @@ def missing_rate(search: Search, found: Sequence[Place]) -> MissingRate | None:
         values, rate, sd = channel.drivers[place.driver], place.profile * size, place.sd * size.abs()
         order = values.argsort(stable=True)
         return MissingRate(
-            kind, target, place.driver, values[order], rate[order], sd[order], unit, channel.time, rate
+            kind, target, place.driver, values[order], rate[order], sd[order], unit, channel.time, rate, place.run
         )
     return None

@@ -33,7 +33,7 @@ def where_in_words(d: Any) -> str:
     if place.driver == RUN:
         if _alike(d, place):
             return (
-                f"The mismatch sits in the {place.kind} {place.target} and is the same in every run: one constant "
+                f"The mismatch sits in the {place.called} and is the same in every run: one constant "
                 f"change there {_does(place)}.{_embedded(d)}"
             )
         largest = "" if everywhere else f" (largest in {spans}, counted from 0)"
@@ -41,20 +41,20 @@ def where_in_words(d: Any) -> str:
         if advice and place.kind == "parameter":
             advice = " With per_run=True that parameter would take it up."
         return (
-            f"The mismatch sits in the {place.kind} {place.target} and differs from run to run{largest}: one change "
+            f"The mismatch sits in the {place.called} and differs from run to run{largest}: one change "
             f"for each run {_does(place)}.{advice}{_embedded(d)}"
         )
     largest = "" if everywhere else f" (largest at {spans})"
     if place.period is not None:
         return (
-            f"The mismatch sits in the {place.kind} {place.target} and oscillates with {place.driver} (period "
+            f"The mismatch sits in the {place.called} and oscillates with {place.driver} (period "
             f"{with_unit(f'{place.period:.3g}', unit)}): a wave there {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
         )
     if place.terms:
         what = f"{' and '.join(place.terms)}{' together' if len(place.terms) > 1 else ''}"
         return (
-            f"The mismatch sits in the {place.kind} {place.target} and varies with {place.driver}{largest}: "
-            f"adding {what} there {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
+            f"The mismatch sits in the {place.called} and varies with {place.driver}{largest}: "
+            f"adding {what} there{'' if d.terms else ', say,'} {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
         )
     if place.edges:
         side = "on one side"
@@ -63,11 +63,11 @@ def where_in_words(d: Any) -> str:
             side = "in between" if any(low < 0.5 * sum(span) < high for span in place.spans) else "outside of these"
         at = with_unit(" and ".join(between([(edge, edge) for edge in place.edges], "to", place.extent)), unit)
         return (
-            f"The mismatch sits in the {place.kind} {place.target} and jumps with {place.driver} (at {at}): one "
+            f"The mismatch sits in the {place.called} and jumps with {place.driver} (at {at}): one "
             f"constant change {side} {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
         )
     return (
-        f"The mismatch sits in the {place.kind} {place.target} and varies with {place.driver}{largest}: a smooth "
+        f"The mismatch sits in the {place.called} and varies with {place.driver}{largest}: a smooth "
         f"change there {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
     )
 

@@ -4,6 +4,7 @@ A change of one equation at one moment moves everything that is observed later. 
 trajectory, say what any rate, known or unknown, in any window of time or state, does to the recording.
 """
 
+import dataclasses
 import math
 from dataclasses import dataclass, field
 
@@ -54,6 +55,14 @@ class Channel:
     def response(self, profile: Tensor) -> Tensor:
         """Change of the data by a change ``profile`` (K, m) along the points, ``(n, m)``."""
         return self.matrix[:, None] * profile if self.matrix.ndim == 1 else self.matrix @ profile
+
+    def where(self, there: Tensor) -> "Channel":
+        """The same with some of its points alone, bool ``(K,)``."""
+        matrix = self.matrix.diag() if self.matrix.ndim == 1 else self.matrix
+        drivers, rates = ({name: each[there] for name, each in table.items()} for table in (self.drivers, self.rates))
+        return dataclasses.replace(
+            self, drivers=drivers, time=self.time[there], matrix=matrix[:, there], rates=rates
+        )
 
 
 def _binning(bound: Trajectories) -> tuple[Tensor, int]:

@@ -33,6 +33,7 @@ class Place:
         sd: Its standard deviation there.
         period: Of an oscillation, in units of the driver; None of any other change.
         edges: Of a change in steps, where these are.
+        run: Of a change in one run of several alone, which, counted from 0.
     """
 
     channel: Channel
@@ -43,6 +44,7 @@ class Place:
     sd: Tensor
     period: float | None = None
     edges: tuple[float, ...] = ()
+    run: int | None = None
 
 
 def evidence_of(u: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:

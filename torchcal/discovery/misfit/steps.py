@@ -18,7 +18,7 @@ from torchcal.discovery.misfit.channels import RUN, Channel
 from torchcal.discovery.misfit.places import SIZES, Place, is_unseen
 from torchcal.discovery.misfit.residual import Residual
 
-__all__ = ["SURER", "Sudden", "stepwise", "sudden_changes"]
+__all__ = ["SURER", "Sudden", "in_one_run", "stepwise", "sudden_changes"]
 
 #: Data, or points of a channel, that there are at least on either side of a step: fewer may be outliers.
 LEAST = 5
@@ -260,6 +260,26 @@ def stepwise(residual: Residual, place: Place, *, surer: float = SURER) -> Place
     edges = tuple(end for end in (float(low[i]), float(high[j])) if math.isfinite(end))
     taken = residual.share(removed, 1.0 + len(edges))
     return dataclasses.replace(place, evidence=evidence, share=taken, profile=profile, sd=sd, edges=edges)
+
+
+def in_one_run(residual: Residual, available: Sequence[Channel]) -> list[Place]:
+    """Constant changes of outputs and equations that begin, end, or both, in one run of several alone.
+
+    Any run is as likely. What is seen in one run and not in the others is no function of what all of them have.
+    """
+    found = []
+    for channel in available:
+        if channel.kind == "parameter" or not {"t", RUN} <= {*channel.drivers}:
+            continue
+        runs = channel.drivers[RUN]
+        for run in runs.unique():
+            own = channel.where((runs == run) & (_acts(channel) if channel.kind == "output" else True))
+            none = torch.zeros_like(own.time)
+            place = stepwise(residual, Place(own, "t", -math.inf, 0.0, none, none))
+            if place.edges:
+                price = math.log(len(runs.unique()))
+                found.append(dataclasses.replace(place, evidence=place.evidence - price, run=int(run)))
+    return found
 
 
 def _one_end(there: Tensor) -> Tensor:

@@ -50,7 +50,7 @@ NEARLY_ALL = 0.9
 #: bend to more, beyond chance: such sd are seldom exact.
 LARGER, LARGER_TOGETHER, CHANCE = 1.15, 1.08, 2.0
 #: Of those less likely than the base, a hypothesis is listed among the tied ones with log odds down to this against the
-#: base, and at least this probability.
+#: base, and at least this probability; with as much, and more than another one, so is something unknown.
 WORSE, WORTH = 1.0, 0.05
 #: Of the tied hypotheses, those that together have this probability are listed.
 TIED = 0.98
@@ -198,7 +198,8 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     decision.pliant = all(
         m.window is not None or (len(m.names) > 1 and not shared) or only_instruments(m) for m in decision.tied_models
     )
-    likely = decision.none > min(1 - UNKNOWN, _second(decision, ranked))
+    least = min((groups[frozenset(model.names)] for model in decision.tied_models), default=1.0)
+    likely = decision.none > min(1 - UNKNOWN, _second(decision, ranked)) or decision.none > max(least, WORTH)
     fewest = [tied for tied in decision.tied if not any({*other} < {*tied} for other in decision.tied)]
     if len(fewest) < 2 or likely or local or decision.pliant or decision.doubt:
         decision.tied.append(list(NONE))

@@ -286,9 +286,10 @@ def _change(place: Any) -> str:
     if terms := getattr(place, "terms", ()):
         return f"effect of {join_terms(terms)}"
     target = plain(place.target, TITLED, middle=True)
+    run = "" if place.run is None else f" in run {place.run}"
     if place.kind == "equation":
-        return f"missing rate of d{target}/dt"
-    return f"{'needed' if place.kind == 'parameter' else 'missing'} shift of {target}"
+        return f"missing rate of d{target}/dt{run}"
+    return f"{'needed' if place.kind == 'parameter' else 'missing'} shift of {target}{run}"
 
 
 def _ignore(_: Any) -> None:
