@@ -1,12 +1,12 @@
 """What text, tables and figures share: how a share is written, what no term is called, when an axis is logarithmic."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from typing import Any
 
 __all__ = [
-    "DECADES", "FAR", "NONE", "PATIENCE", "between", "percent", "placed", "raised", "units_of", "up_to",
+    "DECADES", "FAR", "NONE", "PATIENCE", "between", "percent", "placed", "raised", "unit_of", "units_of", "up_to",
     "version", "with_unit",
 ]  # fmt: skip
 
@@ -49,13 +49,21 @@ def with_unit(amount: str, unit: str | None) -> str:
 
 
 def units_of(recording: Any, simulator: Any) -> dict[str, str]:
-    """Units of outputs, states, conditions, inputs and time, by name, of those that have any; ``"t"`` is time."""
+    """Units of outputs, states, conditions, inputs and time, by name, of those that have any."""
     states: dict[str, str | None] = getattr(simulator, "states", {})
     units = {name: unit for name, unit in states.items() if isinstance(unit, str)}
     for run in recording.runs or ():
         units |= run.units
-    units |= recording.units
-    return ({"t": units["time"]} if "time" in units and recording.runs else {}) | units
+    return units | recording.units
+
+
+def unit_of(driver: str, units: Mapping[str, str]) -> str:
+    """That of what something varies with, where ``"t"`` is time; empty where it has none.
+
+    >>> unit_of("t", {"time": "h"}), unit_of("t", {"t": "s", "time": "h"}), unit_of("T", {"time": "h"})
+    ('h', 's', '')
+    """
+    return units.get(driver) or (units.get("time", "") if driver == "t" else "")
 
 
 def percent(share: float | None) -> str:

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from torchcal.display import between, percent, units_of, up_to, version
+from torchcal.display import between, percent, unit_of, units_of, up_to, version
 from torchcal.files import check_target, replacing
 from torchcal.plots.discovery import FigurePart, figure_parts
 from torchcal.plots.discovery.pieces import likeliest_with
@@ -196,7 +196,7 @@ def _where(diagnosis: Any, units: Mapping[str, str]) -> str:
             "where": item.called,
             "varies with": "time" if item.driver == "t" and "time" in units else item.driver,
             "from … to": _spans(item),
-            "unit": units.get(item.driver, ""),
+            "unit": unit_of(item.driver, units),
             "share of misfit": Right(percent(item.share)),
             "log evidence": Right(in_digits(item.evidence)),
         }

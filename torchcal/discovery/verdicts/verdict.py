@@ -198,8 +198,9 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     decision.pliant = all(
         m.window is not None or (len(m.names) > 1 and not shared) or only_instruments(m) for m in decision.tied_models
     )
-    least = min((groups[frozenset(model.names)] for model in decision.tied_models), default=1.0)
-    likely = decision.none > min(1 - UNKNOWN, _second(decision, ranked)) or decision.none > max(least, WORTH)
+    shares = _shares(decision, ranked)
+    second, least = (shares[1], shares[-1]) if len(shares) > 1 else (1.0, 1.0)
+    likely = decision.none > min(1 - UNKNOWN, second, max(least, WORTH))
     fewest = [tied for tied in decision.tied if not any({*other} < {*tied} for other in decision.tied)]
     if len(fewest) < 2 or likely or local or decision.pliant or decision.doubt:
         decision.tied.append(list(NONE))
@@ -238,16 +239,15 @@ def _dismiss(search: Search, ranked: list[Model]) -> None:
         model.price, model.log_evidence = model.price + UNPHYSICAL, model.log_evidence + UNPHYSICAL
 
 
-def _second(decision: Decision, ranked: Sequence[Model]) -> float:
-    """Probability of the second likeliest of the tied hypotheses, wherever it acts; another name of one has its own."""
+def _shares(decision: Decision, ranked: Sequence[Model]) -> list[float]:
+    """Probabilities of the tied hypotheses, wherever they act, the largest first; another name of one has its own."""
     shares: dict[frozenset[str], float] = {}
     for model in ranked:
         names = frozenset(model.names)
         shares[names] = shares.get(names, 0.0) + decision.probability[id(model)]
     known = [shares.get(frozenset(tied)) for tied in decision.tied]
     best = max((share for share in known if share is not None), default=0.0)
-    told = sorted(best if share is None else share for share in known)
-    return told[-2] if len(told) > 1 else 1.0
+    return sorted((best if share is None else share for share in known), reverse=True)
 
 
 def base_alone(search: Search) -> float:
