@@ -19,7 +19,7 @@ from torchcal.discovery.hypotheses import refitting
 from torchcal.discovery.hypotheses.base import calibrate_base
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.verdicts.decision import Decision
-from torchcal.discovery.verdicts.verdict import _second
+from torchcal.discovery.verdicts.verdict import _shares
 from torchcal.simulators.steps import Steps
 
 F64 = torch.float64
@@ -120,13 +120,13 @@ def shares(**given: float) -> tuple[Decision, list]:
     return decision, models
 
 
-def test_the_second_of_tied_hypotheses_counts_wherever_it_acts():
+def test_tied_hypotheses_count_wherever_they_act():
     decision, models = shares(a=0.5, b_here=0.1, b_there=0.15, c=0.2)
-    assert _second(decision, models) == pytest.approx(0.25)
+    assert _shares(decision, models) == pytest.approx([0.5, 0.25, 0.2])
     decision, models = shares(a_here=0.5, a_there=0.3)
-    assert _second(decision, models) == 1.0  # no other
+    assert _shares(decision, models) == pytest.approx([0.8])
     decision.tied.append(["another name of a"])
-    assert _second(decision, models) == pytest.approx(0.8)
+    assert _shares(decision, models) == pytest.approx([0.8, 0.8])
 
 
 def test_something_unknown_that_is_likelier_than_the_second_is_tied_with_them():
