@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from torchcal.errors import (
     SimulatorError,
     TorchcalWarning,
 )
-from torchcal.inference import tangent
+from torchcal.inference import estimate, tangent
 from torchcal.inference.setup import check_inputs
 from torchcal.simulators.static import _copied
 
@@ -187,6 +188,24 @@ def test_a_product_is_told_of_a_code_whose_starts_all_end_at_one_point():
     simplest = tc.embeddings.PolynomialChaos(order=0)
     with pytest.warns(IdentifiabilityWarning, match="The data determine a, b only together"):
         mode(product, 3 * x, x, embedding=simplest, likelihood="abc_mean", starts=torch.tensor([[0.5, 0.0]]))
+
+
+@pytest.mark.parametrize(
+    ("ends", "given_up", "told"),
+    [
+        ([1.0, 2.0], 0, "Only 1 of 2 starts reached the best objective 1; the next ended at 2."),
+        ([1.0, 2.0, math.inf], 1, "Only 1 of 2 starts that were followed to the end reached the best objective 1; the "
+         "next ended at 2, and 1 other was given up on the way, behind it."),
+        ([1.0, math.inf], 0, "Only 1 of 2 starts reached the best objective 1; no other ended at a finite one."),
+        ([1.0, math.inf, math.inf], 2, "Only 1 of 3 starts was followed to the end, to the objective 1; the 2 others "
+         "were given up on the way, behind it."),
+    ],
+)  # fmt: skip
+def test_how_many_starts_agree_is_told_of_those_that_were_followed(ends, given_up, told):
+    problem = SimpleNamespace(propagate=SimpleNamespace(simulator=SimpleNamespace(dear=False)))
+    said = estimate._lonely(problem, torch.tensor(ends), given_up)
+    assert said.startswith(told)
+    assert "Raise num_starts=" in said
 
 
 def test_a_product_is_told_where_the_maximum_of_it_lies_at_a_bound():

@@ -683,6 +683,8 @@ def test_a_density_ends_where_a_coefficient_whose_sign_means_nothing_does(sign):
     assert np.abs(far[0]).min() > 20
     assert (sign * few[0]).min() < 0  # so few may lie on one side by chance
     assert densities.side_of_zero(np.append(draws, -sign)) == 0
+    inside = normal(4000, 1)[:, 0].numpy() + 2.5  # a normal density that has its draws on one side by chance
+    assert densities.side_of_zero(sign * inside[inside > 0][:200]) == 0
 
 
 def test_contours_end_where_a_coefficient_does():

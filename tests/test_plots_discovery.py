@@ -30,6 +30,7 @@ from torchcal.discovery.records import (
 )
 from torchcal.errors import DomainError, ShapeError
 from torchcal.plots import discovery
+from torchcal.plots.discovery import residuals
 
 F64 = torch.float64
 NASTY = 'a <b>bold</b> & "quoted" $\\foo$ term of a user who writes very long names indeed'
@@ -588,6 +589,9 @@ def test_a_span_of_one_level_is_as_wide_as_half_way_to_the_next():
     located = [patch for patch in ax.patches if "noise" not in patch.get_label()]
     boxes = [patch.get_extents().transformed(ax.transData.inverted()) for patch in located]
     np.testing.assert_allclose([(box.x0, box.x1) for box in boxes], [(1.0, 1.5), (3.0, 6.0), (8.5, 9.0)])
+    assert residuals._widened([(0.0, 5.0)], np.array([0.0, 5.0, 100.0])) == [(0.0, 5.0)]  # as it is told
+    (wide,) = residuals._widened([(10.0, 10.0)], np.array([1.0, 10.0, 1000.0]))
+    assert wide == pytest.approx((10**0.5, 100.0))  # where the axis is logarithmic
 
 
 # --- ranking ---------------------------------------------------------------------------------------------
@@ -799,6 +803,9 @@ def test_of_several_runs_the_one_that_differs_most_is_drawn():
     before[155] += 0.1
     alone = plots.held_out(recording, before, None, mask, legend=False)
     assert alone.get_title(loc="left") == "run 3 (one of 4 with held-out data)"
+    after[:] = before[:] = torch.inf  # as of a model that has blown up
+    after[mask] = before[mask] = torch.inf
+    assert plots.held_out(recording, before, after, mask, legend=False) is not None
     mask[:40] = mask[80:160] = mask[160:200] = mask[240:] = False
     only = plots.held_out(recording, before, None, mask, legend=False)
     assert only.get_title(loc="left") == "run 1"

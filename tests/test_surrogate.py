@@ -666,6 +666,17 @@ def test_save_and_load(tmp_path):
     assert len(os.listdir(tmp_path)) == 3
 
 
+def test_a_value_for_each_run_is_refused_before_anything_is_computed_and_left_out_of_old_files(tmp_path):
+    calls, each = [], Parameter("a", low=0.0, high=1.0, per_run=True)
+    with pytest.raises(DomainError, match=r"Got per_run=True for \['a'\]"):
+        build_surrogate(lambda x, p: calls.append(x), conditions=(0, 1), parameters=[each], order=2)
+    assert not calls
+    surrogate = build(lambda x, p: x * p["a"], conditions=(0, 1), parameters=[A])
+    surrogate.parameters = (each,)  # as they once were
+    surrogate.save(tmp_path / "s.npz")
+    assert not PolynomialSurrogate.load(tmp_path / "s.npz").parameters[0].per_run
+
+
 def test_a_missing_folder_is_named(tmp_path):
     with pytest.raises(DomainError, match=r"folder that exists.*no folder '.*nowhere'"):
         build(cubic).save(tmp_path / "nowhere" / "s.npz")

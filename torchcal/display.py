@@ -6,12 +6,15 @@ from importlib import metadata
 from typing import Any
 
 __all__ = [
-    "DECADES", "FAR", "NONE", "PATIENCE", "between", "percent", "placed", "raised", "unit_of", "units_of", "up_to",
-    "version", "with_unit",
+    "DECADES", "FAR", "ITSELF", "NONE", "PATIENCE", "between", "percent", "placed", "raised", "unit_of", "units_of",
+    "up_to", "version", "with_unit",
 ]  # fmt: skip
 
 NONE = ("none of these",)
 """In place of terms: something that is not among the candidates."""
+
+ITSELF = " itself"
+"""What the driver of an output that varies with its own value ends with, after the output's name."""
 
 PATIENCE = 2.0
 """Seconds before a calibration shows a bar."""
@@ -60,9 +63,10 @@ def units_of(recording: Any, simulator: Any) -> dict[str, str]:
 def unit_of(driver: str, units: Mapping[str, str]) -> str:
     """That of what something varies with, where ``"t"`` is time; empty where it has none.
 
-    >>> unit_of("t", {"time": "h"}), unit_of("t", {"t": "s", "time": "h"}), unit_of("T", {"time": "h"})
-    ('h', 's', '')
+    >>> unit_of("t", {"time": "h"}), unit_of("t", {"t": "s", "time": "h"}), unit_of("T itself", {"T": "K"})
+    ('h', 's', 'K')
     """
+    driver = driver.removesuffix(ITSELF)
     return units.get(driver) or (units.get("time", "") if driver == "t" else "")
 
 

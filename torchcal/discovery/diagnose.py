@@ -224,9 +224,12 @@ def _check(simulator: Any, recording: Any, candidates: Any, confidence: float) -
         if not isinstance(term, Term):
             raise DomainError(f"Expected candidates as torchcal.Term objects. Got {type(term).__name__}: {term!r}.")
         if any(q.per_run for q in term.parameters):
+            advice = "make it a parameter of the simulator, with a neutral value, and free it"
+            if not isinstance(simulator, ODESimulator):
+                advice = "drop it: a static recording has no runs"
             raise DomainError(
-                f"Expected one value of each parameter of the term {term.name!r} for all runs. Got per_run=True (make "
-                "it a parameter of the simulator, with a neutral value, and free it)."
+                f"Expected one value of each parameter of the term {term.name!r} for all runs. Got per_run=True "
+                f"({advice})."
             )
         by_name[term.name] = term
     if not 0.5 < confidence <= 0.998:

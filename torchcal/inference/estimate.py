@@ -1,6 +1,7 @@
 """The maximum a posteriori from many starts, and directions that the data do not see."""
 
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -130,6 +131,9 @@ def maximise(
     middle = _middle_of_the_tied(problem, found, best)
     along = null if middle is best else _flat_directions(_curvature(problem, middle))
     together = () if unseen else _known_together(problem, found, middle, along)
+    if not (unseen or together or middle is best):  # where a ridge is bent the flat direction at the other end may tell
+        middle, along = best, null
+        together = _known_together(problem, found, middle, along)
     if together:
         warn(
             f"The data determine {', '.join(together)} only together: other values of them give the same maximum, as "
@@ -331,12 +335,14 @@ def _unheld(problem: Problem, unseen: tuple[str, ...]) -> tuple[str, ...]:
 def _lonely(problem: Problem, ends: Tensor, given_up: int) -> str:
     """What to say of a best objective that one start alone reached, of those whose ``ends`` came best first."""
     best, followed = float(ends[0]), len(ends) - given_up
-    others = f"{given_up} others were given up on the way, behind it" if given_up else ""
+    others = f"{given_up} other{'s were' if given_up > 1 else ' was'} given up on the way, behind it"
     if followed < 2:
         told = f"Only 1 of {len(ends)} starts was followed to the end, to the objective {best:.6g}; the {others}."
     else:
         of = f"{followed} starts that were followed to the end" if given_up else f"{followed} starts"
-        told = f"Only 1 of {of} reached the best objective {best:.6g}; the next ended at {float(ends[1]):.6g}"
+        second = float(ends[1])
+        then = f"the next ended at {second:.6g}" if math.isfinite(second) else "no other ended at a finite one"
+        told = f"Only 1 of {of} reached the best objective {best:.6g}; {then}"
         told += f", and {others}." if given_up else "."
     # A dear model's starts meet on its tangents: more of them end at the same few points.
     more = "" if problem.propagate.simulator.dear else "Raise num_starts=, or give "

@@ -73,7 +73,7 @@ def corner(
                 ax.set_axis_off()
                 continue
             if i == j:
-                _draw_marginal(ax, values[:, i], None if point is None else float(point[i]))
+                _draw_marginal(ax, values[:, i], None if point is None else float(point[i]), sides[i])
             else:
                 marked = None if point is None else point[[j, i]]
                 _draw_pair(ax, values[:, [j, i]], marked, levels, (sides[j], sides[i]))
@@ -121,8 +121,8 @@ def _limits(values: np.ndarray, point: float | None, side: int) -> tuple[float, 
     return max(low, 0.0) if side > 0 else low, min(high, 0.0) if side < 0 else high
 
 
-def _draw_marginal(ax: "Axes", values: np.ndarray, point: float | None) -> None:
-    found = curve(values, num=200, max_draws=5000)
+def _draw_marginal(ax: "Axes", values: np.ndarray, point: float | None, side: int) -> None:
+    found = curve(values, num=200, max_draws=5000, side=side)
     if found is None:
         ax.axvline(float(values.mean()), color=style.POSTERIOR, lw=1.2)
     else:

@@ -23,16 +23,17 @@ __all__ = [
 ]
 
 
-#: Draws from which on one sign of them all says that there is nothing beyond 0: less than 3 %, 19 times in 20.
-ENOUGH = 100
+#: Draws from which on it is told where they end; and the share of them within so many sd of 0 from which on they are
+#: crowded there, as those of an ordinary density that stays on one side are not.
+ENOUGH, CROWD, NEAR = 100, 0.05, 0.25
 
 
 def side_of_zero(draws: np.ndarray) -> int:
-    """On which side of 0 all draws ``(S,)`` lie, 1 or -1; 0 where they lie on both, or are too few to say.
+    """On which side of 0 all draws ``(S,)`` lie, crowded at it, 1 or -1; else 0, and where they are too few to say.
 
     A coefficient whose sign means nothing ends there, and a kernel estimate would not.
     """
-    if len(draws) < ENOUGH:
+    if len(draws) < ENOUGH or (np.abs(draws) < NEAR * draws.std()).mean() < CROWD:
         return 0
     return int(bool((draws >= 0).all())) - int(bool((draws <= 0).all()))
 
@@ -142,7 +143,7 @@ def smooth(counts: np.ndarray, width: float, axis: int) -> np.ndarray:
 
 
 def curve(
-    draws: np.ndarray, *, num: int = 400, max_draws: int = 20_000, tails: bool = False
+    draws: np.ndarray, *, num: int = 400, max_draws: int = 20_000, tails: bool = False, side: int | None = None
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Normal kernel density estimate of draws ``(S,)`` on ``num`` points across them, reflected at 0 where they end.
 
@@ -151,11 +152,12 @@ def curve(
         num: Number of points.
         max_draws: At most this many draws, evenly spaced, are used: more do not change a drawn line.
         tails: Whether to reach the farthest draws; otherwise all but a thousandth of them.
+        side: On which side of 0 they end; by default as `side_of_zero` says.
 
     Returns:
         Points and density, ``(num,)`` each; None where all draws are one value.
     """
-    side = side_of_zero(draws)
+    side = side_of_zero(draws) if side is None else side
     draws = draws[np.linspace(0, len(draws) - 1, min(len(draws), max_draws)).round().astype(int)]
     spread = float(draws.std())
     if len(draws) < 2 or not spread > 1e-13 * float(np.abs(draws).max()):

@@ -13,4 +13,5 @@ def limit_rows(what: str, rows: int, *, advice: str) -> None:
         DomainError: If ``rows`` exceeds ``MAX_ROWS``.
     """
     if rows > MAX_ROWS:
-        raise DomainError(f"Expected at most {MAX_ROWS} rows in {what}. Got {rows} ({advice}).")
+        told = rows if rows < 1e15 else "far more"  # which may have more digits than Python prints
+        raise DomainError(f"Expected at most {MAX_ROWS} rows in {what}. Got {told} ({advice}).")

@@ -419,7 +419,5 @@ def _rmse_unit(diagnosis: Any) -> str:
     return units_of(diagnosis.recording, diagnosis.simulator).get(outputs[0], "") if len(outputs) == 1 else "spread"
 
 
-
-
 def _comparable(value: float) -> float:
     return -math.inf if value is None or math.isnan(value) else value

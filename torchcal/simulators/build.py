@@ -24,7 +24,7 @@ from torchcal.simulators.held_out import HeldOutError, mean_and_sd, root_mean_sq
 from torchcal.simulators.parameter import Parameter, Scaling, real_number
 from torchcal.simulators.points import PointCall, describe_point
 from torchcal.simulators.scattered import check_points, fit_scattered, scatter
-from torchcal.simulators.static import Conditions, Simulator, check_parameters
+from torchcal.simulators.static import Conditions, Simulator, check_parameters, check_static
 from torchcal.simulators.surrogate import Box, PolynomialSurrogate, check_box
 
 __all__ = ["build_surrogate"]
@@ -105,6 +105,7 @@ def build_surrogate(
     0.250000
     """
     parameters = _choose_parameters(simulator, parameters)
+    check_static(parameters)
     outputs = None if outputs is None else _check_outputs(outputs)
     names, bounds = check_box(conditions, parameters)
     dim = len(bounds) + len(parameters)

@@ -29,6 +29,8 @@ def real_number(value: Any) -> float:
         value = value[0] if isinstance(value, list) and len(value) == 1 else value
     elif dtype is not None and getattr(dtype, "kind", "f") not in "iuf":
         return math.nan
+    elif dtype is not None and getattr(value, "size", 0) == 1 and hasattr(value, "item"):
+        value = value.item()
     if isinstance(value, str | bytes | bytearray | bool):
         return math.nan
     try:

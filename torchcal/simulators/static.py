@@ -19,7 +19,8 @@ from torchcal.simulators.dual import Still, still
 from torchcal.simulators.parameter import Parameter, spans
 from torchcal.simulators.solution import Solution
 
-__all__ = ["Conditions", "Linearisation", "Simulator", "asks_for_numbers", "check_parameters", "nameless_advice"]
+__all__ = ["Conditions", "Linearisation", "Simulator", "asks_for_numbers", "check_parameters", "check_static",
+           "nameless_advice"]  # fmt: skip
 
 _DUAL = threading.RLock()
 """torch keeps one level of forward derivatives for the whole process, and refuses a second thread its own."""
@@ -78,6 +79,15 @@ def check_parameters(parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
     return parameters
 
 
+def check_static(parameters: Sequence[Parameter]) -> None:
+    """Refuse parameters with a value for each run, where there are no runs."""
+    if each := [parameter.name for parameter in parameters if parameter.per_run]:
+        raise DomainError(
+            f"Expected parameters with one value for all conditions. Got per_run=True for {each}: a static "
+            "recording has no runs (drop it and give each table a parameter of its own, or use an ODESimulator)."
+        )
+
+
 class Simulator:
     r"""A model y = f(x; λ) written with torch operations.
 
@@ -123,11 +133,7 @@ class Simulator:
             raise DomainError(f"Expected a callable f(x, p). Got {type(function).__name__}.")
         self.function = function
         self.parameters = check_parameters(parameters)
-        if each := [parameter.name for parameter in self.parameters if parameter.per_run]:
-            raise DomainError(
-                f"Expected parameters with one value for all conditions. Got per_run=True for {each}: a static "
-                "recording has no runs (drop it and give each table a parameter of its own, or use an ODESimulator)."
-            )
+        check_static(self.parameters)
         self.degree = None if degree is None else whole("degree", degree, 0, also="or None")
         self.seen: set[int] = set()
 

@@ -265,7 +265,7 @@ class PolynomialSurrogate(Simulator):
         return cls(
             torch.from_numpy(arrays["coefficients"]),
             conditions=tuple(conditions) if isinstance(conditions, list) else conditions,
-            parameters=[Parameter(**fields) for fields in header["parameters"]],
+            parameters=[Parameter(**{**fields, "per_run": False}) for fields in header["parameters"]],
             order=header["order"],
             outputs=header["outputs"],
             error=error,

@@ -4,8 +4,8 @@ import math
 from typing import Any
 
 from torchcal.discovery.fits.local import Span
-from torchcal.discovery.misfit.channels import ITSELF, RUN
-from torchcal.display import between, percent, unit_of, units_of, up_to, with_unit
+from torchcal.discovery.misfit.channels import RUN
+from torchcal.display import ITSELF, between, percent, unit_of, units_of, up_to, with_unit
 
 __all__ = ["share_in_words", "where_in_words"]
 
@@ -27,7 +27,7 @@ def where_in_words(d: Any) -> str:
     if not d.where:
         return ""
     place = d.where[0]
-    unit = unit_of(place.driver.removesuffix(ITSELF), units_of(d.recording, d.simulator))
+    unit = unit_of(place.driver, units_of(d.recording, d.simulator))
     spans = with_unit(", ".join(between(place.spans[:3], "to", place.extent)), unit)
     everywhere = _everywhere(d, place)
     if place.driver == RUN:

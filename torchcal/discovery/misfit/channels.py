@@ -14,17 +14,16 @@ from torch import Tensor
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.local import is_window
 from torchcal.discovery.fits.problem import Problem
+from torchcal.display import ITSELF
 from torchcal.simulators import Trajectories
 
-__all__ = ["ITSELF", "RUN", "Channel", "channels", "responses"]
+__all__ = ["RUN", "Channel", "channels", "responses"]
 
 #: Moments that a trajectory is cut into, over all runs.
 BINS = 150
 
 #: The driver of what differs from run to run.
 RUN = "run"
-#: What the driver of an output that varies with its own value ends with, after the output's name.
-ITSELF = " itself"
 
 
 @dataclass(frozen=True, eq=False)

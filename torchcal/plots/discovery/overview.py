@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from torchcal.data import Recording
-from torchcal.display import units_of
+from torchcal.display import ITSELF, units_of
 from torchcal.errors import DomainError
 from torchcal.plots.discovery.fits import both_fits
 from torchcal.plots.discovery.hypotheses import ranking
@@ -277,7 +277,7 @@ def _driver_of(diagnosis: Any, driver: str, fit: Any) -> Any:
     kept = getattr(diagnosis, "drivers", None) or {}
     if driver in kept:
         return kept[driver]
-    own = driver.removesuffix(" itself")
+    own = driver.removesuffix(ITSELF)
     return driver_values(diagnosis.recording, own, fit if own == driver else diagnosis.base)
 
 

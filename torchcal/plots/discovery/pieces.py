@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from torchcal.data import Recording
-from torchcal.display import DECADES
+from torchcal.display import DECADES, unit_of
 from torchcal.errors import DomainError, ShapeError
 from torchcal.plots import style
 
@@ -48,9 +48,7 @@ class Look:
 
     def unit(self, name: str) -> str | None:
         """A quantity's unit, where it has one."""
-        name = name.removesuffix(" itself")  # an output that changes with its own size
-        other = {"t": "time", "time": "t"}.get(name, name)
-        unit = self.units.get(name) or self.units.get(other)
+        unit = unit_of("t" if name == "time" else name, self.units)
         return plain(unit) if unit else None
 
     def value(self, name: str, value: float) -> str:

@@ -75,10 +75,11 @@ def held_out(
     look = Look(units={**recording.units, **(units or {})}, labels=labels or {})
     panels = panels_of(recording, fits[0].values, along, None, None, 10**6, look)
     wanted = held & seen
-    apart = (fits[-1].values if len(fits) > 1 else recording.y.cpu().numpy()) - fits[0].values
-    apart = np.where(wanted, apart / recording.spread.cpu().numpy(), 0.0)
+    with np.errstate(invalid="ignore"):  # predictions may be infinite
+        apart = (fits[-1].values if len(fits) > 1 else recording.y.cpu().numpy()) - fits[0].values
+    apart = np.where(wanted & np.isfinite(apart), apart / recording.spread.cpu().numpy(), 0.0)
     panels = [item for item in panels if wanted[item.places].any()]
-    panel = max(panels, key=lambda item: float(np.square(apart[item.places]).sum()))
+    panel = max(panels, key=lambda item: (float(np.square(apart[item.places]).sum()), wanted[item.places].sum()))
     titles = {item.title for item in panels if item.output == panel.output}
     if len(titles) > 1:
         panel = replace(panel, title=f"{panel.title} (one of {len(titles)} with held-out data)")

@@ -217,11 +217,11 @@ def residual_map(
 
 
 def _widened(spans: Sequence[tuple[float, float]], levels: np.ndarray) -> list[tuple[float, float]]:
-    """Spans that end at a level of the driver, half way to the next one: of a single level they have no width."""
-    middles = (levels[1:] + levels[:-1]) / 2
-    below = dict(zip(levels[1:], middles, strict=True))
-    above = dict(zip(levels[:-1], middles, strict=True))
-    return [(below.get(start, start), above.get(end, end)) for start, end in spans]
+    """Spans of a single level of the driver, which have no width, half way to the next levels."""
+    steps = np.sqrt(levels[1:] * levels[:-1]) if is_log(levels) else (levels[1:] + levels[:-1]) / 2
+    below = dict(zip(levels[1:], steps, strict=True))
+    above = dict(zip(levels[:-1], steps, strict=True))
+    return [(below.get(a, a), above.get(b, b)) if a == b else (a, b) for a, b in spans]
 
 
 def _bins(x: np.ndarray, keep: np.ndarray, period: float | None) -> list[np.ndarray]:
