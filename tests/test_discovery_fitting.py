@@ -548,4 +548,22 @@ def test_what_shorter_steps_cannot_bring_to_the_best_is_not_refitted_with_them(m
     monkeypatch.setattr(refitting, "sharpen", lambda *given, **options: ("finer", 0.0))
     found = refitting._in_short_steps(searched, coarse, 40.0)
     assert (found == "finer") is looked
-    assert refitting._in_short_steps(searched, coarse) == "finer"
+    assert refitting._in_short_steps(searched, coarse, math.inf) == "finer"
+
+
+@pytest.mark.parametrize(
+    ("numbers", "gain", "window", "sharpened"),
+    [
+        ((0,), 35.0, None, True), ((0,), 25.0, None, False),  # half of 100, less what noise may change
+        ((0, 1), 85.0, None, True), ((0, 1), 75.0, None, False), ((0,), 99.0, "t > 3", False),
+    ],
+)  # fmt: skip
+def test_steps_are_looked_at_of_what_may_matter_beside_the_best(monkeypatch, numbers, gain, window, sharpened):
+    """Of refits with more room for a shape as of all others."""
+    asked = []
+    monkeypatch.setattr(refitting, "_in_short_steps", lambda search, found, wanted: asked.append(wanted) or "finer")
+    searched = SimpleNamespace(gain=lambda chi2: 0.5 * (1000.0 - chi2), base=SimpleNamespace(chi2=1000.0))
+    one, fitted = SimpleNamespace(numbers=numbers, window=window), SimpleNamespace(chi2=1000.0 - 2 * gain)
+    found = refitting._sharp_enough(searched, one, fitted, 100.0)
+    assert (found == "finer") is sharpened
+    assert asked == ([840.0] if sharpened else [])

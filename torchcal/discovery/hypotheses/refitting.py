@@ -40,16 +40,11 @@ def refit_together(search: Search, wanted: Sequence[Hypothetical]) -> list[Model
             found[k] = fitted
     every = [*(model.found for model in search.models), *(fitted for fitted in found if fitted is not None)]
     best = max((search.gain(fitted.chi2) for fitted in every), default=0.0)
-    models: list[Model | None] = []
-    for one, fitted in zip(wanted, found, strict=True):
-        if fitted is None:
-            models.append(None)
-            continue
-        least = max(WORTH, HOPELESS * best - NEAR if len(one.numbers) == 1 else best - NEAR)
-        if one.window is None and search.gain(fitted.chi2) >= least:  # an edge within a step would only move
-            fitted = _in_short_steps(search, fitted, search.base.chi2 - 2 * (best - NEAR))
-        models.append(search.model(one, fitted))
-    return _with_room(search, models)
+    models = [
+        None if fitted is None else search.model(one, _sharp_enough(search, one, fitted, best))
+        for one, fitted in zip(wanted, found, strict=True)
+    ]
+    return _with_room(search, models, best)
 
 
 def improve(search: Search, wanted: Sequence[Hypothetical]) -> None:
@@ -78,9 +73,9 @@ def take_over(search: Search, models: Sequence[Model]) -> None:
     merge(search)
 
 
-def _with_room(search: Search, models: list[Model | None]) -> list[Model | None]:
+def _with_room(search: Search, models: list[Model | None], best: float) -> list[Model | None]:
     """The models, those anew that only the range in which a shape was sought holds back; where more room is enough,
-    that is the model."""
+    that is the model. ``best`` is the log evidence of the best fit, without its price."""
     models, jobs = list(models), {}
     for k, model in enumerate(models):
         if model is None or model.physical or search.gain(model.found.chi2) < WORTH:
@@ -91,7 +86,7 @@ def _with_room(search: Search, models: list[Model | None]) -> list[Model | None]
             jobs[k] = Hypothetical(model.numbers, roomy, model.found.values[None], model.log_prior, model.window)
     for (k, one), fitted in zip(jobs.items(), _fits(search, list(jobs.values())), strict=True):
         if fitted is not None:
-            free = search.model(one, _in_short_steps(search, fitted))
+            free = search.model(one, _sharp_enough(search, one, fitted, best))
             models[k] = free if free.physical else models[k]
     return models
 
@@ -129,7 +124,15 @@ def _fits(search: Search, wanted: Sequence[Hypothetical]) -> list[Fitted | None]
     return found
 
 
-def _in_short_steps(search: Search, found: Fitted, wanted: float = math.inf) -> Fitted:
+def _sharp_enough(search: Search, one: Hypothetical, fitted: Fitted, best: float) -> Fitted:
+    """A fit in short steps, where it may matter beside the best one, of a log evidence without its price."""
+    least = max(WORTH, HOPELESS * best - NEAR if len(one.numbers) == 1 else best - NEAR)
+    if one.window is not None or search.gain(fitted.chi2) < least:  # an edge within a step would only move
+        return fitted
+    return _in_short_steps(search, fitted, search.base.chi2 - 2 * (best - NEAR))
+
+
+def _in_short_steps(search: Search, found: Fitted, wanted: float) -> Fitted:
     """A fit with time steps that are short enough for it: what a term brings may be faster than the base.
 
     One whose steps err by much less than it is away from a χ² that is ``wanted`` stays as it is.
