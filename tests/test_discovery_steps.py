@@ -354,5 +354,9 @@ def test_what_all_runs_have_is_placed_in_none_of_them():
     every = analyse(residual, every=True)
     best = max(place.evidence for place in every.places)
     alone = in_one_run(residual, every.channels)
+    output = next(c for c in every.channels if c.kind == "output")
+    part = output.where(output.drivers["run"] == 2)
+    change = torch.randn(60, 2, dtype=torch.float64)
+    assert torch.equal(part.response(change), torch.cat([torch.zeros(120, 2, dtype=torch.float64), change]))
     assert {place.run for place in alone if place.channel.kind == "output"} == {0, 1, 2}
     assert all(place.evidence < best for place in alone)

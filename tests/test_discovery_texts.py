@@ -384,6 +384,8 @@ def test_an_experiment_that_takes_an_event_for_granted_says_so(region):
     d = finding("ambiguous", experiment=Experiment("longer", 5.0), tied=[["drag"], ["friction"]], ranking=rows)
     text = "It takes for granted that what acts in a span of time does so again."
     assert (text in called.experiment_told(d)[0]) is (region is not None and "t" in region)
+    d.recording.runs = None  # where "t" is a condition
+    assert text not in called.experiment_told(d)[0]
 
 
 @pytest.mark.parametrize(("separation", "told"), [(12.34, "12.3"), (99.96, "100"), (35e4, "more than 100")])

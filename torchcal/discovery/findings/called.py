@@ -105,6 +105,6 @@ def experiment_told(d: Any) -> list[str]:
     if len(untold) > UNTOLD + 1:
         untold = [*untold[:UNTOLD], f"{len(untold) - UNTOLD} other pairs apart"]
     text += f"; none that was tried in thought tells {', or '.join(untold)}." if untold else "."
-    if any("t" in (_region(d, tied) or "").split() for tied in d.tied):
+    if d.recording.runs and any("t" in (_region(d, tied) or "").split() for tied in d.tied):
         text += " It takes for granted that what acts in a span of time does so again."
     return [text]

@@ -37,7 +37,7 @@ class Channel:
         drivers: What the change may vary with: values at the K points where it can act, ``(K,)`` each.
         time: Time, or condition, of the points ``(K,)``.
         matrix: Response of the n used data to a unit change at each point, ``(n, K)``; or its diagonal ``(n,)`` where
-            each point is a datum.
+            each point is a datum. Sparse where points are some of the data.
         rates: Of a parameter of differential equations, by equation what a unit change does to its rate, ``(K,)``.
         usual: Of an equation, the r.m.s. along the trajectory of its rate, or of what one parameter adds to that.
     """
@@ -57,11 +57,15 @@ class Channel:
 
     def where(self, there: Tensor) -> "Channel":
         """The same with some of its points alone, bool ``(K,)``."""
-        matrix = self.matrix.diag() if self.matrix.ndim == 1 else self.matrix
-        drivers, rates = ({name: each[there] for name, each in table.items()} for table in (self.drivers, self.rates))
-        return dataclasses.replace(
-            self, drivers=drivers, time=self.time[there], matrix=matrix[:, there], rates=rates
-        )
+        rows = there.nonzero()[:, 0]
+        if self.matrix.ndim == 1:  # sparse: of thousands of data it has millions of zeros
+            at = torch.stack([rows, torch.arange(len(rows))])
+            size = (len(there), len(rows))
+            matrix = torch.sparse_coo_tensor(at, self.matrix[rows], size, check_invariants=True)
+        else:
+            matrix = self.matrix[:, rows]
+        drivers, rates = ({name: each[rows] for name, each in table.items()} for table in (self.drivers, self.rates))
+        return dataclasses.replace(self, drivers=drivers, time=self.time[rows], matrix=matrix, rates=rates)
 
 
 def _binning(bound: Trajectories) -> tuple[Tensor, int]:

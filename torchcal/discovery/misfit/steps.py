@@ -207,6 +207,8 @@ class _Between:
 
 def _acts(channel: Channel) -> Tensor:
     """Which of a channel's points do anything to the data, bool ``(K,)``: of an output its own."""
+    if channel.matrix.is_sparse:
+        return torch.ones(channel.matrix.shape[1], dtype=torch.bool)
     return channel.matrix != 0 if channel.matrix.ndim == 1 else (channel.matrix != 0).any(0)
 
 
