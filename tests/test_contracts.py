@@ -316,7 +316,7 @@ def test_integers_of_numpy_are_seeds_and_counts(tmp_path):
     assert surrogate.error.num == 10
 
 
-@pytest.mark.parametrize(("fixed", "told"), [({"a": None}, "a finite value"), ({"a": -1.0}, "positive values")])
+@pytest.mark.parametrize(("fixed", "told"), [({"a": None}, "a finite number"), ({"a": -1.0}, "positive values")])
 def test_diagnose_takes_the_fixed_values_that_calibrate_takes(fixed, told):
     model = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a", transform="log"), tc.Parameter("b")])
     with pytest.raises(DomainError, match=told):
