@@ -31,7 +31,7 @@ def corner(
     """Marginals on the diagonal, contours of the pairs below it, the MAP marked.
 
     Pairs are estimated along their principal axes, so that strongly correlated ones are resolved. Densities are
-    reflected at 0 where all draws of a quantity lie on one side of it, and its axis ends there. Where the
+    reflected at 0 where all draws of a quantity lie on one side of it and crowd there, and its axis ends. Where the
     values of a quantity differ only far behind the decimal point, its ticks count from a number that stands in
     the label.
 
