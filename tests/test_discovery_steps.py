@@ -119,11 +119,12 @@ def test_noise_alone_has_no_more_evidence_than_it_should():
 def functions_of(sudden):
     """Steps, bumps and changes between two steps."""
     first, last = sudden.between
-    return sudden.steps, sudden.bumps, sudden.steps[:, first] - sudden.steps[:, last]
+    steps, bumps = sudden.functions.split([sudden.steps, sudden.functions.shape[1] - sudden.steps], dim=1)
+    return steps, bumps, steps[:, first] - steps[:, last]
 
 
 def counts(sudden):
-    return sudden.steps.shape[1], sudden.bumps.shape[1]
+    return sudden.steps, sudden.functions.shape[1] - sudden.steps
 
 
 def test_sudden_changes_are_of_one_output_in_one_run_between_different_conditions():
@@ -133,7 +134,7 @@ def test_sudden_changes_are_of_one_output_in_one_run_between_different_condition
     for functions in functions_of(sudden):
         assert int((functions != 0).sum(0).min()) >= LEAST
     assert sudden.between.shape[1] == (51 - LEAST) * (51 - LEAST + 1) / 2  # all pairs that are five data apart at least
-    bumps = sudden.bumps
+    _, bumps, _ = functions_of(sudden)
     widths = sorted({round(float(w), 2) for w in bumps.sum(0) / math.sqrt(2 * math.pi) * X[1]}, reverse=True)
     assert widths[0] == pytest.approx(8 * 1.5 * X[1] / 2, rel=0.05)  # of whole bumps: 1.5, 3 and 6 gaps
     x = X.copy()

@@ -29,7 +29,7 @@ from torchcal.discovery.several import refit_several
 from torchcal.discovery.verdicts.decision import Decision
 from torchcal.discovery.verdicts.given import resolved, told_apart
 from torchcal.discovery.verdicts.verdict import decide
-from torchcal.display import NONE
+from torchcal.display import NONE, units_of
 from torchcal.errors import DomainError, EmbeddingError, InterruptionWarning, RecordingError, UnitWarning, warn
 from torchcal.simulators import ODESimulator, Simulator, is_value_of
 from torchcal.simulators.executor import check_executor
@@ -238,10 +238,7 @@ def _check(simulator: Any, recording: Any, candidates: Any, confidence: float) -
             f"Got {confidence!r}."
         )
     states = {name: unit for name, unit in getattr(simulator, "states", {}).items() if unit}
-    known: dict[str, str | None] = states | dict(recording.units)
-    for run in recording.runs or ():
-        known = run.units | known
-    return [labelled(term, known, states) for term in by_name.values()]
+    return [labelled(term, units_of(recording, simulator), states) for term in by_name.values()]
 
 
 def _compare_times(recording: Recording, terms: Sequence[Term]) -> None:

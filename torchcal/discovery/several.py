@@ -377,7 +377,7 @@ def _hypothetical(
             for place in source.own:
                 name = source.problem.parameters[place].name
                 k = names.index(name)
-                neutral = float(source.neutral[source.own.index(place)])
+                neutral = source.neutral_at(place)
                 value = float(fitted.found.values[place]) if fitted is not None else neutral
                 row[k] = neutral + 0.02 * (value - neutral) if place in source.amplitudes else value
         rows.append(row)

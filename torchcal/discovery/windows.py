@@ -350,7 +350,7 @@ def _begun(
         size *= 0.02
     else:
         values = near.found.by_name
-    values[names[amplitude]] = float(plain.neutral[plain.own.index(amplitude)]) + size
+    values[names[amplitude]] = plain.neutral_at(amplitude) + size
     ends = {f"{term.name}.{ENDS['from']}": w.low, f"{term.name}.{ENDS['to']}": w.high}
     shift = span.size * min(FINE if edge else SHIFT, WITHIN * span.share(w.low, w.high))
     choices = []

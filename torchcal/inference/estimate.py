@@ -128,12 +128,7 @@ def maximise(
             "record conditions in which it matters.",
             IdentifiabilityWarning,
         )
-    middle = _middle_of_the_tied(problem, found, best)
-    along = null if middle is best else _flat_directions(_curvature(problem, middle))
-    together = () if unseen else _known_together(problem, found, middle, along)
-    if not (unseen or together or middle is best):  # where a ridge is bent the flat direction at the other end may tell
-        middle, along = best, null
-        together = _known_together(problem, found, middle, along)
+    together, middle, along = ((), best, null) if unseen else _ridge(problem, found, best, null)
     if together:
         warn(
             f"The data determine {', '.join(together)} only together: other values of them give the same maximum, as "
@@ -249,6 +244,17 @@ def _unseen_means(problem: Problem, alpha: Tensor, curvature: Tensor) -> tuple[s
             if bool(((there - here).abs() <= 1e-6 * (1 + here.abs())).all()):
                 names += [name for name, part in zip(pattern.names, direction.abs(), strict=True) if part > 0.1]
     return tuple(dict.fromkeys(names))
+
+
+def _ridge(problem: Problem, found: Minima, best: Tensor, null: Tensor) -> tuple[tuple[str, ...], Tensor, Tensor]:
+    """Parameters that are known together alone, if any; the point ``(P,)`` of their ridge where its flat directions
+    ``(k, P)`` tell so, and these: in the middle of it, or, as it may be bent, at ``best``, where they are ``null``."""
+    middle = _middle_of_the_tied(problem, found, best)
+    if middle is not best:
+        along = _flat_directions(_curvature(problem, middle))
+        if together := _known_together(problem, found, middle, along):
+            return together, middle, along
+    return _known_together(problem, found, best, null), best, null
 
 
 def _known_together(problem: Problem, found: Minima, point: Tensor, null: Tensor) -> tuple[str, ...]:

@@ -24,12 +24,10 @@ def real_number(value: Any) -> float:
     [2.0, 0.5, nan, nan, nan]
     """
     dtype = getattr(value, "dtype", None)
-    if isinstance(dtype, torch.dtype):
-        value = value.tolist() if value.numel() == 1 else None
-        value = value[0] if isinstance(value, list) and len(value) == 1 else value
-    elif dtype is not None and getattr(dtype, "kind", "f") not in "iuf":
-        return math.nan
-    elif dtype is not None and getattr(value, "size", 0) == 1 and hasattr(value, "item"):
+    if dtype is not None:
+        count = value.numel() if isinstance(value, Tensor) else getattr(value, "size", 0)
+        if count != 1 or getattr(dtype, "kind", "f") not in "iuf":
+            return math.nan
         value = value.item()
     if isinstance(value, str | bytes | bytearray | bool):
         return math.nan

@@ -68,7 +68,7 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
         place = candidate.amplitudes[int(screening.amplitude[column]) if column >= 0 else 0]
         q = candidate.problem.parameters[place]
         model = fitted.get(i)
-        estimate = float(model.found.values[place]) - _neutral(candidate, place) if model else None
+        estimate = float(model.found.values[place]) - candidate.neutral_at(place) if model else None
         if i not in effects:
             blind = "its tangent tells nothing new: only large effects can"
             note = blind if candidate.blind else "already in the base model"
@@ -248,14 +248,9 @@ def _corrected(
 
 def _room(candidate: Candidate, place: int, sign: int) -> float:
     """How far an amplitude's bounds let it be from neutral, to one side."""
-    q, neutral = candidate.problem.parameters[place], _neutral(candidate, place)
+    q, neutral = candidate.problem.parameters[place], candidate.neutral_at(place)
     end = q.lowest if sign < 0 else math.inf if q.high is None else q.high
     return max(sign * (end - neutral), 0.0)
-
-
-def _neutral(candidate: Candidate, place: int) -> float:
-    """Of an amplitude."""
-    return float(candidate.neutral[candidate.own.index(place)])
 
 
 def _simulated(search: Search, i: int, column: int, size: float) -> Tensor | None:

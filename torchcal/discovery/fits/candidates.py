@@ -59,10 +59,14 @@ class Candidate:
         """Names of its terms."""
         return " + ".join(term.name for term in self.terms)
 
+    def neutral_at(self, place: int) -> float:
+        """The neutral value of one of its own parameters, by its place among all."""
+        return float(self.neutral[self.own.index(place)])
+
     def one_sided(self, place: int) -> int:
         """+1 or −1 where physics lets the amplitude leave its neutral value to one side only, else 0."""
         parameter = self.problem.parameters[place]
-        neutral = float(self.neutral[self.own.index(place)])
+        neutral = self.neutral_at(place)
         if parameter.low is not None and parameter.low >= neutral - 1e-12 * abs(neutral):
             return 1
         if parameter.high is not None and parameter.high <= neutral + 1e-12 * abs(neutral):

@@ -31,7 +31,7 @@ def _follows(search: Search, i: int, k: int, model: Model | None) -> bool:
     if model is None or not side:
         return True
     place = other.amplitudes[0]
-    size = float(model.found.values[place]) - float(other.neutral[other.own.index(place)])
+    size = float(model.found.values[place]) - other.neutral_at(place)
     return side * search.screening.correlation(i, k) * size >= 0
 
 

@@ -231,7 +231,7 @@ def blind_rows(candidate: Candidate) -> Tensor:
 
 def _from_guess(base: Fitted, candidate: Candidate, begin: Tensor, guess: Tensor) -> Tensor:
     """The base before it was bent, with amplitudes of several sizes."""
-    neutral = {place: float(candidate.neutral[candidate.own.index(place)]) for place in candidate.amplitudes}
+    neutral = {place: candidate.neutral_at(place) for place in candidate.amplitudes}
     row = begin[0].clone()
     for place, value in neutral.items():
         row[place] = value

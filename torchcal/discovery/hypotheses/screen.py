@@ -134,9 +134,9 @@ def twins(candidates: Sequence[Candidate], screening: Screening) -> dict[int, in
     side = {i: c.one_sided(c.amplitudes[0]) for i, c in enumerate(candidates)
             if len(c.shapes) == 1 and len(c.amplitudes) == 1}  # fmt: skip
     found: dict[int, int] = {}
-    for i, k in itertools.permutations(side, 2):
+    for k, i in itertools.combinations(side, 2):
         alike = screening.correlation(i, k) * (side[i] * side[k] or 1)
-        if k < i and i not in found and k not in found and (alike > ONE or (alike < -ONE and not side[i] * side[k])):
+        if i not in found and k not in found and (alike > ONE or (alike < -ONE and not side[i] * side[k])):
             found[i] = k
     return found
 

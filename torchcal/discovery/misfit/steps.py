@@ -50,13 +50,13 @@ class Sudden:
     """Steps of one output, changes between two of them, and bumps, each in one of its runs, at any of some places.
 
     Attributes:
-        steps: 0 before a step, 1 from there on to the end of its run, ``(n, S)``.
-        bumps: Normal curves, ``(n, B)``.
+        functions: Steps, 0 before and 1 from there on to the end of their run; then bumps, normal curves; ``(n, K)``.
+        steps: How many of them are steps.
         between: Places of two steps of a run with enough data in between, ``(2, P)``.
     """
 
-    steps: Tensor
-    bumps: Tensor
+    functions: Tensor
+    steps: int
     between: Tensor
 
     @classmethod
@@ -75,8 +75,8 @@ class Sudden:
             pairs = torch.combinations(torch.arange(len(at))).T
             between.append(pairs[:, at[pairs[1]] - at[pairs[0]] >= LEAST] + before)
             before += len(at)
-        found = cls(torch.cat(steps, 1), torch.cat(bumps, 1), torch.cat(between, 1)) if own else None
-        return found if found is not None and found.steps.shape[1] + found.bumps.shape[1] else None
+        functions = torch.cat([torch.zeros(problem.n, 0, dtype=torch.float64), *steps, *bumps], dim=1)
+        return cls(functions, before, torch.cat(between, 1)) if functions.shape[1] else None
 
     def evidence(self, residual: Residual) -> tuple[float, int, Tensor]:
         """Log evidence of one of them against none, with every kind, all of a kind and all `SIZES` as likely.
@@ -97,25 +97,25 @@ class Sudden:
 
     @functools.cached_property
     def _prior(self) -> Tensor:
-        """Log prior of one of them and of one of `SIZES`, ``(S + B + P,)``."""
-        counts = torch.tensor([kind.shape[1] for kind in (self.steps, self.bumps, self.between)])
+        """Log prior of one of them and of one of `SIZES`, ``(K + P,)``."""
+        counts = torch.tensor([self.steps, self.functions.shape[1] - self.steps, self.between.shape[1]])
         each = -(counts.double() * (counts > 0).sum() * len(SIZES)).log()
         return each.repeat_interleave(counts)
 
     def _function(self, number: int) -> Tensor:
         """One of them, ``(n,)``."""
-        alone = self.steps.shape[1] + self.bumps.shape[1]
+        alone = self.functions.shape[1]
         if number < alone:
-            return torch.cat([self.steps, self.bumps], dim=1)[:, number]
+            return self.functions[:, number]
         first, last = self.between[:, number - alone]
-        return self.steps[:, first] - self.steps[:, last]
+        return self.functions[:, first] - self.functions[:, last]
 
     def _along(self, residual: Residual) -> tuple[Tensor, Tensor]:
         """The residual along their effects, of unit norm, 0 where none is seen; and their norms."""
-        (first, last), count = self.between, self.steps.shape[1]
-        columns, norm = _beyond_tangents(residual, torch.cat([self.steps, self.bumps], dim=1))
+        first, last = self.between
+        columns, norm = _beyond_tangents(residual, self.functions)
         along = columns.T @ residual.e
-        inner = columns[:, :count].T @ columns[:, :count]
+        inner = columns[:, : self.steps].T @ columns[:, : self.steps]
         own = inner.diagonal()
         square = own[first] + own[last] - 2 * inner[first, last]
         seen = square > SEEN * (own[first] + own[last])
@@ -274,13 +274,14 @@ def in_one_run(residual: Residual, available: Sequence[Channel]) -> list[Place]:
         if channel.kind == "parameter" or not {"t", RUN} <= {*channel.drivers}:
             continue
         runs = channel.drivers[RUN]
-        for run in runs.unique():
+        every = runs.unique()
+        for run in every:
             own = channel.where((runs == run) & (_acts(channel) if channel.kind == "output" else True))
             none = torch.zeros_like(own.time)
             place = stepwise(residual, Place(own, "t", -math.inf, 0.0, none, none))
             if place.edges:
-                price = math.log(len(runs.unique()))
-                found.append(dataclasses.replace(place, evidence=place.evidence - price, run=int(run)))
+                evidence = place.evidence - math.log(len(every))
+                found.append(dataclasses.replace(place, evidence=evidence, run=int(run)))
     return found
 
 
