@@ -9,6 +9,7 @@ import torch
 from torch.autograd import forward_ad
 
 import torchcal as tc
+from torchcal.discovery.fits.candidates import Candidate
 from torchcal.discovery.fits.fitting import FINISH, finished, fit, refit, starts
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses import refitting
@@ -526,7 +527,7 @@ def test_what_is_named_is_told_at_its_lowest_minimum():
 
     def named(w):
         found = fit(problem, whitening, torch.tensor([[w, 0.3]], dtype=F64), [0, 1])
-        candidate = SimpleNamespace(own=[1], amplitudes=[1], neutral=torch.zeros(1, dtype=F64))
+        candidate = Candidate((), problem, [0, 1], [1], [1], *torch.zeros(4, 1, dtype=F64))
         return SimpleNamespace(found=found, candidate=candidate, window=None)
 
     astray, right = named(4.6), named(2.1)

@@ -16,6 +16,7 @@ from torchcal.discovery.findings import called, symptoms, where, words
 from torchcal.discovery.findings import where_in_words as where_text
 from torchcal.discovery.findings.where_in_words import where_in_words
 from torchcal.discovery.fits import local
+from torchcal.discovery.fits.candidates import Candidate
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.misfit.channels import Channel
 from torchcal.discovery.misfit.places import Place
@@ -516,7 +517,7 @@ def test_two_terms_that_do_much_the_same_may_stand_for_one_law(first, second, to
                 evaluate=lambda rows, columns: (rows @ shapes, None, None),
             ),
         ),
-        candidate=SimpleNamespace(terms=terms, own=[1, 2], amplitudes=[1, 2], neutral=torch.zeros(2, dtype=F64)),
+        candidate=Candidate(tuple(terms), None, [0, 1, 2], [1, 2], [1, 2], *torch.zeros(4, 2, dtype=F64)),
     )  # fmt: skip
     rows = explain.one_law(model)
     assert [row.startswith("one and two do much the same here (correlation 0.9") for row in rows] == [True] * told
@@ -784,3 +785,17 @@ def test_parameters_of_a_valley_are_said_to_be_hardly_known_apart(reach):
     a, k = (100 * e.sd / e.value for e in d.base.estimates)
     told = f"a and k are hardly known apart (correlation of their estimates 0.993; sd of {a:.0f} %, {k:.0f} %)"
     assert rows == ([told] if reach == 1.0 else [])
+
+
+@pytest.mark.parametrize(
+    ("outputs", "told"), [({"T": "K"}, " K"), ({"T": None}, ""), ({"T": "K", "n": None}, " of each output's spread")]
+)
+def test_noise_and_errors_have_their_units(outputs, told):
+    x = torch.linspace(0, 1, 12, dtype=F64)
+    line = tc.Simulator(lambda x, p: {name: p["a"] * x for name in outputs}, [tc.Parameter("a")])
+    y = {name: 2 * x + 0.2 * (-1.0) ** torch.arange(12) for name in outputs}
+    units = {name: unit for name, unit in outputs.items() if unit}
+    d = tc.diagnose(line, tc.Recording(x=x, y=y, noise=0.2, units=units), [], seed=0, progress=False)
+    text = words.paragraph(d).replace("\n", " ")
+    assert f"T 0.2{' K' if outputs['T'] else ''}{', n 0.2' if 'n' in outputs else ''}. The calibrated" in text
+    assert f"an RMSE of {d.before.fitted.rmse:.4g}{told}; noise alone" in text

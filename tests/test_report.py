@@ -280,9 +280,3 @@ def test_the_same_diagnosis_gives_the_same_page(pages):
         return re.sub(r" on \d{4}-\d\d-\d\d \d\d:\d\d UTC", "", text)
 
     assert without_time(report.page(cooling())) == without_time(pages["cooling"])
-
-
-def test_errors_are_in_the_unit_of_a_state_where_the_recording_has_none():
-    recording = SimpleNamespace(outputs=("v",), units={}, runs=None)
-    found = SimpleNamespace(recording=recording, simulator=SimpleNamespace(states={"v": "m/s", "n": None}))
-    assert report._rmse_unit(found) == "m/s"

@@ -6,8 +6,8 @@ from importlib import metadata
 from typing import Any
 
 __all__ = [
-    "DECADES", "FAR", "ITSELF", "NONE", "PATIENCE", "between", "percent", "placed", "raised", "unit_of", "units_of",
-    "up_to", "version", "with_unit",
+    "DECADES", "FAR", "ITSELF", "NONE", "PATIENCE", "between", "error_unit", "percent", "placed", "raised", "unit_of",
+    "units_of", "up_to", "version", "with_unit",
 ]  # fmt: skip
 
 NONE = ("none of these",)
@@ -68,6 +68,18 @@ def unit_of(driver: str, units: Mapping[str, str]) -> str:
     """
     driver = driver.removesuffix(ITSELF)
     return units.get(driver) or (units.get("time", "") if driver == "t" else "")
+
+
+def error_unit(recording: Any, simulator: Any) -> str:
+    """That of errors: ``"spread"``, each output's own, where there are several; empty where the only one has none.
+
+    >>> from types import SimpleNamespace
+    >>> speed = SimpleNamespace(outputs=("v",), units={}, runs=None)
+    >>> error_unit(speed, SimpleNamespace(states={"v": "m/s", "n": None}))
+    'm/s'
+    """
+    outputs = recording.outputs
+    return "spread" if len(outputs) > 1 else units_of(recording, simulator).get(outputs[0], "")
 
 
 def percent(share: float | None) -> str:

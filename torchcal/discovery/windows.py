@@ -227,8 +227,7 @@ def stepped(search: Search, model: Model, driver: str) -> Model:
     begin = torch.cartesian_prod(*choices)
     # Each with the size that suits it, to first order: that of soft edges beside a datum may be any.
     w, sizes = search.noise.whitening(problem), model.candidate.amplitudes
-    neutral = values.clone()
-    neutral[sizes] = model.candidate.neutral[[model.candidate.own.index(i) for i in sizes]]
+    neutral = model.candidate.without(values, sizes)
     without = problem.evaluate(neutral[None], [])[0]
     left, effect = w.vector(problem.y - without), w.vector(problem.evaluate(begin, [])[0] - without)
     factor = (effect @ left[0]) / effect.square().sum(-1)
@@ -315,8 +314,7 @@ def _amplitude(search: Search, model: Model) -> tuple[int, str, float]:
     column = search.screening.acting[model.numbers[0]]  # local models come of candidates that have one
     name = plain.problem.parameters[search.amplitude(column)].name
     place = [q.name for q in model.found.problem.parameters].index(name)
-    neutral = model.candidate.neutral[model.candidate.own.index(place)]
-    return place, name, float(model.found.values[place] - neutral)
+    return place, name, float(model.found.values[place]) - model.candidate.neutral_at(place)
 
 
 def _begun(

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from torchcal.display import between, percent, unit_of, units_of, up_to, version
+from torchcal.display import between, error_unit, percent, unit_of, units_of, up_to, version
 from torchcal.files import check_target, replacing
 from torchcal.plots.discovery import FigurePart, figure_parts
 from torchcal.plots.discovery.pieces import likeliest_with
@@ -176,7 +176,7 @@ def _facts(diagnosis: Any) -> str:
     before, after = getattr(diagnosis, "before", None), getattr(diagnosis, "after", None)
     old, new = (getattr(scores, "held_out", None) for scores in (before, after))
     if old is not None and new is not None and _accepted(diagnosis):
-        unit = "of the spread" if len(diagnosis.recording.outputs) > 1 else _rmse_unit(diagnosis)
+        unit = error_unit(diagnosis.recording, diagnosis.simulator).replace("spread", "of the spread")
         change = f"{in_digits(old.rmse, 3)} → {in_digits(new.rmse, 3)} {unit}".rstrip()
         facts.append(("RMSE on held-out data", change))
     cells = "".join(f"<div><dt>{escaped(name)}</dt><dd>{escaped(value)}</dd></div>" for name, value in facts)
@@ -256,7 +256,7 @@ def _estimates(diagnosis: Any) -> str:
 
 
 def _held_out(diagnosis: Any) -> str:
-    unit = _rmse_unit(diagnosis)
+    unit = error_unit(diagnosis.recording, diagnosis.simulator)
     rows = []
     models = [("base model", getattr(diagnosis, "before", None))]
     if _accepted(diagnosis):
@@ -411,12 +411,6 @@ def _accepted(diagnosis: Any) -> bool:
     """Whether there is a model beside the base."""
     final = getattr(diagnosis, "final", None)
     return final is not None and tuple(final.terms) != tuple(diagnosis.base.terms)
-
-
-def _rmse_unit(diagnosis: Any) -> str:
-    """Of errors, which are in units of each output's spread where there are several; empty where nobody told it."""
-    outputs = diagnosis.recording.outputs
-    return units_of(diagnosis.recording, diagnosis.simulator).get(outputs[0], "") if len(outputs) == 1 else "spread"
 
 
 def _comparable(value: float) -> float:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from torchcal.display import NONE, up_to
+from torchcal.display import NONE, error_unit, up_to, with_unit
 
 __all__ = [
     "LISTED",
@@ -42,8 +42,9 @@ def joined(names: list[str]) -> str:
 
 
 def rmse_unit(d: Any) -> str:
-    """What errors of several outputs are divided by."""
-    return " of each output's spread" if len(d.recording.outputs) > 1 else ""
+    """Behind an error in a sentence."""
+    unit = error_unit(d.recording, d.simulator)
+    return " of each output's spread" if unit == "spread" else with_unit("", unit)
 
 
 def log_odds_behind(p: float, first: float) -> float:

@@ -124,5 +124,6 @@ def _proof(d: Any) -> str:
     if d.before.model_error_sd and d.after.model_error_sd is not None:
         text += (
             f". The embedded model-error sd shrinks from {d.before.model_error_sd:.3g} to {d.after.model_error_sd:.3g}"
+            f"{rmse_unit(d)}"
         )
     return text + "."

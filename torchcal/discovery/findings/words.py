@@ -15,7 +15,7 @@ from torchcal.discovery.findings.called import (
 )
 from torchcal.discovery.findings.named_in_words import named
 from torchcal.discovery.findings.unnamed_in_words import ambiguous, consistent, likelier, unexplained
-from torchcal.display import NONE
+from torchcal.display import NONE, units_of, with_unit
 
 __all__ = ["paragraph"]
 
@@ -92,7 +92,9 @@ def _company(d: Any) -> str:
 
 def _detected(d: Any) -> str:
     noise = d.noise
-    sd = ", ".join(f"{name} {value:.3g}{_varying(d, name)}" for name, value in noise.sd.items())
+    units = units_of(d.recording, d.simulator)
+    sizes = {name: with_unit(f"{value:.3g}", units.get(name)) for name, value in noise.sd.items()}
+    sd = ", ".join(f"{name} {size}{_varying(d, name)}" for name, size in sizes.items())
     if noise.source == "none":
         rmse = d.before.fitted.rmse
         unit = rmse_unit(d)

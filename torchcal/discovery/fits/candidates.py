@@ -63,6 +63,11 @@ class Candidate:
         """The neutral value of one of its own parameters, by its place among all."""
         return float(self.neutral[self.own.index(place)])
 
+    def without(self, values: Tensor, places: Sequence[int]) -> Tensor:
+        """Values of all parameters ``(P,)`` with some of its own, by their places, at neutral."""
+        at = torch.tensor([self.own.index(place) for place in places], dtype=torch.long)
+        return values.index_copy(0, torch.tensor([*places], dtype=torch.long), self.neutral[at])
+
     def one_sided(self, place: int) -> int:
         """+1 or −1 where physics lets the amplitude leave its neutral value to one side only, else 0."""
         parameter = self.problem.parameters[place]

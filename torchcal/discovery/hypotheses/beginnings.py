@@ -136,8 +136,7 @@ def _off_bounds(base: Fitted, candidate: Candidate, rows: Tensor, within: Tensor
     begin = _from_guess(base, candidate, rows, within)
     if not len(begin):
         return None
-    row = begin[0].clone()
-    row[candidate.own] = candidate.neutral
+    row = candidate.without(begin[0], candidate.own)
     columns = _columns(base, candidate)
     try:
         slopes = base.whitening(candidate.problem.evaluate(row[None], [*columns, *candidate.amplitudes])[1][0])

@@ -36,7 +36,7 @@ def judge(model: Model, base: Fitted) -> None:
         if at and names[i] in amplitude:
             value, q = float(found.values[i]), candidate.problem.parameters[i]
             end = min((one for one in (q.low, q.high) if one is not None), key=lambda one: abs(one - value))
-            if end == float(candidate.neutral[candidate.own.index(i)]):
+            if end == candidate.neutral_at(i):
                 off.add(names[i])
     closed = model.window is not None and model.window.low >= model.window.high
     model.physical = not new and not closed

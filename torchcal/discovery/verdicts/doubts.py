@@ -245,7 +245,7 @@ def _distance(model: Model, places: Sequence[int], shapes: Sequence[int], size: 
     the scale of a state that is not seen, say, is no matter of the term.
     """
     found, candidate = model.found, model.candidate
-    away = found.values[list(places)] - candidate.neutral[[candidate.own.index(i) for i in places]]
+    away = (found.values - candidate.without(found.values, places))[list(places)]
     columns = found.whitening(found.jacobian) / max(size, 1e-300)
     mine = [found.free.index(i) for i in places]
     kept = [k for k, i in enumerate(found.free) if i not in {*places, *shapes}]
@@ -256,8 +256,7 @@ def _distance(model: Model, places: Sequence[int], shapes: Sequence[int], size: 
     base = [k for k, i in enumerate(found.free) if i not in candidate.own]
     if not base:
         return left
-    values = found.values.clone()
-    values[candidate.own] = candidate.neutral
+    values = candidate.without(found.values, candidate.own)
     jacobian = found.problem.evaluate(values[None], [found.free[k] for k in base])[1][0]
     slope = found.whitening(jacobian) / max(size, 1e-300)
     if not bool(slope.isfinite().all()):

@@ -211,13 +211,10 @@ def one_law(model: Model) -> list[str]:
     them looks like their sum."""
     found, candidate = model.found, model.candidate
     names = [q.name for q in found.problem.parameters]
-    without = found.values.repeat(len(candidate.terms), 1)
-    for row, term in zip(without, candidate.terms, strict=True):
-        for i in candidate.amplitudes:
-            if term.brings(names[i]):
-                row[i] = candidate.neutral[candidate.own.index(i)]
-    if len(without) < 2:
+    if len(candidate.terms) < 2:
         return []
+    own = [[i for i in candidate.amplitudes if term.brings(names[i])] for term in candidate.terms]
+    without = torch.stack([candidate.without(found.values, places) for places in own])
     change = found.whitening((found.y - found.problem.evaluate(without, [])[0]).T)
     slopes = found.whitening(found.jacobian[:, [k for k, i in enumerate(found.free) if i not in candidate.own]])
     slopes = slopes / slopes.norm(dim=0).clamp_min(1e-300)
@@ -307,10 +304,10 @@ def _sized(search: Search, model: Model) -> list[int]:
     Where the size is open, as the scale of an unseen state leaves it, there is a valley and no other minimum.
     """
     found, candidate, sd = model.found, model.candidate, model.found.sd()
-    neutral = dict(zip(candidate.own, candidate.neutral.tolist(), strict=True))
     if search.exact:
         return []
-    return [i for i in candidate.amplitudes if 0 < float(sd[i]) < abs(float(found.values[i]) - neutral[i])]
+    away = (found.values - candidate.without(found.values, candidate.amplitudes)).abs()
+    return [i for i in candidate.amplitudes if 0 < float(sd[i]) < float(away[i])]
 
 
 def _from_guesses(search: Search, model: Model) -> Fitted | None:

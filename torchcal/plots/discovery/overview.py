@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from torchcal.data import Recording
-from torchcal.display import ITSELF, units_of
+from torchcal.display import ITSELF, error_unit, units_of
 from torchcal.errors import DomainError
 from torchcal.plots.discovery.fits import both_fits
 from torchcal.plots.discovery.hypotheses import ranking
@@ -244,7 +244,7 @@ def figure_parts(diagnosis: Any) -> list[FigurePart]:
             )
         )
     if None not in pair:  # without an accepted term there is nothing to compare
-        unit = units.get(recording.outputs[0], "") if len(recording.outputs) == 1 else None
+        unit = error_unit(recording, diagnosis.simulator)
         parts.append(
             FigurePart(
                 "scores",
