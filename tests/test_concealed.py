@@ -183,7 +183,7 @@ def test_every_family_has_a_near_tie(name):
     assert np.median([tied_correlation(FAMILIES[name], seed) for seed in range(3)]) > 0.9
 
 
-@pytest.mark.parametrize("name", [*FRESH, *UNSEEN, *BLIND])
+@pytest.mark.parametrize("name", [*(pytest.param(name, marks=pytest.mark.slow) for name in (*FRESH, *UNSEEN)), *BLIND])
 def test_the_tool_is_given_the_same_physics(name):
     """Base and candidates are written twice: both say the same, with everything known. The saturation has a shape."""
     family, rng = FAMILIES[name], np.random.default_rng(1)

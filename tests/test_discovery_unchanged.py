@@ -150,7 +150,7 @@ def test_a_noisier_run_is_seen_beside_one_that_is_sampled_at_another_rate():
     assert by_run[3] == pytest.approx(told, rel=0.1)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_a_noisier_run_is_no_missing_physics(seed):
     model, recording = cooling((0.1,) * 4, (100,) * 4, (0.01, 0.01, 0.01, 0.2), seed)
     d = diagnose(model, recording, LOSS)
@@ -252,7 +252,7 @@ def test_numbers_of_any_type():
 # --- what is told of a range, and of an instrument ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_range_holds_the_data_that_it_is_told_by(seed):
     f, ph = (g.ravel() for g in np.meshgrid(np.linspace(0.2, 0.7, 9), np.arange(2.5, 8), indexing="ij"))
     model = tc.Simulator(lambda x, p: p["k"] - p["S"] * x["f"], [tc.Parameter("k"), tc.Parameter("S", low=0.0)])
@@ -265,7 +265,7 @@ def test_a_range_holds_the_data_that_it_is_told_by(seed):
     assert all(float(found[1]) < 4.5 < float(found[2]) for found in ranges if found)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_a_jump_at_zero_is_no_instrument_that_saturates_below_all_data(seed):
     x = np.tile(np.linspace(-3, 3, 25), 2)
     model = tc.Simulator(
