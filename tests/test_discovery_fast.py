@@ -215,3 +215,25 @@ def test_a_refit_that_goes_astray_begins_at_the_base(monkeypatch: pytest.MonkeyP
     assert len(first) >= 1
     row = next(row for row in d.ranking if row.terms == ("bend",))
     assert -5.0 < row.log_evidence < 5.0
+
+
+def test_a_small_value_of_what_no_tangent_shows_is_found():
+    """A noise floor that adds its square to a power, and may be eighty times as large."""
+    f = torch.logspace(1.3, 4.7, 96, dtype=F64)
+
+    def level(x, p):
+        power = 1 / (1 + (x / 3000.0) ** 4) + p["n"] ** 2
+        return p["K"] + 10 * torch.log10(power)
+
+    base = tc.Simulator(
+        level, [tc.Parameter("K", low=-20.0, high=30.0), tc.Parameter("n", low=0.0, high=0.2, neutral=0.0)]
+    )
+    terms = [
+        tc.Term("noise floor", frees=("n",)),
+        tc.Term("feedthrough", outputs={"y": lambda x, p, y: y + p["c"] * x / 1e3}, parameters=[tc.Parameter("c")]),
+    ]
+    noise = 0.1 * torch.randn(96, generator=torch.Generator().manual_seed(0), dtype=F64)
+    y = level(f, {"K": 6.0, "n": 0.0024}) + noise
+    d = tc.diagnose(base, tc.Recording(x=f, y=y, noise=0.1), terms, seed=0, progress=False)
+    assert d.terms == ["noise floor"]
+    assert d.final.estimates[-1].value == pytest.approx(0.0024, rel=0.1)

@@ -548,3 +548,19 @@ def test_long_sequences_have_no_more_curves_than_can_be_taken_away():
     problem = Problem.of(tc.Simulator(lambda x, p: p["a"] * x, [tc.Parameter("a")]), tc.Recording(x=x, y=x))
     assert smooth_columns(problem, torch.arange(6000)).shape == (6000, MOST_CURVES)
     assert smooth_columns(problem, torch.arange(600)).shape == (600, 100)
+
+
+def test_what_neighbouring_conditions_have_in_common_is_no_outlier():
+    """At x near 0.6 all data were off together; the largest of them were set aside, and nothing was left."""
+    x, T = (g.ravel() for g in np.meshgrid(np.linspace(0.04, 0.96, 12), [300.0, 320.0, 340.0, 360.0], indexing="ij"))
+    true = (60 * x + 35 * (1 - x)) * np.exp(-4200 * (1 / T - 1 / 330))
+    noise = 0.4 * np.random.default_rng(2017).standard_normal(48)
+    y = true * (1 - 0.06 * np.exp(-(((x - 0.6) / 0.07) ** 2))) + noise
+    base = tc.Simulator(
+        lambda x, p: (p["P1"] * x["x"] + p["P2"] * (1 - x["x"])) * torch.exp(-4200 * (1 / x["T"] - 1 / 330)),
+        [tc.Parameter("P1", low=20.0, high=120.0), tc.Parameter("P2", low=10.0, high=80.0)],
+    )
+    terms = [tc.Term("gas", outputs={"y": lambda x, p, y: y + p["g"] * x["T"]}, parameters=[tc.Parameter("g")])]
+    conditions = {"x": torch.as_tensor(x), "T": torch.as_tensor(T)}
+    d = tc.diagnose(base, tc.Recording(x=conditions, y=torch.as_tensor(y)), terms, seed=0, progress=False)
+    assert d.verdict == "unexplained" or ["none of these"] in d.tied

@@ -16,7 +16,7 @@ from torchcal.discovery.misfit.likeliest import Tangents, settled, with_unknown
 from torchcal.discovery.misfit.lines import Lines
 from torchcal.discovery.misfit.places import SIZES
 from torchcal.discovery.misfit.residual import Residual
-from torchcal.discovery.misfit.steps import LEAST, MOST, SURER, Sudden, in_one_run, stepwise, sudden_changes
+from torchcal.discovery.misfit.steps import LEAST, MOST, SURER, in_one_run, stepwise, sudden_changes
 from torchcal.discovery.misfit.structure import analyse, evidences
 from torchcal.plots.discovery.overview import figure_parts
 from torchcal.report.diagnosis_page import page
@@ -170,7 +170,46 @@ def test_sudden_changes_are_of_one_output_in_one_run_between_different_condition
     simulator = tc.Simulator(lambda x, p: p["a"] + p["b"] * x["x"] + 0 * x["z"], parameters())
     several = Problem.of(simulator, tc.Recording(x=x, y=torch.as_tensor(stepped(3)), noise=0.1))
     found, _ = calibrate_base(several, {}, 2, 0)
-    assert [Sudden.of(several, c) for c in channels(several, found) if c.kind == "output"] == [None]
+    assert counts(only(found))[0] == 2 * 51  # along either condition
+
+
+def gridded(sd, seed, *, in_one=0.0, everywhere=0.0):
+    """31 fields at each of three temperatures, with a bump at 1.6 in one of the sweeps, or in all."""
+    T, B = (g.ravel() for g in np.meshgrid([60.0, 150.0, 250.0], np.linspace(-4, 4, 31), indexing="ij"))
+    bump = np.exp(-(((B - 1.6) / 0.35) ** 2))
+    y = 0.8 * B + (in_one * (T < 100) + everywhere) * bump + sd * np.random.default_rng(seed).standard_normal(93)
+    simulator = tc.Simulator(lambda x, p: p["S"] * x["B"], [tc.Parameter("S", low=-5.0, high=5.0)])
+    x = {"T": torch.as_tensor(T), "B": torch.as_tensor(B)}
+    return simulator, tc.Recording(x=x, y=torch.as_tensor(y))
+
+
+def test_in_a_grid_sudden_changes_are_sought_in_every_row():
+    simulator, recording = gridded(0.05, 0)
+    found, _ = calibrate_base(Problem.of(simulator, recording), {}, 2, 0)
+    sudden = only(found)
+    assert counts(sudden)[0] == 28 + 3 * (31 + 1 - 2 * LEAST)  # along B everywhere, and at each T; three T are too few
+    rows = {tuple(found.problem.recording.columns[column != 0, 0].unique().tolist())
+            for column in functions_of(sudden)[0].T}  # fmt: skip
+    assert rows == {(60.0, 150.0, 250.0), (60.0,), (150.0,), (250.0,)}
+
+
+@pytest.mark.parametrize("size", [{"in_one": 0.6}, {"everywhere": 0.3}, {}])
+def test_what_is_off_in_a_part_of_a_grid_is_no_noise(size):
+    simulator, recording = gridded(0.05, 1, **size)
+    terms = [tc.Term("cubic", outputs={"y": lambda x, p, y: y + p["c"] * x["B"] ** 3}, parameters=[tc.Parameter("c")])]
+    d = tc.diagnose(simulator, recording, terms, seed=0, progress=False)
+    assert d.noise.sd["y"] == pytest.approx(0.05, rel=0.4)
+    assert d.verdict == "consistent" if not size else d.verdict == "unexplained" or ["none of these"] in d.tied
+
+
+def test_bumps_along_a_condition_that_spans_decades_are_as_wide_in_decades():
+    f = np.geomspace(20, 50000, 96)
+    y = 1e-4 * f + 0.1 * np.random.default_rng(0).standard_normal(96)
+    found, _ = calibrated(y, f, noise=0.1)
+    _, bumps, _ = functions_of(only(found))
+    half = [f[(column > 0.5 * column.max()).numpy()] for column in bumps.T]
+    assert max(part[-1] / part[0] for part in half) < 20
+    assert min(part[-1] for part in half) < 60
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -119,7 +119,8 @@ def _again(search: Search, observed: Problem, detected: bool, confidence: float)
 def with_all(
     search: Search, observed: Problem, detected: bool, confidence: float
 ) -> tuple[Search | None, tuple[str, ...]]:
-    """The search of all observed data, where its best model is clearly likelier than outliers.
+    """The search of all observed data, where its best model is clearly likelier than outliers; or something unknown is,
+    where nothing was ``detected`` without them: of neighbouring conditions several may well be off together.
 
     Where they are too few to prove it, the names of what may explain them are returned instead.
     """
@@ -130,6 +131,8 @@ def with_all(
         return None, ()
     odds, spare = outdone(search, every, detected)
     if odds <= EXPLAINED or spare <= 0:
+        if not detected and not observed.in_time and not outliers_alone(search, every, detected, short=EXPLAINED):
+            return (every if _refit(every, confidence) and not search.stop.is_set() else None), ()
         sticking = outliers(every, observed.keep)
         if sticking is None or not 0 < int(sticking.sum()) < observed.n - search.problem.n:
             best = every.physical_leader

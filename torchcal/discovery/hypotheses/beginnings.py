@@ -32,8 +32,8 @@ SHAPES, SHAPES_FAR = 3, 8
 FAR, BENT, LOST = 30.0, 5.0, 0.5
 #: Amplitudes tried from first guesses, as shares of the range or of the largest linear estimate.
 GUESSED = (0.1, 0.4, 0.9)
-#: Amplitudes tried where the tangent says nothing: shares of the range, or powers of ten.
-BLIND, MAGNITUDES = (0.1, 0.3, 0.5, 0.7, 0.9), range(-4, 3)
+#: Amplitudes tried where the tangent says nothing: shares of the way from neutral to either bound, or powers of ten.
+BLIND, MAGNITUDES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 0.9), range(-4, 3)
 #: Sizes, in those of the misfit, at which an effect whose tangent is the base's is looked at; steps in which the base
 #: makes up for it; and the χ² a datum that it must leave to be something else.
 LARGER, MADE_UP, SEEN = (1.0, 4.0), 12, 0.01
@@ -220,11 +220,12 @@ def blind_rows(candidate: Candidate) -> Tensor:
     rows = []
     for place in candidate.amplitudes:
         q = candidate.problem.parameters[place]
+        neutral = candidate.neutral_at(place)
         if q.low is not None and q.high is not None:
-            values = [q.low + (q.high - q.low) * k for k in BLIND]
+            values = [neutral + (end - neutral) * k for end in (q.low, q.high) if end != neutral for k in BLIND]
         else:
-            values = [sign * 10.0**k for k in MAGNITUDES for sign in (1, -1)]
-        rows += _each(candidate.begin, place, values)
+            values = [neutral + sign * 10.0**k for k in MAGNITUDES for sign in (1, -1)]
+        rows += _each(candidate.begin, place, [value for value in values if q.contains(value)])
     return torch.stack(rows)
 
 

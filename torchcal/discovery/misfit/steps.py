@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchcal.discovery.fits.local import Span
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.misfit.channels import RUN, Channel
 from torchcal.discovery.misfit.places import SIZES, Place, is_unseen
@@ -22,6 +23,8 @@ __all__ = ["SURER", "Sudden", "in_one_run", "stepwise", "sudden_changes"]
 
 #: Data, or points of a channel, that there are at least on either side of a step: fewer may be outliers.
 LEAST = 5
+#: Levels of one of several conditions up to which smooth curves follow whatever is along it.
+FEW = 5
 #: Steps that are tried in all outputs together, evenly among their data, and about how many bumps.
 MOST = 200
 #: Sd of the narrowest bump, in usual gaps between data, and of the widest, as a share of a run.
@@ -47,7 +50,8 @@ def _shrink() -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Sudden:
-    """Steps of one output, changes between two of them, and bumps, each in one of its runs, at any of some places.
+    """Steps of one output, changes between two of them, and bumps, each in one of its runs or along one of several
+    conditions, at any of some places.
 
     Attributes:
         functions: Steps, 0 before and 1 from there on to the end of their run; then bumps, normal curves; ``(n, K)``.
@@ -61,19 +65,19 @@ class Sudden:
 
     @classmethod
     def of(cls, problem: Problem, channel: Channel) -> "Sudden | None":
-        """Of an output; None where its data follow in nothing, or are too few."""
-        if problem.order is None:
-            return None
-        number, along = problem.recording.outputs.index(channel.target), problem.order[problem.condition_of]
-        own = [p for p in problem.sequences if int(problem.output_of[p[0]]) == number and len(p) >= 2 * LEAST]
-        most = max(MOST // max(len(own) * len(problem.recording.outputs), 1), 1)
+        """Of an output; None where its data are too few."""
+        rows = _rows(problem, problem.recording.outputs.index(channel.target))
+        most = max(MOST // max(len(rows) * len(problem.recording.outputs), 1), 1)
         steps, bumps, between, before = [], [], [torch.zeros(2, 0, dtype=torch.long)], 0
-        for places in own:
-            at = _steps(along[places], most)
-            steps.append(_over_run(problem, places, (torch.arange(len(places))[:, None] >= at).double()))
-            bumps.append(_over_run(problem, places, _bumps(along[places], most)))
+        for places, values in rows:
+            levels, level = values.unique(return_inverse=True)
+            below = level.bincount().cumsum(0)
+            at = _steps(below, most)
+            steps.append(_over_run(problem, places, (level[:, None] >= at).double()))
+            scale = levels.log() if Span.of(values, time=problem.in_time).log else levels
+            bumps.append(_over_run(problem, places, _filling(_bumps(scale, most)[level])))
             pairs = torch.combinations(torch.arange(len(at))).T
-            between.append(pairs[:, at[pairs[1]] - at[pairs[0]] >= LEAST] + before)
+            between.append(pairs[:, below[at[pairs[1]] - 1] - below[at[pairs[0]] - 1] >= LEAST] + before)
             before += len(at)
         functions = torch.cat([torch.zeros(problem.n, 0, dtype=torch.float64), *steps, *bumps], dim=1)
         return cls(functions, before, torch.cat(between, 1)) if functions.shape[1] else None
@@ -123,6 +127,25 @@ class Sudden:
         return torch.cat([along / norm, (along[first] - along[last]) / apart]), torch.cat([norm, apart])
 
 
+def _rows(problem: Problem, output: int) -> list[tuple[Tensor, Tensor]]:
+    """Places of an output's data among which sudden changes are sought, and what these follow in: runs in time, or all
+    along the only condition; of several along each one, everywhere and where none of the others changes."""
+    own = [places for places in problem.sequences if int(problem.output_of[places[0]]) == output]
+    if problem.order is not None:
+        return [(p, problem.order[problem.condition_of[p]]) for p in own if len(p) >= 2 * LEAST]
+    found = []
+    for places in own:
+        columns = problem.recording.columns[problem.condition_of[places]]
+        for k, values in enumerate(columns.T):
+            others = torch.cat([columns[:, :k], columns[:, k + 1 :]], dim=1)
+            at = others.unique(dim=0, return_inverse=True)[1]
+            parts = [at == level for level in (at.bincount() >= 2 * LEAST).nonzero()[:, 0].tolist()]
+            for part in [torch.ones_like(at, dtype=torch.bool), *parts]:
+                if int(part.sum()) >= 2 * LEAST and len(values[part].unique()) > FEW:
+                    found.append((places[part], values[part]))
+    return found
+
+
 def _beyond_tangents(residual: Residual, functions: Tensor) -> tuple[Tensor, Tensor]:
     """Whitened effects ``(n, K)`` beyond what the base's parameters make up for, and their norms, infinite where none
     is seen."""
@@ -143,21 +166,27 @@ def sudden_changes(problem: Problem, available: Sequence[Channel]) -> list[Sudde
     return [sudden for sudden in found if sudden is not None]
 
 
-def _steps(along: Tensor, most: int) -> Tensor:
-    """Where steps are between values ``(m,)`` that rise, with enough of them on either side, ``(K,)``."""
-    number = torch.arange(LEAST, len(along) - LEAST + 1)
-    return _evenly(number[along[number] > along[number - 1]], most)
+def _steps(below: Tensor, most: int) -> Tensor:
+    """Levels that steps begin at, with enough data on either side, ``(K,)``, by how many there are up to each level,
+    ``(m,)``."""
+    number = torch.arange(1, len(below))
+    before = below[number - 1]
+    return _evenly(number[(before >= LEAST) & (below[-1] - before >= LEAST)], most)
 
 
 def _bumps(along: Tensor, most: int) -> Tensor:
-    """Normal curves over values ``(m,)`` that rise, of widths that double, with centres a width apart, ``(m, K)``."""
+    """Normal curves over levels ``(m,)`` that rise, of widths that double, with centres a width apart, ``(m, K)``."""
     span, gap = float(along[-1] - along[0]), float(along.diff().median())
     width, found = NARROW * max(gap, span / most), []
     while gap > 0 and width <= WIDE * span:
         centres = torch.linspace(float(along[0]), float(along[-1]), round(span / width) + 1, dtype=torch.float64)
         found.append(torch.exp(-0.5 * ((along[:, None] - centres) / width).square()))
         width *= 2.0
-    bumps = torch.cat(found, dim=1) if found else torch.zeros(len(along), 0, dtype=torch.float64)
+    return torch.cat(found, dim=1) if found else torch.zeros(len(along), 0, dtype=torch.float64)
+
+
+def _filling(bumps: Tensor) -> Tensor:
+    """Those of bumps ``(n, K)`` that enough data are in."""
     size = bumps.sum(0).square() / bumps.square().sum(0).clamp_min(1e-300)  # of how many data that are alike
     return bumps[:, size >= 0.5 * LEAST]
 
