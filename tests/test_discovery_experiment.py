@@ -232,6 +232,15 @@ def test_bolder_runs_are_what_their_texts_say():
     assert torch.equal(slow["inputs"]["f"], first.inputs["f"])
 
 
+def test_a_multiple_of_an_initial_state_that_was_calibrated_has_to_be_known_from_elsewhere():
+    model = driven({"x": 0.5})
+    model.values = torch.cat([model.values, torch.tensor([0.3], dtype=F64)])
+    texts = [text for text, _, _ in (*conditions.simple(model), *conditions.bolder(model))]
+    multiples = [text for text in texts if "times the initial" in text or "inputs and initial states" in text]
+    assert len(multiples) > 8
+    assert all(text.endswith(", with initial v known from elsewhere") for text in multiples)
+
+
 def test_milder_multiples_are_tried_first():
     # Where twice the initial states is more than a model bears (a pendulum's past the top) half as much more may do.
     chosen = {text: conditions for text, _, conditions in conditions.simple(driven({"x": 0.5, "v": 0.0}))}

@@ -99,7 +99,8 @@ def simple(model: Fitted, feasible: Feasible = ANYWHERE) -> list[Option]:
     options += _stronger(recording, begin, ask, MULTIPLES)
     options.append(_run(recording, f"a run three times as long as the first{ask}", begin.values, copies=3))
     if begin.moves:
-        text = f"a run that starts from 2 times the initial states{begin.counted} and is twice as long"
+        known = _ask(recording, begin.values)
+        text = f"a run that starts from 2 times the initial states{begin.counted} and is twice as long{known}"
         options.append(_run(recording, text, begin.times(2.0), copies=2))
     return _allowed(recording, [*options, *_at_ends(recording, begin, ask, feasible)], feasible)
 
@@ -125,7 +126,8 @@ def bolder(model: Fitted, feasible: Feasible = ANYWHERE) -> list[Option]:
             options.append(_run(recording, text, {**values, name: float(f"{largest:.3g}")}))
         elif not at_rest and len(values) > 1:  # of one state alone this is a multiple of all initial states
             initial = f"the initial {name} of the first{_counted({name: zero})}"
-            text = f"a run that starts from {ALONE:g} times {initial}, all else as there{others}"
+            known = _ask(recording, values)
+            text = f"a run that starts from {ALONE:g} times {initial}, all else as there{known}"
             options.append(_run(recording, text, begin.times(ALONE, [name])))
     options += _stronger(recording, begin, ask, BOLD)
     if _runs(recording)[0].inputs:
@@ -233,7 +235,8 @@ def _ask(recording: Recording, begin: Iterable[str]) -> str:
 
 def _elsewhere(recording: Recording, begin: _Begin, factors: tuple[float, ...]) -> list[Option]:
     """Runs from multiples of the initial states; none where these are no others."""
-    text = "a run that starts from {:g} times the initial states of the first" + begin.counted
+    known = _ask(recording, begin.values)
+    text = f"a run that starts from {{:g}} times the initial states of the first{begin.counted}{known}"
     able = factors if begin.moves else ()
     return [_run(recording, text.format(factor), begin.times(factor)) for factor in able]
 
@@ -253,7 +256,7 @@ def _stronger(recording: Recording, begin: _Begin, ask: str, factors: tuple[floa
              change=times(factor))
         for factor in factors
     ]  # fmt: skip
-    both = _counted({**zero, **begin.zero})
+    both = _counted({**zero, **begin.zero}) + _ask(recording, begin.values)
     for factor in factors if begin.moves else ():
         text = f"a run with {factor:g} times the inputs and initial states of the first{both}"
         options.append(_run(recording, text, begin.times(factor), change=times(factor)))
