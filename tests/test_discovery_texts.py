@@ -237,6 +237,25 @@ def test_a_term_in_a_window_is_told_by_its_name_and_steps_by_where_they_are():
     assert "(at 2 and 5): one constant change outside of these removes" in where_in_words(finding(where=[ends]))
 
 
+def test_another_place_in_one_run_is_told_with_that_run():
+    places = [
+        Location("equation", "v", "t", PART, 0.5, 20.0, run=0), Location("equation", "z", "t", PART, 0.5, 19.0, run=1),
+    ]  # fmt: skip
+    text = where_in_words(finding("unexplained", where=places))
+    assert "and one of the equation z of run 1 (counted from 0) with t about as much" in text
+
+
+def test_what_varies_with_a_driver_is_what_several_terms_do_together():
+    terms = [
+        tc.Term("one", frees=("D",)), tc.Term("two", frees=("d",)), tc.Term("three", frees=("d",)),
+    ]  # fmt: skip
+    model = SimpleNamespace(candidate=SimpleNamespace(terms=terms))
+    first, *also = where._act_on(model)
+    place = Location(*first, "t", PART, 0.5, 20.0, terms=("one", "two", "three"), also=tuple(also))
+    text = where_in_words(finding(where=[place]))
+    assert "sits in the parameter D and the parameter d and varies with t" in text
+
+
 def test_spans_over_decades_are_measured_in_decades():
     place = Location("parameter", "k", "c", ((1e3, 1e6),), 0.5, 20.0)
     assert not where_text._everywhere(finding(drivers={"c": torch.logspace(0, 6, 13, dtype=F64)}), place)

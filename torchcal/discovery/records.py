@@ -208,6 +208,8 @@ class Location:
         edges: Of a change in steps, the values of the driver where it begins or ends; none of any other change.
         terms: Where it is that some terms act, their names: the share is what they remove, and the evidence theirs.
         run: Of a change in one run of several alone, which, counted from 0.
+        also: Kinds and targets of what else some terms together act on: what varies with the driver is then what they
+            do together.
     """
 
     kind: str
@@ -221,11 +223,13 @@ class Location:
     edges: tuple[float, ...] = ()
     terms: tuple[str, ...] = ()
     run: int | None = None
+    also: tuple[tuple[str, str], ...] = ()
 
     @property
     def called(self) -> str:
         """What it is a place in, in words."""
-        return f"{self.kind} {self.target}" + ("" if self.run is None else f" of run {self.run} (counted from 0)")
+        places = " and the ".join(f"{kind} {target}" for kind, target in ((self.kind, self.target), *self.also))
+        return places + ("" if self.run is None else f" of run {self.run} (counted from 0)")
 
 
 @dataclass(frozen=True)

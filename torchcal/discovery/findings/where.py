@@ -108,12 +108,12 @@ def locate(
         drivers = search.drivers()[w.driver]
         low = w.low if math.isfinite(w.low) else float(drivers.min())
         high = w.high if math.isfinite(w.high) else float(drivers.max())
-        kind, target = _acts_on(local)
+        (kind, target), *also = _act_on(local)
         share, evidence, extent = removed(search, local), _evidence(search, local), _extent(drivers)
         if local is search.unnamed:
             told: dict[str, Any] = {"edges": tuple(end for end in (w.low, w.high) if math.isfinite(end))}
         else:
-            told = {"terms": local.names}
+            told = {"terms": local.names, "also": tuple(also)}
         rows.append(Location(kind, target, w.driver, ((low, high),), share, evidence, extent=extent, **told))
     sensor = best is not None and _acts_on(best)[0] == "output"  # then it has been shown to be the output
     places = [
@@ -212,10 +212,10 @@ def _contributed(search: Search, model: Model, drivers: Sequence[str]) -> Locati
     driver = next((name for name in drivers if name in at_data), next(iter(at_data)))
     values, which = at_data[driver].unique(return_inverse=True)
     largest = torch.zeros_like(values).scatter_reduce(0, which, size.to(values), "amax")
-    kind, target = _acts_on(model)
+    (kind, target), *also = _act_on(model)
     spans, share, evidence = _ranges(values, largest), removed(search, model), _evidence(search, model)
-    extent = _extent(values)
-    return Location(kind, target, driver, spans, share, evidence, extent=extent, terms=model.names)
+    told: dict[str, Any] = {"extent": _extent(values), "terms": model.names, "also": tuple(also)}
+    return Location(kind, target, driver, spans, share, evidence, **told)
 
 
 def _evidence(search: Search, model: Model) -> float:
@@ -224,7 +224,16 @@ def _evidence(search: Search, model: Model) -> float:
 
 
 def _acts_on(model: Model) -> tuple[str, str]:
-    term = model.candidate.terms[0]
+    """Kind and target of what the first of a model's terms acts on."""
+    return _act_on(model)[0]
+
+
+def _act_on(model: Model) -> list[tuple[str, str]]:
+    """Kinds and targets of what a model's terms act on, in the order of these."""
+    return list(dict.fromkeys(_one_acts_on(term) for term in model.candidate.terms))
+
+
+def _one_acts_on(term: Term) -> tuple[str, str]:
     if _is_rate(term):
         return "equation", _equations(term)[0]
     if term.outputs:

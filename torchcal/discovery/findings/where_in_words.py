@@ -120,7 +120,7 @@ def _elsewhere(d: Any) -> str:
     first = d.where[0]
     close = [place for place in d.where[1:] if place.evidence > first.evidence - CLOSE and place.driver != RUN]
     other = next((place for place in close if (place.kind, place.target) != (first.kind, first.target)), None)
-    return "" if other is None else f", and one of the {other.kind} {other.target} with {other.driver} about as much"
+    return "" if other is None else f", and one of the {other.called} with {other.driver} about as much"
 
 
 def _embedded(d: Any) -> str:

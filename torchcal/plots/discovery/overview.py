@@ -168,6 +168,7 @@ def figure_parts(diagnosis: Any) -> list[FigurePart]:
     if best is not None and driver is not None:
         by = plain(called(driver), TITLED, middle=True)
         name = f"Mismatch in the {best.kind} {plain(best.target, TITLED, middle=True)}, along {by}"
+        name = f"Mismatch along {by}" if getattr(best, "also", ()) else name  # of several places there are too many
     if spans:
         said += (
             f" Shaded: where the {_change(best)} is largest. What that does to the output may be largest elsewhere: "
