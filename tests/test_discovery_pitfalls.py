@@ -650,6 +650,48 @@ def test_limits_stay_within_a_parameters_bounds():
     assert hidden.sign == 0
 
 
+def test_an_effect_that_no_tangent_shows_has_a_limit_too():
+    """A high-pass: its effect goes with the square of the corner frequency, whose tangent vanishes at 0."""
+    f = torch.logspace(1.3, 3, 40, dtype=torch.float64)
+    base = tc.Simulator(
+        lambda x, p: p["K"] - 10 * torch.log10(1 + (p["fl"] / x["f"]) ** 2),
+        [tc.Parameter("K"), tc.Parameter("fl", low=0.0, high=200.0, neutral=0.0)],
+    )
+    noise = 0.1 * torch.randn(40, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    terms = [tc.Term("AC coupling", frees=("fl",))]
+    d = diagnose(base, tc.Recording(x={"f": f}, y=3.0 + noise, noise=0.1), terms)
+    (limit,) = d.detection_limit
+
+    def left(fl):
+        """Noise sd by which the data are beyond any K."""
+        effect = 10 * torch.log10(1 + (fl / f) ** 2)
+        return float((effect - effect.mean()).norm()) / 0.1
+
+    assert 4.9 < left(limit.smallest) < 5.5  # 3.5 to be seen, and 1.6 for the power
+    assert d.verdict == "consistent"
+    assert "AC coupling" in str(d)
+
+
+def test_an_estimate_of_another_shape_is_no_multiple_of_a_limit():
+    x = torch.linspace(-4, 4, 60, dtype=torch.float64)
+    base = tc.Simulator(lambda x, p: p["S"] * x["B"], [tc.Parameter("S")])
+    term = tc.Term(
+        "two carriers", outputs={"y": lambda x, p, y: y - p["k"] * x["B"] ** 3 / (1 + (x["B"] / p["b"]) ** 2)},
+        parameters=[tc.Parameter("k"), tc.Parameter("b", low=0.5, high=20.0)],
+    )  # fmt: skip
+    noise = 0.05 * torch.randn(60, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    y = x - 0.01 * x**3 / (1 + (x / 1.1) ** 2) + noise
+    (limit,) = diagnose(base, tc.Recording(x={"B": x}, y=y, noise=0.05), [term]).detection_limit
+    assert limit.estimate is not None
+    assert not limit.comparable
+    assert limit.note.startswith("at b = 3.16")
+    assert "; the estimate at b = " in limit.note
+    ax = tc.plots.detection_limits([limit])
+    assert not [line for line in ax.get_lines() if line.get_marker() == "o" and len(line.get_xdata())]
+    ax = tc.plots.detection_limits([dataclasses.replace(limit, comparable=True)])
+    assert [line for line in ax.get_lines() if line.get_marker() == "o" and len(line.get_xdata())]
+
+
 def test_the_estimate_beside_a_limit_is_as_far_from_neutral():
     """An order of 1 that stays at 1 is not many times what could have been seen."""
     x = torch.linspace(1, 10, 40, dtype=torch.float64)

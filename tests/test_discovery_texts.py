@@ -22,7 +22,7 @@ from torchcal.discovery.misfit.channels import Channel
 from torchcal.discovery.misfit.places import Place
 from torchcal.discovery.records import Estimate, Experiment, Hypothesis, Limit, Location, MissingRate, Table
 from torchcal.discovery.verdicts import doubts, explain
-from torchcal.display import NONE
+from torchcal.display import IN_BASE, NONE
 from torchcal.plots.discovery.pieces import likeliest_with
 from torchcal.report import diagnosis_page
 
@@ -378,6 +378,15 @@ def test_without_noise_a_name_is_lost_on_held_out_data():
 def test_limits_that_are_left_out_are_counted(count, told):
     limits = [Limit(f"term{k}", "c", 0.5, None, 0.95) for k in range(count)]
     assert said(finding("consistent", detection_limit=limits)).endswith(told)
+
+
+def test_effects_that_would_not_have_shown_are_told():
+    rows = [Limit(name, "c", size, None, 0.95, note=note) for name, size, note in (
+        ("drag", 0.5, ""), ("sag", math.inf, "calibration hides effects of 9, the largest that was tried"),
+        ("offset", math.inf, IN_BASE),
+    )]  # fmt: skip
+    text = said(finding("consistent", detection_limit=rows))
+    assert "No effect of any size that was tried would have shown of sag. The smallest" in text
 
 
 @pytest.mark.parametrize(

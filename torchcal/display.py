@@ -6,12 +6,15 @@ from importlib import metadata
 from typing import Any
 
 __all__ = [
-    "DECADES", "FAR", "ITSELF", "NONE", "PATIENCE", "between", "error_unit", "percent", "placed", "raised", "unit_of",
-    "units_of", "up_to", "version", "with_unit",
+    "DECADES", "FAR", "IN_BASE", "ITSELF", "NONE", "PATIENCE", "between", "error_unit", "percent", "placed", "raised",
+    "unit_of", "units_of", "up_to", "version", "with_unit",
 ]  # fmt: skip
 
 NONE = ("none of these",)
 """In place of terms: something that is not among the candidates."""
+
+IN_BASE = "already in the base model"
+"""What is noted of a term that the base can do all of."""
 
 ITSELF = " itself"
 """What the driver of an output that varies with its own value ends with, after the output's name."""

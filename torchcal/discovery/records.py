@@ -248,6 +248,7 @@ class Limit:
         note: ``"already in the base model"`` or the like.
         sign: 1 or −1 where ``smallest`` is of effects of that sign, as calibration hides those of the other whatever
             their size; 0 where it is of any that its bounds allow.
+        comparable: Whether the estimate is of the shape that ``smallest`` is of: else one is no multiple of the other.
     """
 
     term: str
@@ -258,6 +259,7 @@ class Limit:
     estimate: float | None = None
     note: str = ""
     sign: int = 0
+    comparable: bool = True
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """Detection limits: the smallest effect of each candidate that these data could have shown."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from torchcal.discovery.fits.fitting import fit
 from torchcal.discovery.hypotheses.model import PRIOR
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.records import Limit, Table
-from torchcal.display import with_unit
+from torchcal.display import IN_BASE, with_unit
 from torchcal.terms import Term
 
 __all__ = ["limits"]
@@ -21,6 +22,11 @@ __all__ = ["limits"]
 ROUNDS, MOST = 8, 4.0
 #: Where it is close enough, as a logarithm.
 CLOSE = 0.05
+#: Score that is asked for where there are none of noise.
+UNSCORED = 3.5
+#: Orders of magnitude of sizes that are tried to either side of 1 where a tangent tells nothing, or twice as many below
+#: a bound, and how close the size found there is, as a factor.
+ORDERS, NEAR = 8, 1.2
 #: Smallest share that is left of a distance by how much it wavers itself.
 LEFT = 0.25
 #: Data to spare below which the size of the noise is anyone's guess.
@@ -32,8 +38,10 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
 
     The linear limit, from the norm of the projected tangent, is checked: an effect of its size is simulated without
     noise, the base is calibrated to that, and the size is changed until what calibration cannot hide is just large
-    enough. Infinite where calibration hides ever larger effects, or all within the parameter's bounds; of an amplitude
-    of either sign the larger of both, or that of the sign that is seen. An open shape is the one of median effect.
+    enough. Where the tangent tells nothing new it begins with what the base's tangents leave of a finite effect.
+    Infinite where calibration hides ever larger effects, or all within the parameter's bounds; of an amplitude of
+    either sign the larger of both, or that of the sign that is seen. An open shape is the one of median effect; an
+    estimate of another shape is told with that.
 
     Args:
         search: With its screening.
@@ -45,45 +53,56 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
     from_power = math.sqrt(2) * float(torch.special.erfinv(torch.tensor(2 * power - 1, dtype=torch.float64)))
     # Several families of statistics share the level: each may use as much of it as leaves alpha in all.
     level = float(search.least.quantile(alpha))
-    critical = float(screening.null.quantile(1 - level)) if len(screening.null) else 3.5
+    scored = bool((screening.null > 0).any())  # not where no tangent shows anything
+    critical = float(screening.null.quantile(1 - level)) if scored else UNSCORED
     odds = math.log(PRIOR["base"] / (PRIOR["single"] / max(len(search.candidates), 1)))
     fitted = search.plain
     effects: dict[int, _Effect] = {}
     few = {i for i, c in enumerate(search.candidates) if search.noise.open and _spare(search, c) < SPARE}
+    sizes: dict[int, float] = {}
     for i, candidate in enumerate(search.candidates):
-        if screening.best[i] < 0 or i in few:
+        blind = screening.best[i] < 0
+        if i in few or (blind and not candidate.blind):
             continue
-        column = _typical(search, i)
         # Seen is not enough: the evidence for the term must outweigh that for the base too.
         wanted = max(critical, math.sqrt(max(2 * odds + len(candidate.own) * math.log(search.problem.n), 0.0)))
-        distance = _distance(wanted, from_power, 0.5 * _wavers(search, screening.columns[:, column]))
-        effects[i] = _Effect(column, distance, float(screening.norm[column]))
-    sizes = {i: effect.distance / effect.norm for i, effect in effects.items()}
+        if blind:
+            first = _Effect(len(candidate.shapes) // 2, 0, wanted, order=2)
+            direction = _left(search, i, first, _seen_from(search, i, first))
+        else:
+            column = _typical(search, i)
+            first = _Effect(int(screening.shape[column]), int(screening.amplitude[column]), wanted)
+            direction = screening.columns[:, column]
+        noisy = 0.0 if direction is None else 0.5 * _wavers(search, direction)
+        effects[i] = effect = dataclasses.replace(first, distance=_distance(wanted, from_power, noisy))
+        sizes[i] = _seen_from(search, i, effect) if blind else effect.distance / float(screening.norm[column])
     hidden: dict[int, _Hidden] = {}
     if not search.exact and not search.stop.is_set():
         sizes, hidden = _corrected(search, effects, sizes)
     rows = []
     for i, candidate in enumerate(search.candidates):
-        column = effects[i].column if i in effects else screening.best[i]
-        place = candidate.amplitudes[int(screening.amplitude[column]) if column >= 0 else 0]
+        best = screening.best[i]
+        number = effects[i].amplitude if i in effects else int(screening.amplitude[best]) if best >= 0 else 0
+        place = candidate.amplitudes[number]
         q = candidate.problem.parameters[place]
         model = fitted.get(i)
         estimate = float(model.found.values[place]) - candidate.neutral_at(place) if model else None
         if i not in effects:
-            blind = "its tangent tells nothing new: only large effects can"
-            note = blind if candidate.blind else "already in the base model"
-            note = "so few data show no effect beside noise of unknown size" if i in few else note
+            note = "so few data show no effect beside noise of unknown size" if i in few else IN_BASE
             rows.append(Limit(candidate.name, q.name, math.inf, q.unit, power, estimate, note))
             continue
         others = [search.candidates[j].name for j in search.aliases.get(i, ())]
-        notes = [_shape(candidate, effects[i], search), f"also: {', '.join(others)}" if others else ""]
+        at = _shape(candidate, candidate.shapes[effects[i].shape])
+        fitted_at = at if model is None else _shape(candidate, model.found.values[candidate.own])
+        notes = [at, "" if fitted_at == at else f"the estimate {fitted_at}"]
+        notes += [f"also: {', '.join(others)}" if others else ""]
         notes += [hidden[i].note] if i in hidden else []
         note = "; ".join(filter(None, notes))
         sign = -hidden[i].sign if i in hidden else 0
-        rows.append(Limit(candidate.name, q.name, sizes[i], q.unit, power, estimate, note, sign))
+        rows.append(Limit(candidate.name, q.name, sizes[i], q.unit, power, estimate, note, sign, fitted_at == at))
     for term in contained:
         name = term.full(term.parameters[0].name) if term.parameters else term.frees[0]
-        rows.append(Limit(term.name, name, math.inf, None, power, None, "already in the base model"))
+        rows.append(Limit(term.name, name, math.inf, None, power, None, IN_BASE))
     return Table(rows, ("term", "parameter", "smallest", "unit", "power", "estimate", "note"))
 
 
@@ -119,9 +138,8 @@ def _typical(search: Search, i: int) -> int:
     return int(places[order[len(order) // 2]])
 
 
-def _shape(candidate: Candidate, effect: "_Effect", search: Search) -> str:
-    """The shape that a limit is of, in words; empty where there is none."""
-    row = candidate.shapes[int(search.screening.shape[effect.column])]
+def _shape(candidate: Candidate, row: Tensor) -> str:
+    """The shape that a limit or an estimate is of, by the candidate's own parameters, in words; empty of none."""
     parts = []
     for k, place in enumerate(candidate.own):
         q = candidate.problem.parameters[place]
@@ -135,14 +153,16 @@ class _Effect:
     """What a candidate must do to the data to be seen.
 
     Attributes:
-        column: Of the screening: shapes and amplitude.
+        shape: Number of its shape.
+        amplitude: Number of its amplitude.
         distance: How far the data must be, in noise sd, from what the base can be calibrated to.
-        norm: How far a unit of the amplitude takes them, to first order.
+        order: Power of its size that what it does to the data goes with at first.
     """
 
-    column: int
+    shape: int
+    amplitude: int
     distance: float
-    norm: float
+    order: int = 1
 
 
 @dataclass(frozen=True)
@@ -170,7 +190,7 @@ def _corrected(
     room: dict[tuple[int, int], float] = {}
     for i, effect in effects.items():
         candidate = search.candidates[i]
-        place = candidate.amplitudes[int(search.screening.amplitude[effect.column])]
+        place = candidate.amplitudes[effect.amplitude]
         sided = candidate.one_sided(place)
         for sign in (sided,) if sided else (1, -1):
             room[i, sign] = _room(candidate, place, sign)
@@ -185,7 +205,7 @@ def _corrected(
             break
         data, known = [], []
         for trial in trials:
-            y = _simulated(search, trial[0], effects[trial[0]].column, trial[1] * now[trial])
+            y = _simulated(search, trial[0], effects[trial[0]], trial[1] * now[trial])
             if y is None:  # what blows up is seen
                 seen[trial] = now[trial]
                 now[trial] = math.sqrt(unseen[trial] * now[trial]) if unseen[trial] else now[trial] / MOST
@@ -224,7 +244,8 @@ def _corrected(
                 if unseen[trial] >= room[trial]:
                     trials.remove(trial)
                     continue
-                wanted = min(now[trial] * min(max(short, 1 / MOST), MOST), room[trial])
+                factor = min(max(short, 1 / MOST), MOST) ** (1 / effects[trial[0]].order)
+                wanted = min(now[trial] * factor, room[trial])
                 if not unseen[trial] < wanted < seen[trial]:
                     wanted = math.sqrt(unseen[trial] * seen[trial])
                 now[trial] = wanted
@@ -253,12 +274,41 @@ def _room(candidate: Candidate, place: int, sign: int) -> float:
     return max(sign * (end - neutral), 0.0)
 
 
-def _simulated(search: Search, i: int, column: int, size: float) -> Tensor | None:
+def _seen_from(search: Search, i: int, effect: _Effect) -> float:
+    """The size from which on a candidate's effect is far enough from what the base's tangents can do, within a factor
+    of `NEAR`, or the largest that is tried: for where its own tangent tells nothing."""
+    candidate = search.candidates[i]
+    place = candidate.amplitudes[effect.amplitude]
+    room = _room(candidate, place, candidate.one_sided(place) or 1)
+    high = room if math.isfinite(room) else 10.0**ORDERS
+    low = high * 10.0 ** (-2 * ORDERS)
+    while high > NEAR * low:
+        size = math.sqrt(low * high)
+        left = _left(search, i, effect, size)
+        if left is None or float(left.norm()) >= effect.distance:  # what blows up is seen
+            high = size
+        else:
+            low = size
+    return high
+
+
+def _left(search: Search, i: int, effect: _Effect, size: float) -> Tensor | None:
+    """What the base's tangents cannot do of an effect of some size, whitened, ``(n,)``; None where that blows up."""
+    candidate = search.candidates[i]
+    sign = candidate.one_sided(candidate.amplitudes[effect.amplitude]) or 1
+    y = _simulated(search, i, effect, sign * size)
+    none = _simulated(search, i, effect, 0.0)
+    if y is None or none is None:
+        return None
+    return search.residual.project(search.base.whitening((y - none)[:, None]))[:, 0]
+
+
+def _simulated(search: Search, i: int, effect: _Effect, size: float) -> Tensor | None:
     """Noise-free data ``(n,)`` of the base with a candidate of some size; None where they are not finite."""
-    candidate, screening = search.candidates[i], search.screening
+    candidate = search.candidates[i]
     row = candidate.begin.clone()
-    row[candidate.own] = candidate.shapes[int(screening.shape[column])]
-    row[candidate.amplitudes[int(screening.amplitude[column])]] += size
+    row[candidate.own] = candidate.shapes[effect.shape]
+    row[candidate.amplitudes[effect.amplitude]] += size
     warm = candidate.problem.guess(search.base.warm, row[None])
     y = candidate.problem.evaluate(row[None], [], warm)[0][0]
     return y if bool(torch.isfinite(y).all()) else None

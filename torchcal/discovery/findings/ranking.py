@@ -11,7 +11,7 @@ from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.records import Hypothesis, Table
 from torchcal.discovery.verdicts import explain
 from torchcal.discovery.verdicts.decision import Decision, other_names
-from torchcal.display import NONE
+from torchcal.display import IN_BASE, NONE
 
 __all__ = ["ranking"]
 
@@ -120,7 +120,7 @@ def _screened(search: Search, i: int) -> Hypothesis:
     """A candidate that was not refitted, or could not be."""
     candidate = search.candidates[i]
     nothing = not candidate.blind and search.screening.best[i] < 0
-    note = "already in the base model" if nothing else ""
+    note = IN_BASE if nothing else ""
     note = "no fit from any starting value" if i in search.failed else note
     removed = 0.0 if nothing else None
     score = search.screening.score(i)

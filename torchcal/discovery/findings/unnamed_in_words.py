@@ -19,7 +19,7 @@ from torchcal.discovery.findings.where_in_words import share_in_words, where_in_
 from torchcal.discovery.misfit.channels import RUN
 from torchcal.discovery.verdicts.by_share import REMOVED
 from torchcal.discovery.verdicts.verdict import PLAINLY_WHITE, WHITE
-from torchcal.display import NONE, percent, up_to, with_unit
+from torchcal.display import IN_BASE, NONE, percent, up_to, with_unit
 
 __all__ = ["ambiguous", "consistent", "likelier", "unexplained"]
 
@@ -53,6 +53,10 @@ def consistent(d: Any) -> list[str]:
                 "Slow noise explains that structure at least as well as anything in the library, so that no physics is "
                 "called missing; a known noise sd, replicates or a repeated run would tell."
             )
+    # What the base has is none of it.
+    hidden = [one.term for one in d.detection_limit if math.isinf(one.smallest) and one.note != IN_BASE]
+    if hidden:
+        nothing += f" No effect of any size that was tried would have shown of {', '.join(dict.fromkeys(hidden))}."
     if not limits:
         return [nothing]
     shown = ", ".join(with_unit(f"{_told(limit)} {limit.smallest:.3g}", limit.unit) for limit in limits[:LIMITS])

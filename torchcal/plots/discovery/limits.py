@@ -39,7 +39,8 @@ def detection_limits(limits: Iterable[Any], *, most: int = 16, ax: "Axes | None"
     """The smallest effect of each candidate that these data could have shown, and the estimate over it.
 
     Args:
-        limits: Each with ``term``, ``parameter``, ``smallest``, ``unit`` and ``estimate`` (or None).
+        limits: Each with ``term``, ``parameter``, ``smallest``, ``unit`` and ``estimate`` (or None). An estimate of
+            another shape than the limit, where ``comparable`` is not true, is not drawn.
         most: Largest number of rows: those with the largest estimates, then the others.
         ax: Where to draw; a new figure by default.
         legend: Whether to draw one.
@@ -57,7 +58,9 @@ def detection_limits(limits: Iterable[Any], *, most: int = 16, ax: "Axes | None"
         raise DomainError("Expected at least one candidate. Got none.")
 
     def ratio(item: Any) -> float:
-        if item.estimate is None or not math.isfinite(item.estimate) or not 0 < item.smallest < math.inf:
+        if item.estimate is None or not getattr(item, "comparable", True):
+            return math.nan
+        if not math.isfinite(item.estimate) or not 0 < item.smallest < math.inf:
             return math.nan
         return abs(item.estimate) / float(item.smallest)
 

@@ -264,7 +264,7 @@ def figure_parts(diagnosis: Any) -> list[FigurePart]:
                 "limits",
                 "Detection limits",
                 "The smallest effect of each candidate that these data could have shown, and the estimate as a "
-                "multiple of it.",
+                "multiple of it where both are of one shape.",
                 lambda fig: _ignore(detection_limits(limits, ax=fig.subplots())),
                 7.0,
                 max(3.2, 1.4 + 0.3 * min(len(limits), 16)),
