@@ -492,6 +492,23 @@ def test_local_means_of_an_oscillation_are_finer_than_its_period(periods, drawn)
         assert np.sqrt((mean**2).mean()) == pytest.approx(math.sqrt(0.5), rel=0.1)
 
 
+def test_where_no_place_is_known_the_residuals_that_go_together_are_drawn():
+    """A wave along B in the second output, at each of three T; the first has the larger misfit, of noise alone."""
+    field, other = torch.linspace(-4, 4, 30, dtype=F64).repeat(3), torch.arange(3.0, dtype=F64).repeat_interleave(30)
+    noise = torch.randn(180, generator=torch.Generator().manual_seed(0), dtype=F64)
+    y = {"Rxy": 0.5 * noise[:90], "Rxx": 0.2 * torch.sin(3 * field) + 0.1 * noise[90:]}
+    d = cooling()
+    d.recording = Recording(x={"T": other, "B": field}, y=y)
+    d.base = d.final = fit(d.recording, torch.zeros(180, dtype=F64))
+    d.where, d.set_aside = [], torch.zeros(180, dtype=torch.bool)
+    (part,) = [part for part in discovery.figure_parts(d) if part.key == "residuals"]
+    assert part.caption == "What the models leave of the data, against B."
+    figure = plt.figure()
+    part.draw(figure)
+    assert "Rxx" in figure.axes[0].get_ylabel()
+    assert figure.axes[0].get_xlabel().startswith("B")
+
+
 def test_where_a_constant_change_begins_and_ends_is_marked():
     d = cooling()
     d.where = [Location("output", "y", "x", ((40.0, 60.0),), 1.0, 20.0, edges=(40.0, 60.0, 500.0))]

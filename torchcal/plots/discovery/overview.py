@@ -5,6 +5,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import torch
+
 from torchcal.data import Recording
 from torchcal.display import ITSELF, error_unit, units_of
 from torchcal.errors import DomainError
@@ -20,6 +22,8 @@ from torchcal.plots.selection import conditions_of
 
 #: Letters of a name in a title, beside which there is a second one.
 TITLED = 18
+#: Data of a sweep along a condition, at least, and levels of one that the residuals are drawn against by choice.
+SWEPT = 6
 
 
 def discovery_overview(diagnosis: Any, fig: Any = None) -> Any:
@@ -155,6 +159,8 @@ def figure_parts(diagnosis: Any) -> list[FigurePart]:
     spans = () if best is None or waves else best.spans  # a wave is everywhere
     told = {} if best is None else {"edges": best.edges, "period": best.period, "change": _change(best)}
     output = best.target if best is not None and best.target in recording.outputs else None
+    if best is None:  # no place is known: where neighbours are most alike
+        output, driver = _most_alike(recording, base if after is None else after, getattr(diagnosis, "set_aside", None))
 
     def mismatch(fig: Any) -> None:
         residual_map(
@@ -280,6 +286,41 @@ def _driver_of(diagnosis: Any, driver: str, fit: Any) -> Any:
         return kept[driver]
     own = driver.removesuffix(ITSELF)
     return driver_values(diagnosis.recording, own, fit if own == driver else diagnosis.base)
+
+
+def _most_alike(recording: Recording, fit: Any, set_aside: Any) -> tuple[str | None, str | None]:
+    """The output, and the condition, along which the residuals of neighbours in a sweep are most alike.
+
+    Each is None where there is no choice, or nothing to choose by; the condition of runs is time.
+    """
+    predicted = getattr(fit, "prediction", None)
+    columns = conditions_of(recording.x, recording)
+    in_time = set(columns) == {"time", "run"}
+    if predicted is None or (len(recording.outputs) < 2 and (in_time or len(columns) < 2)):
+        return None, None
+    residual = recording.y - predicted
+    residual = residual if set_aside is None else residual.where(~set_aside, torch.nan)
+    along = [name for name, values in columns.items() if len(set(values.tolist())) >= SWEPT] or list(columns)
+    along = ["time"] if in_time else along
+    best: tuple[float, str | None, str | None] = (-math.inf, None, None)
+    for output, part in recording.split(residual).items():
+        seen = part.isfinite()
+        scaled = part[seen] / part[seen].square().mean().sqrt().clamp_min(1e-300)
+        at = {name: torch.as_tensor(values)[seen] for name, values in columns.items()}
+        for driver in along:
+            others = [values.to(torch.float64) for name, values in at.items() if name != driver]
+            group = torch.zeros(len(scaled), dtype=torch.long)
+            if others:
+                group = torch.stack(others).unique(dim=1, return_inverse=True)[1]
+            if len(group) < SWEPT * (len(group.unique())):  # no sweeps
+                group = torch.zeros_like(group)
+            order = at[driver].argsort(stable=True)
+            order = order[group[order].argsort(stable=True)]
+            pairs = group[order[1:]] == group[order[:-1]]
+            alike = (scaled[order[1:]] * scaled[order[:-1]])[pairs].sum() / math.sqrt(max(int(pairs.sum()), 1))
+            if float(alike) > best[0]:
+                best = float(alike), output, None if in_time else driver
+    return best[1:]
 
 
 def _change(place: Any) -> str:
