@@ -182,6 +182,21 @@ def test_what_a_term_in_time_is_a_function_of():
         assert where._reads(model) == read
 
 
+@pytest.mark.parametrize(("low", "high", "met"), [(72.9, 78.6, (80.0, 80.0)), (1.0, 9.0, (0.0, 0.0)),
+                                                  (70.0, 85.0, (70.0, 85.0)), (60.0, 61.0, (60.0, 61.0))])  # fmt: skip
+def test_a_window_between_the_levels_of_a_driver_acts_at_the_nearest(low, high, met):
+    assert where._met(torch.tensor([0.0, 60.0, 80.0, 60.0], dtype=F64), low, high) == met
+
+
+@pytest.mark.parametrize(
+    ("driver", "hold", "levels"), [("I", "zero", True), ("I", "linear", False), ("T", "zero", False)]
+)
+def test_an_input_that_is_held_has_levels(driver, hold, levels):
+    runs = (tc.Run(time=T, outputs={"T": T}, inputs={"I": T}, hold=hold),)
+    search = SimpleNamespace(problem=SimpleNamespace(recording=SimpleNamespace(runs=runs)))
+    assert where._has_levels(search, driver) is levels
+
+
 def test_slivers_are_no_spans():
     x = torch.linspace(0, 1, 200, dtype=F64)
     change = ((x > 0.2) & (x < 0.6)).double()

@@ -77,6 +77,20 @@ def sharpened(search: Search) -> list[Place]:
     return sorted(found, key=lambda place: -round(place.evidence, TIED))
 
 
+def _has_levels(search: Search, driver: str) -> bool:
+    """Whether a driver has no values but those of the data: a condition, or an input that is held between samples."""
+    runs = search.problem.recording.runs
+    return runs is None or all(run.hold == "zero" and driver in run.inputs for run in runs)
+
+
+def _met(values: Tensor, low: float, high: float) -> tuple[float, float]:
+    """A range where some values of a driver lie in it, else the nearest of these: edges of a window are smooth, so that
+    it may act at a value beside it alone."""
+    beyond = torch.maximum(low - values, values - high)
+    nearest = int(beyond.argmin())
+    return (low, high) if float(beyond[nearest]) <= 0 else (float(values[nearest]), float(values[nearest]))
+
+
 def _key(place: Place) -> tuple[str, str, str]:
     """Kind, target and driver."""
     return place.channel.kind, place.channel.target, place.driver
@@ -110,11 +124,13 @@ def locate(
         high = w.high if math.isfinite(w.high) else float(drivers.max())
         (kind, target), *also = _act_on(local)
         share, evidence, extent = removed(search, local), _evidence(search, local), _extent(drivers)
+        span = (low, high)
         if local is search.unnamed:
             told: dict[str, Any] = {"edges": tuple(end for end in (w.low, w.high) if math.isfinite(end))}
         else:
             told = {"terms": local.names, "also": tuple(also)}
-        rows.append(Location(kind, target, w.driver, ((low, high),), share, evidence, extent=extent, **told))
+            span = _met(drivers, low, high) if _has_levels(search, w.driver) else span
+        rows.append(Location(kind, target, w.driver, (span,), share, evidence, extent=extent, **told))
     sensor = best is not None and _acts_on(best)[0] == "output"  # then it has been shown to be the output
     places = [
         place
