@@ -193,6 +193,18 @@ def test_in_a_grid_sudden_changes_are_sought_in_every_row():
     assert rows == {(60.0, 150.0, 250.0), (60.0,), (150.0,), (250.0,)}
 
 
+def test_in_a_large_grid_bumps_are_sought_all_the_same():
+    for count, rows in ((20, 2 + 40), (40, 2)):  # of many rows none is looked at by itself
+        a, b = (torch.as_tensor(g.ravel()) for g in np.meshgrid(np.arange(count), np.arange(count), indexing="ij"))
+        simulator = tc.Simulator(lambda x, p: p["a"] + 0 * x["a"], [tc.Parameter("a")])
+        y = 1 + 0.1 * torch.as_tensor(np.random.default_rng(0).standard_normal(count**2))
+        conditions = {"a": a.double(), "b": b.double()}
+        found, _ = calibrate_base(Problem.of(simulator, tc.Recording(x=conditions, y=y, noise=0.1)), {}, 2, 0)
+        steps, bumps = counts(only(found))
+        assert steps >= rows * 3
+        assert bumps >= 2 * 8
+
+
 @pytest.mark.parametrize("size", [{"in_one": 0.6}, {"everywhere": 0.3}, {}])
 def test_what_is_off_in_a_part_of_a_grid_is_no_noise(size):
     simulator, recording = gridded(0.05, 1, **size)

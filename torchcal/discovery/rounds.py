@@ -132,7 +132,8 @@ def with_all(
     odds, spare = outdone(search, every, detected)
     if odds <= EXPLAINED or spare <= 0:
         if not detected and not observed.in_time and not outliers_alone(search, every, detected, short=EXPLAINED):
-            return (every if _refit(every, confidence) and not search.stop.is_set() else None), ()
+            if _refit(every, confidence) and not search.stop.is_set():
+                return every, ()
         sticking = outliers(every, observed.keep)
         if sticking is None or not 0 < int(sticking.sum()) < observed.n - search.problem.n:
             best = every.physical_leader

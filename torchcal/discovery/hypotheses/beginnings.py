@@ -226,7 +226,7 @@ def blind_rows(candidate: Candidate) -> Tensor:
         else:
             values = [neutral + sign * 10.0**k for k in MAGNITUDES for sign in (1, -1)]
         rows += _each(candidate.begin, place, [value for value in values if q.contains(value)])
-    return torch.stack(rows)
+    return torch.stack(rows or [candidate.begin])
 
 
 def _from_guess(base: Fitted, candidate: Candidate, begin: Tensor, guess: Tensor) -> Tensor:

@@ -25,6 +25,8 @@ __all__ = ["SURER", "Sudden", "in_one_run", "stepwise", "sudden_changes"]
 LEAST = 5
 #: Levels of one of several conditions up to which smooth curves follow whatever is along it.
 FEW = 5
+#: Rows of a grid along one condition up to which each is looked at by itself, and steps that are tried in one at least.
+ROWS, EACH = 24, 16
 #: Steps that are tried in all outputs together, evenly among their data, and about how many bumps.
 MOST = 200
 #: Sd of the narrowest bump, in usual gaps between data, and of the widest, as a share of a run.
@@ -67,7 +69,8 @@ class Sudden:
     def of(cls, problem: Problem, channel: Channel) -> "Sudden | None":
         """Of an output; None where its data are too few."""
         rows = _rows(problem, problem.recording.outputs.index(channel.target))
-        most = max(MOST // max(len(rows) * len(problem.recording.outputs), 1), 1)
+        fewest = 1 if problem.order is not None else EACH
+        most = max(MOST // max(len(rows) * len(problem.recording.outputs), 1), fewest)
         steps, bumps, between, before = [], [], [torch.zeros(2, 0, dtype=torch.long)], 0
         for places, values in rows:
             levels, level = values.unique(return_inverse=True)
@@ -139,7 +142,8 @@ def _rows(problem: Problem, output: int) -> list[tuple[Tensor, Tensor]]:
         for k, values in enumerate(columns.T):
             others = torch.cat([columns[:, :k], columns[:, k + 1 :]], dim=1)
             at = others.unique(dim=0, return_inverse=True)[1]
-            parts = [at == level for level in (at.bincount() >= 2 * LEAST).nonzero()[:, 0].tolist()]
+            long = (at.bincount() >= 2 * LEAST).nonzero()[:, 0].tolist()
+            parts = [at == level for level in long if 1 < len(long) <= ROWS]
             for part in [torch.ones_like(at, dtype=torch.bool), *parts]:
                 if int(part.sum()) >= 2 * LEAST and len(values[part].unique()) > FEW:
                     found.append((places[part], values[part]))
