@@ -50,6 +50,7 @@ class _Begin:
         zero: What multiples of it are counted from: 0, of a temperature the lowest in any run.
         largest: Its value farthest from there in any run.
         mirrored: Whether all of them may be mirrored.
+        known: What has to be known of it that the first run did not tell, in words.
         elsewhere: Where that is not, as it is not feasible, in words.
     """
 
@@ -57,7 +58,13 @@ class _Begin:
     zero: dict[str, float]
     largest: dict[str, float]
     mirrored: bool
+    known: str
     elsewhere: str
+
+    @property
+    def ask(self) -> str:
+        """What is to be said of a run that begins where the first did."""
+        return self.known + self.elsewhere
 
     @property
     def moves(self) -> bool:
@@ -93,16 +100,14 @@ def simple(model: Fitted, feasible: Feasible = ANYWHERE) -> list[Option]:
     if not model.problem.in_time:
         return _allowed(recording, _static(recording, feasible), feasible)
     begin = _states(model, feasible)
-    ask = _ask(recording, begin.values) + begin.elsewhere
-    options = [_run(recording, "the first run again" + ask, begin.values)]
+    options = [_run(recording, "the first run again" + begin.ask, begin.values)]
     options += _elsewhere(recording, begin, (*MULTIPLES, -1.0) if begin.mirrored else MULTIPLES)
-    options += _stronger(recording, begin, ask, MULTIPLES)
-    options.append(_run(recording, f"a run three times as long as the first{ask}", begin.values, copies=3))
+    options += _stronger(recording, begin, MULTIPLES)
+    options.append(_run(recording, f"a run three times as long as the first{begin.ask}", begin.values, copies=3))
     if begin.moves:
-        known = _ask(recording, begin.values)
-        text = f"a run that starts from 2 times the initial states{begin.counted} and is twice as long{known}"
+        text = f"a run that starts from 2 times the initial states{begin.counted} and is twice as long{begin.known}"
         options.append(_run(recording, text, begin.times(2.0), copies=2))
-    return _allowed(recording, [*options, *_at_ends(recording, begin, ask, feasible)], feasible)
+    return _allowed(recording, [*options, *_at_ends(recording, begin, feasible)], feasible)
 
 
 def bolder(model: Fitted, feasible: Feasible = ANYWHERE) -> list[Option]:
@@ -115,7 +120,7 @@ def bolder(model: Fitted, feasible: Feasible = ANYWHERE) -> list[Option]:
     if not model.problem.in_time:
         return _allowed(recording, _static_bolder(recording, feasible), feasible)
     begin = _states(model, feasible)
-    values, ask = begin.values, _ask(recording, begin.values) + begin.elsewhere
+    values, ask = begin.values, begin.ask
     options = _elsewhere(recording, begin, BOLD)
     for name, value in values.items():
         others = _ask(recording, [one for one in values if one != name])
@@ -126,10 +131,9 @@ def bolder(model: Fitted, feasible: Feasible = ANYWHERE) -> list[Option]:
             options.append(_run(recording, text, {**values, name: float(f"{largest:.3g}")}))
         elif not at_rest and len(values) > 1:  # of one state alone this is a multiple of all initial states
             initial = f"the initial {name} of the first{_counted({name: zero})}"
-            known = _ask(recording, values)
-            text = f"a run that starts from {ALONE:g} times {initial}, all else as there{known}"
+            text = f"a run that starts from {ALONE:g} times {initial}, all else as there{begin.known}"
             options.append(_run(recording, text, begin.times(ALONE, [name])))
-    options += _stronger(recording, begin, ask, BOLD)
+    options += _stronger(recording, begin, BOLD)
     if _runs(recording)[0].inputs:
         lowest = _zeros(recording)
 
@@ -180,7 +184,7 @@ def _cut(recording: Recording, option: Option, feasible: Feasible) -> Option:
     return f"{text}, until t = {last:.4g}", Recording(runs=[_blank_run(recording, chosen)]), chosen
 
 
-def _at_ends(recording: Recording, begin: _Begin, ask: str, feasible: Feasible) -> list[Option]:
+def _at_ends(recording: Recording, begin: _Begin, feasible: Feasible) -> list[Option]:
     """Runs that begin with one state, or have one input held, at an end of what is feasible."""
     options = []
     for name, value in begin.values.items():
@@ -194,7 +198,8 @@ def _at_ends(recording: Recording, begin: _Begin, ask: str, feasible: Feasible) 
             def held(one: str, values: Tensor, name: str = name, end: float = end) -> Tensor:
                 return torch.full_like(values, end) if one == name else values
 
-            options.append(_run(recording, f"a run with {name} held at {end:.4g}{ask}", begin.values, change=held))
+            text = f"a run with {name} held at {end:.4g}{begin.ask}"
+            options.append(_run(recording, text, begin.values, change=held))
     return options
 
 
@@ -206,7 +211,7 @@ def _states(model: Fitted, feasible: Feasible) -> _Begin:
     """Of every state that an experiment may choose."""
     bound = model.problem.simulator
     if not isinstance(bound, Trajectories):
-        return _Begin({}, {}, {}, False, "")
+        return _Begin({}, {}, {}, False, "", "")
     states = bound.solve(model.values[None], model.warm)[0]
     places = {name: i for i, name in enumerate(bound.ode.states) if name not in bound.ode.initial}
     begin = {name: float(states[0, 0, i]) for name, i in places.items()}
@@ -218,7 +223,8 @@ def _states(model: Fitted, feasible: Feasible) -> _Begin:
     moved = {name: feasible.clipped(name, value) for name, value in begin.items()}
     told = [f"{name} = {moved[name]:.4g}" for name, value in begin.items() if moved[name] != value]
     elsewhere = f", but from {' and '.join(told)}" if told else ""
-    return _Begin(moved, zero, largest, mirrored and not any(zero.values()), elsewhere)
+    known = _ask(model.problem.recording, begin)
+    return _Begin(moved, zero, largest, mirrored and not any(zero.values()), known, elsewhere)
 
 
 def _zero(values: Tensor, unit: str | None) -> float:
@@ -235,13 +241,12 @@ def _ask(recording: Recording, begin: Iterable[str]) -> str:
 
 def _elsewhere(recording: Recording, begin: _Begin, factors: tuple[float, ...]) -> list[Option]:
     """Runs from multiples of the initial states; none where these are no others."""
-    known = _ask(recording, begin.values)
-    text = f"a run that starts from {{:g}} times the initial states of the first{begin.counted}{known}"
+    text = f"a run that starts from {{:g}} times the initial states of the first{begin.counted}{begin.known}"
     able = factors if begin.moves else ()
     return [_run(recording, text.format(factor), begin.times(factor)) for factor in able]
 
 
-def _stronger(recording: Recording, begin: _Begin, ask: str, factors: tuple[float, ...]) -> list[Option]:
+def _stronger(recording: Recording, begin: _Begin, factors: tuple[float, ...]) -> list[Option]:
     """Runs with inputs of other sizes, and with inputs and initial states of other sizes."""
     inputs, zero = _runs(recording)[0].inputs, _zeros(recording)
     if all(bool((values == zero[name]).all()) for name, values in inputs.items()):
@@ -252,11 +257,11 @@ def _stronger(recording: Recording, begin: _Begin, ask: str, factors: tuple[floa
 
     counted = _counted({name: zero[name] for name, values in inputs.items() if bool((values != zero[name]).any())})
     options = [
-        _run(recording, f"a run with {factor:g} times the inputs of the first{counted}{ask}", begin.values,
+        _run(recording, f"a run with {factor:g} times the inputs of the first{counted}{begin.ask}", begin.values,
              change=times(factor))
         for factor in factors
     ]  # fmt: skip
-    both = _counted({**zero, **begin.zero}) + _ask(recording, begin.values)
+    both = _counted({**zero, **begin.zero}) + begin.known
     for factor in factors if begin.moves else ():
         text = f"a run with {factor:g} times the inputs and initial states of the first{both}"
         options.append(_run(recording, text, begin.times(factor), change=times(factor)))

@@ -68,7 +68,7 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
         wanted = max(critical, math.sqrt(max(2 * odds + len(candidate.own) * math.log(search.problem.n), 0.0)))
         if blind:
             first = _Effect(len(candidate.shapes) // 2, 0, wanted, order=2)
-            direction = _left(search, i, first, _seen_from(search, i, first))
+            direction = _left(search, i, first, _seen_from(search, i, first), _simulated(search, i, first, 0.0))
         else:
             column = _typical(search, i)
             first = _Effect(int(screening.shape[column]), int(screening.amplitude[column]), wanted)
@@ -282,9 +282,10 @@ def _seen_from(search: Search, i: int, effect: _Effect) -> float:
     room = _room(candidate, place, candidate.one_sided(place) or 1)
     high = room if math.isfinite(room) else 10.0**ORDERS
     low = high * 10.0 ** (-2 * ORDERS)
+    none = _simulated(search, i, effect, 0.0)
     while high > NEAR * low:
         size = math.sqrt(low * high)
-        left = _left(search, i, effect, size)
+        left = _left(search, i, effect, size, none)
         if left is None or float(left.norm()) >= effect.distance:  # what blows up is seen
             high = size
         else:
@@ -292,12 +293,12 @@ def _seen_from(search: Search, i: int, effect: _Effect) -> float:
     return high
 
 
-def _left(search: Search, i: int, effect: _Effect, size: float) -> Tensor | None:
-    """What the base's tangents cannot do of an effect of some size, whitened, ``(n,)``; None where that blows up."""
+def _left(search: Search, i: int, effect: _Effect, size: float, none: Tensor | None) -> Tensor | None:
+    """What the base's tangents cannot do of an effect of some size, by the data with ``none``, whitened, ``(n,)``; None
+    where that blows up."""
     candidate = search.candidates[i]
     sign = candidate.one_sided(candidate.amplitudes[effect.amplitude]) or 1
     y = _simulated(search, i, effect, sign * size)
-    none = _simulated(search, i, effect, 0.0)
     if y is None or none is None:
         return None
     return search.residual.project(search.base.whitening((y - none)[:, None]))[:, 0]
