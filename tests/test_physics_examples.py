@@ -149,11 +149,15 @@ def test_evaporation_predicts_the_second_half_of_the_mug(loss: str | None, rmse:
     assert fit_mug(loss, until=120.0)[2] == pytest.approx(rmse, abs=5e-3)
 
 
-@pytest.mark.parametrize("among", ["losses of one state", pytest.param("all", marks=pytest.mark.slow)])
-def test_the_mug_is_told_to_evaporate(among: str):
+LOSSES = ("natural convection", "radiation", "evaporation")
+
+
+@pytest.mark.parametrize(
+    "among", [LOSSES[1:], *(pytest.param(each, marks=pytest.mark.slow) for each in (LOSSES, None))]
+)
+def test_the_mug_is_told_to_evaporate(among: tuple[str, ...] | None):
     needs_mug()
-    losses = ("natural convection", "radiation", "evaporation")
-    candidates = [term for term in cooling_water.candidates() if among == "all" or term.name in losses]
+    candidates = [term for term in cooling_water.candidates() if among is None or term.name in among]
     diagnosis = tc.diagnose(
         cooling_water.simulator(),
         cooling_water.recording(),
@@ -168,7 +172,7 @@ def test_the_mug_is_told_to_evaporate(among: str):
     assert diagnosis.after.held_out.rmse < 0.6
     room, _ = estimates(diagnosis)["Ta"]
     assert 15.0 < room < 30.0
-    if among == "all":  # all that are likelier hold it, and more
+    if among is None:  # all that are likelier hold it, and more
         assert diagnosis.terms == ["evaporation"]
         told = " ".join(str(diagnosis).split())
         assert "Likelier still is that ambient drift and second heat capacity act beside it" in told
