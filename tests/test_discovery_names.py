@@ -234,14 +234,15 @@ def test_only_noise_of_two_sizes_is_uneven(shape):
     assert shape != "spiky" or uneven > 540
 
 
-def test_the_size_of_a_product_is_determined_where_its_factors_are_not():
+@pytest.mark.parametrize("seeds", [range(24, 27), pytest.param(range(27, 32), marks=pytest.mark.slow)])
+def test_the_size_of_a_product_is_determined_where_its_factors_are_not(seeds):
     x, y = bent(bend=1.0)
     product = tc.Term("product", outputs={"y": lambda x, p, y: y + p["c"] * p["d"] * x**2},
                       parameters=[tc.Parameter("c"), tc.Parameter("d")])  # fmt: skip
     assert diagnose(straight(), tc.Recording(x=x, y=y, noise=0.1), [product]).terms == ["product"]
     both = tc.Term("both", outputs={"y": lambda x, p, y: y + p["c"] * x**2 + p["e"] * torch.sin(5 * x)},
                    parameters=[tc.Parameter("c"), tc.Parameter("e")])  # fmt: skip
-    for seed in range(24, 32):  # the second amplitude is within its sd of zero, now and then far within
+    for seed in seeds:  # the second amplitude is within its sd of zero, now and then far within
         x, y = bent(bend=1.0, seed=seed)
         assert diagnose(straight(), tc.Recording(x=x, y=y, noise=0.1), [both]).terms == ["both"]
 
@@ -264,11 +265,12 @@ def kinetics_on(inhibitor, dose):
     return base, terms, recordings
 
 
-def test_noise_along_the_rows_of_a_grid_is_given_no_name():
+@pytest.mark.parametrize("many", [slice(3), pytest.param(slice(3, 6), marks=pytest.mark.slow)])
+def test_noise_along_the_rows_of_a_grid_is_given_no_name(many):
     dose, inhibitor = (c.flatten() for c in torch.meshgrid(
         torch.linspace(0.2, 5, 15, dtype=F64), torch.linspace(0, 3, 4, dtype=F64), indexing="ij"))  # fmt: skip
     base, terms, recordings = kinetics_on(inhibitor, dose)
-    for recording in recordings:
+    for recording in recordings[many]:
         assert diagnose(base, recording, terms).verdict != "named"
     problem = Problem.of(base, recordings[0])
     assert problem.sweeps is None  # of four rows each

@@ -790,11 +790,12 @@ def emission(n, seed):
     return base, tc.Recording(x=x, y=y), [bend, line]
 
 
-def test_what_the_base_takes_for_slow_noise_is_weighed_with_the_noise_that_a_term_leaves():
-    found = [diagnose(*emission(60, seed)) for seed in range(6)]
+@pytest.mark.parametrize("seeds", [3, pytest.param(6, marks=pytest.mark.slow)])
+def test_what_the_base_takes_for_slow_noise_is_weighed_with_the_noise_that_a_term_leaves(seeds):
+    found = [diagnose(*emission(60, seed)) for seed in range(seeds)]
     assert all(d.verdict != "consistent" for d in found)
     first = [next(row.terms for row in d.ranking if row.terms != ("none of these",)) for d in found]
-    assert sum(terms == ("line",) for terms in first) >= 5
+    assert sum(terms == ("line",) for terms in first) >= 5 / 6 * seeds
     assert all(["line"] in (d.tied or [d.terms]) for d in found)  # a bend in a window may do it too
     assert all(d.noise.sd["y"] < 0.08 for d in found)
 
