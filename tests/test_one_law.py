@@ -151,8 +151,9 @@ def test_the_reference_of_gravity_is_the_largest_distance():
 
 @pytest.mark.parametrize(
     ("time", "mine", "told"),
-    [("s", "min", True), ("h", "min", True), ("min", "minutes", False), ("s", "ticks", False), ("min", None, False)],
-)
+    [("s", "min", True), pytest.param("h", "min", True, marks=pytest.mark.slow),
+     ("min", "minutes", False), ("s", "ticks", False), ("min", None, False)],
+)  # fmt: skip
 def test_a_library_in_another_unit_of_time_is_told(time, mine, told):
     model, recording = decay((1.0,), units={"time": mine, "A": "mol/L"} if mine else None)
     with warnings.catch_warnings(record=True) as caught:
