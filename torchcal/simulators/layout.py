@@ -110,6 +110,7 @@ class Layout:
                     parameters.append(Parameter(name, unit=unit, initial=guess, per_run=len(runs) > 1))
             self._initial.append(known)
         self.parameters = tuple(parameters)
+        self._fixed_slopes: Tensor | None = None
 
     @property
     def nuisance(self) -> tuple[str, ...]:
@@ -207,6 +208,13 @@ class Layout:
 
     def start_slopes(self, values: Tensor) -> Tensor:
         """∂ initial states / ∂ columns, ``(H, R, S, P)``."""
+        if any(callable(value) for known in self._initial for value in known.values()):
+            return self._start_slopes(values)
+        if self._fixed_slopes is None:  # numbers, columns and other states, whatever their values are
+            self._fixed_slopes = self._start_slopes(values.new_zeros(1, values.shape[-1]))
+        return self._fixed_slopes.expand(len(values), -1, -1, -1)
+
+    def _start_slopes(self, values: Tensor) -> Tensor:
         with torch.enable_grad():
             leaf = values.detach().requires_grad_(True)
             start = self.start(leaf)
