@@ -462,7 +462,7 @@ def test_a_black_box_is_searched_on_its_tangents():
         calls += 1
         return p["a"] * math.exp(-p["k"] * x)
 
-    x = torch.linspace(0, 3, 10, dtype=torch.float64)
+    x = torch.linspace(0, 3, 6, dtype=torch.float64)
     y = 2 * torch.exp(-0.8 * x) + 0.1 * x
     parameters = [Parameter("a", low=0.0, high=5.0), Parameter("k", low=0.01, high=3.0, transform="log")]
     simulators = (
@@ -473,7 +473,7 @@ def test_a_black_box_is_searched_on_its_tangents():
     box, model = (calibrate(one, Recording(x=x, y=y), likelihood=abc, num_samples=0).map for one in simulators)
     assert box.objective == pytest.approx(model.objective, rel=1e-6)
     torch.testing.assert_close(box.mean, model.mean, rtol=1e-4, atol=0)
-    assert calls < 1_000_000  # with every start on the model itself ten million
+    assert calls < 600_000  # with every start on the model itself six million
 
     calls = 0
     tilt = Term("tilt", outputs={"y": lambda x, p, y: y + p["q"] * x}, parameters=[Parameter("q", low=-0.2, high=0.5)])
@@ -481,4 +481,4 @@ def test_a_black_box_is_searched_on_its_tangents():
     bent = Recording(x=x, y=y + 0.05 * torch.sin(9 * x))
     box, model = (calibrate(extend(one, [tilt]), bent, **options).map for one in simulators)
     assert box.objective == pytest.approx(model.objective, rel=1e-6)
-    assert calls < 1_000_000  # with a term it is a black box still
+    assert calls < 600_000  # with a term it is a black box still

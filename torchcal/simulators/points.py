@@ -164,6 +164,8 @@ def _read(result: Any, shape: tuple[int, ...]) -> Value:
 
 
 def _numbers(value: Any, shape: tuple[int, ...], what: str) -> Array:
+    if type(value) is float and shape == ():  # nearly always, and then there is nothing to look at
+        return np.asarray(value)
     wanted = f"an array of shape {shape}" if shape else "one real number"
     plain = isinstance(value, numbers.Real) and not isinstance(value, bool)
     if isinstance(value, np.ma.MaskedArray) and value.dtype.kind in "fiu":
