@@ -1,7 +1,7 @@
 """Every built-in term is planted once in a base model of its field, hidden by calibration and noise, and looked for.
 
 It must come back named, or among the tied, or as an alias of one that is, or be called part of the base model where
-that is the truth. A twelfth of them runs always, among a third of the library; all run among all of it with the slow tests.
+that is the truth. A twelfth of them runs always, among a third of its library; all run with the slow tests.
 """
 
 from collections.abc import Callable
