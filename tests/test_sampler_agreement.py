@@ -121,7 +121,7 @@ def check_same_density(given):
     log_density, (model, arguments) = given["batched"], given["pyro"]
     (prior,) = (argument for argument in arguments if isinstance(argument, priors.CoefficientPrior))
     transform = prior.support.transform
-    z = 1.5 * torch.randn(40, len(prior.low), dtype=torch.float64)
+    z = 1.5 * torch.randn(15, len(prior.low), dtype=torch.float64)
     found = log_density(transform.unwhiten(z))
     expected, potential = [], initialize_model(model, arguments)[1]
     for point in z:
