@@ -4,6 +4,7 @@ Every tolerance follows from the number of seeds: five standard errors, or the b
 """
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -694,3 +695,16 @@ def test_noise_that_is_given_as_a_share_of_what_was_read_is_no_misfit(counts):
     assert min(p) > 0.01 / 6 / 2
     assert np.median(p) > 0.1
     assert sum(c > 0.2 for c in correlations) <= 2  # of white noise
+
+
+def test_data_that_scatter_by_more_than_the_noise_that_was_given_are_told_to():
+    c = torch.linspace(1, 8, 15, dtype=F64).repeat(2)
+    y = 2 * c / (1.5 + c) + draw(30, 0.03, 0)
+    y[15:] *= 0.9  # the second time
+    law = tc.Simulator(lambda x, p: p["V"] * x / (p["K"] + x), [tc.Parameter("V", low=0.0), tc.Parameter("K", low=0.0)])
+    for noise, larger in ((0.03, True), (0.1, False)):
+        d = tc.diagnose(law, tc.Recording(x=c, y=y, noise=noise), [], seed=0, progress=False)
+        told = " ".join(str(d).split())
+        assert d.verdict == "consistent", told
+        assert bool(re.search(r"could show, if the noise is [23]\.\d times as large as given\)", told)) is larger, told
+        assert ("they scatter by more than the noise that was given" in told) is larger

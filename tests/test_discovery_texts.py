@@ -206,6 +206,10 @@ def test_slivers_are_no_spans():
     alone = torch.zeros(200, dtype=F64)
     alone[150] = 1.0
     assert where._ranges(x, alone) == ((float(x[150]), float(x[150])),)
+    # Nor is what may be nothing, unless all of it may.
+    sd = torch.where(x > 0.5, 2.0, 0.1)
+    assert where._ranges(x, change, sd) == ((float(x[40]), float(x[99])),)
+    assert where._ranges(x, change, 2 * torch.ones_like(x)) == where._ranges(x, change)
 
 
 def test_the_missing_rate_is_told_where_the_change_without_a_name_acts():
@@ -366,9 +370,9 @@ def test_an_estimate_that_depends_on_what_acts_beside_it_is_told():
     ("source", "best", "unknown", "told"),
     [
         ("given", {"p_white": 0.3}, 0.9, ", but something unknown is likelier by 2.9 in log odds."),
-        ("given", {"p_white": 1e-4}, 0.01, ", but what it leaves is not noise (probability < 0.001)."),
-        ("given", {"p_white": 0.002}, 1.0, ", but something unknown is likelier by 3.0 in log odds and what it leaves "
-         "is not noise (probability 0.002)."),
+        ("given", {"p_white": 1 / 501}, 0.01, ", but what it leaves is not noise (probability < 0.002)."),
+        ("given", {"p_white": 0.004}, 1.0, ", but something unknown is likelier by 3.0 in log odds and what it leaves "
+         "is not noise (probability 0.004)."),
         ("given", {"p_white": 0.3}, 0.01, ", but it leaves more than the noise that is given."),
         ("estimated", {"note": "its window has closed"}, 0.9, " (its window has closed)."),
     ],
@@ -670,7 +674,7 @@ def test_a_term_that_frees_what_is_free_is_told():
      ((0.6, 0.3, 0.05), "3 hypotheses explain it with probabilities from 0.60 to 0.05, and"),
      ((0.6, 0.3, 0.0002), "3 hypotheses explain it with probabilities from 0.60 to < 0.001, and"),
      ((0.3, 0.3), "2 hypotheses explain it about as well, and these data cannot exclude either"),
-     ((0.9, 0.05), "b0 explains it best (probability 0.90); these data cannot exclude the other.")],
+     ((0.9, 0.05), "The best of them is b0 (probability 0.90); these data cannot exclude the other.")],
 )  # fmt: skip
 def test_how_well_tied_hypotheses_do_is_their_probability(shares, told):
     names = [f"b{k}" for k in range(len(shares))]

@@ -573,3 +573,50 @@ def test_noise_of_two_colours_may_be_physics_where_the_evidence_comes_from_one_o
         assert "What it leaves of b is correlated from sample to sample" in " ".join(str(d).split())
     else:
         assert d.terms == ["gain of b" if gain else "source"]
+
+
+def chain(adsorbed: float, seed: int) -> tc.Recording:
+    """Activities of a nuclide and its daughter in two samples, the daughter of which is adsorbed and set free again."""
+    generator, runs = torch.Generator().manual_seed(seed), []
+    rates = torch.tensor([[-0.12, 0, 0], [0.12, -0.5 - adsorbed, 0.1], [0, adsorbed, -0.1]], dtype=torch.float64)
+    samples = ((np.r_[np.linspace(0, 4, 12), np.linspace(5, 40, 14)], (100.0, 0.0)), (np.linspace(0, 25, 20), (40, 30)))
+    for times, start in samples:
+        begin = torch.tensor([*start, 0.0], dtype=torch.float64)
+        nuclei = torch.stack([torch.linalg.matrix_exp(rates * time) @ begin for time in times.tolist()])
+        noise = 0.15 * torch.randn(len(times), 2, generator=generator, dtype=torch.float64)
+        seen = nuclei[:, :2] * torch.tensor([0.12, 0.5], dtype=torch.float64) + noise
+        runs.append(tc.Run(time=times, outputs={"A1": seen[:, 0], "A2": seen[:, 1]}))
+    return tc.Recording(runs=runs, noise=0.15)
+
+
+def test_two_errors_of_one_instrument_are_no_name_where_the_other_output_is_as_likely_off():
+    # They bend to nearly any curve of A1, which the base's rate constant turns into one of A2.
+    decay = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"N1": -p["k1"] * s["N1"], "N2": p["k1"] * s["N1"] - p["k2"] * s["N2"]},
+        states={"N1": "1", "N2": "1"},
+        parameters=[tc.Parameter("k1", low=0.0, high=2.0, initial=0.1), tc.Parameter("k2", low=0.0, high=5.0)],
+        observe={"A1": lambda t, s, p, u: p["k1"] * s["N1"], "A2": lambda t, s, p, u: p["k2"] * s["N2"]},
+    )
+    wrong = [t for t in tc.terms.sensor(("A1",)) if t.name in ("offset of A1", "non-linearity of A1")]
+    d = tc.diagnose(decay, chain(0.2, seed=2), wrong, seed=0, progress=False)
+    assert d.verdict == "ambiguous", str(d)
+    assert d.tied == [["offset of A1", "non-linearity of A1"], ["none of these"]]
+    told = " ".join(str(d).split())
+    assert "Several errors of one instrument bend to much, and a change of A2" in told, told
+
+
+def test_two_errors_of_one_instrument_that_it_has_are_named():
+    rng, times = np.random.default_rng(3), np.linspace(0, 12, 90)
+    true = np.exp(-0.1 * times) * np.cos(2 * times)
+    read = 0.1 + true + 0.25 * true**2 + 0.02 * rng.standard_normal(90)
+    spring = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"] - p["c"] * s["v"]},
+        states={"x": "m", "v": "m/s"},
+        parameters=[tc.Parameter("k", low=0.0, initial=4.0), tc.Parameter("c", low=0.0, initial=0.1)],
+        observe=("x",),
+    )
+    recording = tc.Recording(runs=[tc.Run(time=times, outputs={"x": read})], noise=0.02)
+    wrong = [t for t in tc.terms.sensor(("x",)) if t.name in ("offset of x", "non-linearity of x", "gain error of x")]
+    d = tc.diagnose(spring, recording, wrong, seed=0, progress=False)
+    assert d.verdict == "named", str(d)
+    assert sorted(d.terms) == ["non-linearity of x", "offset of x"]

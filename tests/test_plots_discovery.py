@@ -633,7 +633,7 @@ def test_ranking_shows_evidence_and_marks_what_each_is():
     assert found["bias force"].get_hatch() == "xxxx"
     assert found["cubic drag"].get_hatch() == "////"
     assert found["quadratic drag"].get_hatch() is None
-    assert ax.get_xlabel() == "log evidence against the base, ln K [1]"
+    assert ax.get_xlabel() == "log evidence against the base, ln K [1]\n(probabilities include priors)"
 
 
 def test_the_base_and_none_of_these_stay_in_a_short_ranking():
@@ -644,7 +644,7 @@ def test_the_base_and_none_of_these_stay_in_a_short_ranking():
     assert sorted(names) == sorted(
         ["base model alone", "none of these", "candidate 30", "candidate 0", "candidate 1", "candidate 2"]
     )
-    assert "(36 weaker ones not shown)" in ax.get_xlabel()
+    assert "(probabilities include priors; 36 weaker ones not shown)" in ax.get_xlabel()
     with pytest.raises(DomainError, match="at least one hypothesis"):
         plots.ranking([])
     with pytest.raises(DomainError, match="Expected value"):

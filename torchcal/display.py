@@ -7,7 +7,7 @@ from typing import Any
 
 __all__ = [
     "DECADES", "FAR", "IN_BASE", "ITSELF", "NONE", "PATIENCE", "between", "error_unit", "percent", "placed", "raised",
-    "unit_of", "units_of", "up_to", "version", "with_unit",
+    "rate_unit", "unit_of", "units_of", "up_to", "version", "with_unit",
 ]  # fmt: skip
 
 NONE = ("none of these",)
@@ -52,6 +52,22 @@ def with_unit(amount: str, unit: str | None) -> str:
     ('3.2 m/s', '0.06', '0.06')
     """
     return amount if unit in (None, "", "1") else f"{amount} {unit}"
+
+
+def rate_unit(unit: str | None, time: str) -> str | None:
+    """That of the rate of what has a unit; None where that is not known.
+
+    >>> [rate_unit(unit, "s") for unit in ("m", "m/s", "m/s^2", "V s", "1", "")]
+    ['m/s', 'm/s^2', 'm/s^3', 'V', '1/s', '1/s']
+    """
+    if not unit:
+        return None if unit is None else f"1/{time}"
+    if unit.endswith(f" {time}"):
+        return unit.removesuffix(f" {time}")
+    whole, _, power = unit.partition(f"/{time}^")
+    if power.isdigit():
+        return f"{whole}/{time}^{int(power) + 1}"
+    return f"{unit}^2" if unit.endswith(f"/{time}") else f"{unit}/{time}"
 
 
 def units_of(recording: Any, simulator: Any) -> dict[str, str]:

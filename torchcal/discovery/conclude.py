@@ -13,7 +13,7 @@ from torchcal.discovery.findings.feasible import Feasible
 from torchcal.discovery.findings.limits import limits
 from torchcal.discovery.findings.ranking import ranking
 from torchcal.discovery.findings.result import Diagnosis
-from torchcal.discovery.findings.symptoms import in_rows, more_than_replicates, symptoms, unlike
+from torchcal.discovery.findings.symptoms import in_rows, larger_than_given, more_than_replicates, symptoms, unlike
 from torchcal.discovery.findings.where import locate, missing_rate, needed_shifts, sharpened
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.hypotheses import verify
@@ -175,6 +175,7 @@ def conclude(
             "nearly": decision.nearly,
             "lost": lost,
             "unlike": any_unlike,
+            "larger_noise": larger_than_given(search, best)[0],
             "set_aside": suspect,
             "interrupted": interrupted,
             "region": None if best is None else best.where,

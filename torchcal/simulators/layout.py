@@ -212,7 +212,7 @@ class Layout:
             return self._start_slopes(values)
         if self._fixed_slopes is None:  # numbers, columns and other states, whatever their values are
             self._fixed_slopes = self._start_slopes(values.new_zeros(1, values.shape[-1]))
-        return self._fixed_slopes.expand(len(values), -1, -1, -1)
+        return self._fixed_slopes.to(values).expand(len(values), -1, -1, -1)
 
     def _start_slopes(self, values: Tensor) -> Tensor:
         with torch.enable_grad():

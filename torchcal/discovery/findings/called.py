@@ -31,9 +31,13 @@ NEARLY = 1 / 3
 UNTOLD = 3
 
 
-def chance(p: float) -> str:
-    """A probability in a sentence."""
-    return f"{p:.2g}" if p >= 0.001 else "< 0.001"
+def chance(p: float, draws: int = 1000) -> str:
+    """A probability in a sentence, by so many simulations: none is smaller than one in these.
+
+    >>> chance(0.0213), chance(0.0004), chance(1 / 501, 500)
+    ('0.021', '< 0.001', '< 0.002')
+    """
+    return f"{p:.2g}" if p > 1.0 / draws else f"< {1.0 / draws:.1g}"
 
 
 def joined(names: list[str]) -> str:

@@ -14,7 +14,7 @@ from torchcal.discovery.verdicts.doubts import goes_on
 from torchcal.discovery.verdicts.explain import estimates, stated_sd
 from torchcal.display import with_unit
 
-__all__ = ["in_rows", "more_than_replicates", "symptoms", "unlike"]
+__all__ = ["in_rows", "larger_than_given", "more_than_replicates", "symptoms", "unlike"]
 
 #: A base parameter that moves by this many sd when a term is added was bent by it.
 BENT = 3.0
@@ -54,17 +54,10 @@ def symptoms(search: Search, best: Model | None) -> list[str]:
             f"{count} of {search.problem.recording.n} rows are others once more, numbers and all, as of a table or a "
             "run that was read twice: they count once"
         )
-    if search.noise.doubted > 1:
-        # A misfit that is smooth on coarse spacing passes for fast: what leaves less tells more of the noise.
-        leader = best or search.physical_leader
-        left = base if leader is None or leader.found.chi2 > base.chi2 else leader.found
-        again = estimate(left.problem, left.residual, left.jacobian, search.problem.recording.noise)
-        if again.doubted > 1:
-            outputs = search.problem.recording.outputs
-            of = f" of {outputs[int(again.sizes[:, 0].argmax())]}" if len(outputs) > 1 else ""
-            rows.append(
-                f"the fastest part of the residual{of} is {again.doubted:.1f} times the noise sd that was given"
-            )
+    times, output = larger_than_given(search, best)
+    if times > 1:
+        of = f" of {output}" if len(search.problem.recording.outputs) > 1 else ""
+        rows.append(f"the fastest part of the residual{of} is {times:.1f} times the noise sd that was given")
     if search.coarser > 1:
         rows.append(
             f"the calibrated base misses the data by so many times the noise sd that was given that arithmetic cannot "
@@ -74,6 +67,18 @@ def symptoms(search: Search, best: Model | None) -> list[str]:
     elif search.noise.source == "given":
         rows += _too_large(search, base if best is None else best.found)
     return rows
+
+
+def larger_than_given(search: Search, best: Model | None) -> tuple[float, str]:
+    """How many times the noise that was given the fastest part of what is left is, and of which output; 1 where it is
+    no larger than chance would make it."""
+    if search.noise.doubted <= 1:
+        return 1.0, ""
+    # A misfit that is smooth on coarse spacing passes for fast: what leaves less tells more of the noise.
+    base, leader = search.base, best or search.physical_leader
+    left = base if leader is None or leader.found.chi2 > base.chi2 else leader.found
+    noise = estimate(left.problem, left.residual, left.jacobian, search.problem.recording.noise)
+    return noise.doubted, search.problem.recording.outputs[int(noise.sizes[:, 0].argmax())]
 
 
 def _too_large(search: Search, found: Fitted) -> list[str]:

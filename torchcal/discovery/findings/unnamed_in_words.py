@@ -16,6 +16,7 @@ from torchcal.discovery.findings.called import (
     unknown_share,
 )
 from torchcal.discovery.findings.where_in_words import share_in_words, where_in_words
+from torchcal.discovery.hypotheses.search import CHECKED
 from torchcal.discovery.misfit.channels import RUN
 from torchcal.discovery.verdicts.by_share import REMOVED
 from torchcal.discovery.verdicts.verdict import PLAINLY_WHITE, WHITE
@@ -44,6 +45,11 @@ def consistent(d: Any) -> list[str]:
     nothing = f"There is no {'sure ' if yet else ''}sign of missing physics.{yet}"
     if d.settings.get("unlike"):
         nothing = "There is no sign of missing physics, if the symptoms below are noise." + yet
+    elif d.settings.get("larger_noise", 1.0) > 1:
+        nothing = (
+            "There is no sign of missing physics in how the data follow one another, but they scatter by more than the "
+            f"noise that was given: it is larger, or something acts on single data.{yet}"
+        )
     elif d.p_detect < SELDOM:
         nothing = "There is no sure sign of missing physics: by chance noise does as much now and then." + yet
     if d.p_detect < 1 - d.confidence:
@@ -114,7 +120,7 @@ def ambiguous(d: Any) -> list[str]:
     best = max(range(len(known)), key=lambda k: shares[k])
     if all(shares) and shares[best] > PLAINLY * sorted(shares)[-2]:  # another name of the same model has no share
         others = "the other" if len(known) == 2 else f"the {len(known) - 1} others"
-        told = f"{called(d, known[best])} explains it best (probability {shares[best]:.2f}); these data cannot "
+        told = f"The best of them is {called(d, known[best])} (probability {shares[best]:.2f}); these data cannot "
         told += f"exclude {others}."
     else:
         which = "either" if len(known) == 2 else "any"
@@ -173,8 +179,8 @@ def _would_tell(d: Any, terms: Sequence[str]) -> str:
     if row is None or row.p_white is None or row.p_white >= PLAINLY_WHITE:
         return "More data, or less noise, would tell."
     return (
-        f"What it leaves has a structure that noise gives with a probability of {chance(row.p_white)}: whether "
-        "that is chance a repeated recording would tell."
+        f"What it leaves has a structure that noise gives with a probability of {chance(row.p_white, CHECKED)}: "
+        "whether that is chance a repeated recording would tell."
     )
 
 
@@ -216,7 +222,7 @@ def _no_name(d: Any, best: Any) -> str:
     if unknown > mine:
         reasons.append(f"something unknown is likelier by {up_to(log_odds_behind(mine, unknown))} in log odds")
     if left:
-        reasons.append(f"what it leaves is not noise (probability {chance(best.p_white)})")
+        reasons.append(f"what it leaves is not noise (probability {chance(best.p_white, CHECKED)})")
     elif not reasons and d.noise.source == "given":
         reasons.append("it leaves more than the noise that is given")
     return ", but " + joined(reasons) if reasons else ""

@@ -43,14 +43,16 @@ def _spans(place: Place) -> tuple[tuple[float, float], ...]:
     values = place.channel.drivers[place.driver]
     if place.period is not None:
         return ((float(values.min()), float(values.max())),)
-    return _ranges(values, place.profile)
+    return _ranges(values, place.profile, place.sd)
 
 
-def _ranges(values: Tensor, change: Tensor) -> tuple[tuple[float, float], ...]:
-    """Ranges of some values where a change at them is large."""
+def _ranges(values: Tensor, change: Tensor, sd: Tensor | None = None) -> tuple[tuple[float, float], ...]:
+    """Ranges of some values where a change at them is large, and larger than its sd if some of it is."""
     order = values.argsort(stable=True)
     along, size = values[order], change[order].abs()
     high = size >= SPAN_LEVEL * float(size.max())
+    if sd is not None and bool((sure := high & (size > sd[order])).any()):
+        high = sure
     least = SLIVER * len(along)
     found: list[list[int]] = []
     for k in high.nonzero()[:, 0].tolist():

@@ -28,7 +28,7 @@ from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.misfit.structure import Structure, analyse
 from torchcal.terms import Term
 
-__all__ = ["HOPELESS", "NEAR", "Search"]
+__all__ = ["CHECKED", "HOPELESS", "NEAR", "Search"]
 
 #: Log evidence by which a model may fall short of the best one and still play a part.
 NEAR = 20.0
@@ -37,6 +37,8 @@ CLEARLY = 5.0
 #: Share of the best log evidence below which a model is not fitted again when the noise estimate has changed, nor on to
 #: its end where it falls slowly, nor with shorter steps.
 HOPELESS = 0.5
+#: Simulated residuals by which what a model leaves is held to be noise or not.
+CHECKED = 500
 
 
 @dataclass(eq=False)
@@ -271,7 +273,7 @@ class Search:
     def examine(self, model: Model) -> Structure:
         """What is left after a model."""
         if model.structure is None or model.residual is None or model.residual.found is not model.found:
-            model.residual = Residual(model.found, self.noise, seed=self.seed, draws=500)
+            model.residual = Residual(model.found, self.noise, seed=self.seed, draws=CHECKED)
             model.structure = analyse(model.residual)
         return model.structure
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.local import is_window
 from torchcal.discovery.fits.problem import Problem
-from torchcal.display import ITSELF
+from torchcal.display import ITSELF, rate_unit
 from torchcal.simulators import Trajectories
 
 __all__ = ["RUN", "Channel", "channels", "responses"]
@@ -153,10 +153,6 @@ def _time(problem: Problem) -> Tensor:
     return problem.order[at] if problem.in_time and problem.order is not None else at.double()
 
 
-def _rate_unit(unit: str | None, time: str) -> str | None:
-    return None if unit is None else f"{unit or 1}/{time}"
-
-
 def definitions(bound: Trajectories, values: Tensor, states: Tensor) -> set[str]:
     """States whose equation only says what another state is, as dx/dt = v does: there is no physics to leave out.
 
@@ -210,7 +206,7 @@ def channels(problem: Problem, found: Fitted) -> list[Channel]:
         run = torch.arange(len(bins), dtype=torch.float64)[:, None].expand(bins.shape)
         drivers = _by_run(problem, drivers, _bin_means(bins, count, run))
         labels = [
-            ("equation", state, _rate_unit(unit, problem.recording.units.get("time", "[time]")))
+            ("equation", state, rate_unit(unit, problem.recording.units.get("time", "[time]")))
             for state, unit in bound.ode.states.items()
         ]
         labels += [("parameter", names[i], problem.parameters[i].unit) for i in own]

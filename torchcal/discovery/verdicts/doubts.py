@@ -18,7 +18,7 @@ from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.noise import GRID, LEAST, Noise, log_prior
 from torchcal.discovery.verdicts.explain import misfit_size, stated_sd
 from torchcal.discovery.verdicts.given import as_good
-from torchcal.discovery.verdicts.instruments import no_instrument, unnatural
+from torchcal.discovery.verdicts.instruments import bends_to_physics, no_instrument, unnatural
 from torchcal.discovery.verdicts.together import only_together
 from torchcal.errors import TorchcalError
 from torchcal.simulators import Trajectories
@@ -64,7 +64,8 @@ def doubt(search: Search, model: Model) -> str:
     found = unfit(search, model) or _no_better(search, model) or by_hold(search, model) or only_together(search, model)
     if found or search.exact:
         return found
-    return _noise_or_physics(search, model) or in_common(search, model) or _of_two_colours(search, model)
+    found = _noise_or_physics(search, model) or in_common(search, model) or _of_two_colours(search, model)
+    return found or bends_to_physics(search, model)
 
 
 def unfit(search: Search, model: Model) -> str:
@@ -105,8 +106,8 @@ def left_open(search: Search, model: Model) -> str:
             return told + looks if bound else told
     if model.window is not None and _levels(model) < LEVELS:
         return (
-            f"It acts in full, or not at all, at hardly more than one value of {model.window.driver}, where something "
-            f"else may be missing as well: more values of {model.window.driver} would tell."
+            f"Its range takes in, or leaves out, hardly more than one value of {model.window.driver}, at which "
+            f"something else may be missing as well: more values of {model.window.driver} would tell."
         )
     # As many to spare as are added: else there is a curve through the data, whatever they are.
     if distinct(search.problem) - len(model.found.free) <= len(model.candidate.own):

@@ -190,7 +190,8 @@ def _nearly_the_same(search: Search) -> list[str]:
                 group.append(k)
         within = list(itertools.combinations(sorted(group), 2))
         names = [search.candidates[k].name for k in sorted(group)]
-        least = f"correlation {'' if len(within) == 1 else 'from '}{min(pairs[pair] for pair in within):.3f}"
+        low, high = (f"{end(pairs[pair] for pair in within):.3f}" for end in (min, max))
+        least = f"correlation {'' if low == high else 'from '}{low}"
         rows.append(f"{', '.join(names[:-1])} and {names[-1]} are nearly the same here ({least})")
         open_ = {pair: c for pair, c in open_.items() if pair not in within}
     return rows

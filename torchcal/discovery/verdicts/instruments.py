@@ -16,7 +16,9 @@ from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.verdicts.explain import stated_sd
 from torchcal.terms import extend
 
-__all__ = ["no_instrument", "only_instruments", "reads_otherwise", "unnatural", "which_instruments"]
+__all__ = [
+    "bends_to_physics", "no_instrument", "only_instruments", "reads_otherwise", "unnatural", "which_instruments",
+]  # fmt: skip
 
 #: Noise sd by which an instrument's reading must fall while the true value rises to be no instrument's: a hard limit is
 #: one. And the least sd, in the data's spread.
@@ -37,6 +39,9 @@ FAR, STRAIGHT = 3.0, 1e-9
 NEAR = 0.01
 #: Joint sd of an estimate and of what it is in nature, from which on it is not that.
 APART = 2.0
+#: Log odds by which a change of the output must be likelier than one of anything else for several errors of one
+#: instrument: those that were planted had 15 to 640, and what stood for physics that no list had 5 at most.
+OUTPUT = 5.0
 #: Sd by which an instrument's size beside other terms is off that alone from which on it is no property of its own.
 OFF = 3.0
 
@@ -92,6 +97,28 @@ def reads_otherwise(model: Model, larger: Model) -> str:
                 "of one instrument, but what none of the terms does."
             )
     return ""
+
+
+def bends_to_physics(search: Search, model: Model) -> str:
+    """Whether several errors of one instrument may stand for a change of something else, in a sentence; empty if not.
+
+    Together they are nearly any curve of what is read. So is an unknown smooth change, of the output or of the physics
+    behind it: the data have to tell that it is the output.
+    """
+    terms, places, recorded = model.candidate.terms, search.structure.places, search.problem.recording.outputs
+    outputs = {name if name in recorded else recorded[0] for term in terms for name in term.outputs}
+    if len(terms) < 2 or len(outputs) != 1 or any(term.states for term in terms) or not only_instruments(model):
+        return ""
+    output = outputs.pop()
+    inside = [p.evidence for p in places if p.channel.kind == "output" and p.channel.target == output]
+    others = [p for p in places if p.channel.kind != "output" or p.channel.target != output]
+    rival = max(others, key=lambda p: p.evidence, default=None)
+    if rival is None or max(inside, default=0.0) > rival.evidence + OUTPUT:
+        return ""
+    return (
+        f"Several errors of one instrument bend to much, and a change of {rival.channel.target} along {rival.driver} "
+        f"would do as well: a check of the instrument that reads {output} would tell."
+    )
 
 
 def which_instruments(model: Model) -> list[bool]:

@@ -31,7 +31,7 @@ def only_together(search: Search, model: Model) -> str:
     if alike := one_law(model):
         return f"Of its terms {alike[0]}."
     if other_minima(search, model):
-        return "Other sizes of its terms fit about as well: what they do is told together alone."
+        return "Other sizes of its terms fit about as well: only what they do together is told."
     return ""
 
 

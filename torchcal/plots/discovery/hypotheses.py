@@ -117,7 +117,8 @@ def ranking(
     beside(ax, None, 46, "ln K")
     beside(ax, None, 92, "prob.")
     shown = "log evidence against the base, ln K [1]" if value == "log_evidence" else "probability [1]"
-    ax.set_xlabel(shown + (f"\n({left_out} weaker ones not shown)" if left_out else ""))
+    weaker = f"; {left_out} weaker ones not shown" if left_out else ""
+    ax.set_xlabel(f"{shown}\n(probabilities include priors{weaker})")
     style.dress(ax)
     ax.tick_params(axis="y", length=0)
     if legend and len(set(kinds)) > 1:
