@@ -16,7 +16,7 @@ from torchcal.discovery.verdicts.by_share import decide_exact, nearly
 from torchcal.discovery.verdicts.decision import Decision, certain, groups_of, other_names, tie_other_names, weigh
 from torchcal.discovery.verdicts.doubts import by_hold, doubt, in_common, in_order, unfit
 from torchcal.discovery.verdicts.explain import removed
-from torchcal.discovery.verdicts.instruments import no_instrument, only_instruments, reads_otherwise
+from torchcal.discovery.verdicts.instruments import bends_to_physics, no_instrument, only_instruments, reads_otherwise
 from torchcal.discovery.verdicts.proof import prove
 from torchcal.discovery.verdicts.together import only_together
 from torchcal.display import NONE
@@ -191,7 +191,11 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     local = rival and all(model.window is not None for model in decision.tied_models)
     told = decision.tied_models[0] if decision.tied_models else best
     decision.doubt = (
-        unfit(search, told) or by_hold(search, told) or only_together(search, told) or in_common(search, told)
+        unfit(search, told)
+        or by_hold(search, told)
+        or only_together(search, told)
+        or in_common(search, told)
+        or bends_to_physics(search, told)
     )
     # Windows, instruments and several terms, of which they share none, bend to what no term of the list explains.
     shared = set(best.names).intersection(*(m.names for m in decision.tied_models))

@@ -43,6 +43,8 @@ OPAQUE = 200
 ENTRY = 60
 #: Local means in one period of an oscillation: fewer would not show it.
 PER_PERIOD = 6
+#: Parts of the range of a driver over which residuals are averaged, and the fewest data of a mean.
+PARTS, FEWEST = 25, 8
 
 
 def driver_values(recording: Recording, driver: str, fitted: Any = None) -> Tensor | None:
@@ -227,13 +229,14 @@ def _widened(spans: Sequence[tuple[float, float]], levels: np.ndarray) -> list[t
 def _bins(x: np.ndarray, keep: np.ndarray, period: float | None) -> list[np.ndarray]:
     """Rows over which residuals are averaged, of those to keep in ascending order; none where that would hide a period.
 
-    Each holds one level of the driver where it has few, else at least eight data, or two in a part of a period.
+    Each holds one level of the driver where it has few, else at least eight data in a part of its range, or two in one
+    of a period.
     """
     levels = np.unique(x[keep])
     if len(levels) <= 30:
         return [keep[x[keep] == level] for level in levels]
     if period is None:
-        return np.array_split(keep, min(30, len(keep) // 8))
+        return _in_parts(np.log(x[keep]) if is_log(levels) else x[keep], keep)
     part = np.floor((x[keep] - levels[0]) * PER_PERIOD / period)
     bins = [keep[part == number] for number in np.unique(part)]
     return bins if np.median([len(rows) for rows in bins]) >= 2 else []
@@ -268,3 +271,20 @@ def _noise_of(noise: Any, recording: Recording, output: str) -> np.ndarray | Non
     numbers = np.asarray(sd, dtype=np.float64)
     every = as_numbers(np.full(recording.n, numbers) if numbers.ndim == 0 else numbers, "noise", recording.n)
     return every if np.isfinite(every).all() and every.max() > 0 else None
+
+
+def _in_parts(along: np.ndarray, keep: np.ndarray) -> list[np.ndarray]:
+    """Rows by the parts of a range that some ascending values lie in, several parts where these hold few: bins of as
+    many data each would be so narrow where data are dense that their means scatter."""
+    part = np.minimum(PARTS * (along - along[0]) / np.ptp(along), PARTS - 1).astype(int)
+    bins: list[np.ndarray] = []
+    few = keep[:0]
+    for number in np.unique(part):
+        few = np.concatenate([few, keep[part == number]])
+        if len(few) >= FEWEST:
+            bins.append(few)
+            few = keep[:0]
+    if len(few):
+        bins[-1:] = [np.concatenate([*bins[-1:], few])]
+    equal = np.array_split(keep, min(PARTS, len(keep) // FEWEST))
+    return bins if len(bins) > len(equal) / 5 else equal  # nearly all are in a small part of the range
