@@ -5,6 +5,7 @@ import dataclasses
 import re
 from collections.abc import Mapping
 
+from torchcal.display import rate_unit
 from torchcal.terms.pieces import factor
 from torchcal.terms.term import Term
 
@@ -26,6 +27,9 @@ def labelled(term: Term, known: Mapping[str, str | None], states: Mapping[str, s
     >>> bend = sensor(("y",), static=True)[2]
     >>> [q.unit for term in (bend, labelled(bend, {"y": "mm"}, {})) for q in term.parameters]
     ['1/([y])', '1/mm']
+    >>> drift = next(term for term in sensor(("w",)) if term.name == "drift of w")
+    >>> [q.unit for q in labelled(drift, {"w": "rad/s"}, {}).parameters]
+    ['rad/s^2']
     """
     units = {f"[{name}]": unit for name, unit in known.items() if unit and unit != "1"}
     for label in {*term.labels.values()} - {"1", term.time}:
@@ -35,7 +39,7 @@ def labelled(term: Term, known: Mapping[str, str | None], states: Mapping[str, s
             units[label] = f"[{name}]" if unit == "1" else str(unit)
 
     def told(text: str | None) -> str | None:
-        return None if text is None else units.get(text) or PARTS.sub(lambda part: _put(part[0], units), text)
+        return None if text is None else units.get(text) or _settled(PARTS.sub(lambda p: _put(p[0], units), text))
 
     changes = {
         "parameters": tuple(
@@ -49,6 +53,15 @@ def labelled(term: Term, known: Mapping[str, str | None], states: Mapping[str, s
     for name, value in (changes | {"labels": {x: units.get(label, label) for x, label in term.labels.items()}}).items():
         object.__setattr__(other, name, value)
     return other
+
+
+def _settled(unit: str) -> str:
+    """A unit, where it is that of a rate once more by the same time with a power of it: (rad/s)/s is rad/s^2."""
+    whole, _, time = unit.rpartition("/")
+    if whole.startswith("(") and whole.endswith(")"):
+        whole = whole[1:-1]
+    told = rate_unit(whole, time) if whole and time.isalpha() else None
+    return unit if told is None or told == f"{whole}/{time}" else told
 
 
 def _put(part: str, units: Mapping[str, str]) -> str:
