@@ -707,4 +707,5 @@ def test_data_that_scatter_by_more_than_the_noise_that_was_given_are_told_to():
         told = " ".join(str(d).split())
         assert d.verdict == "consistent", told
         assert bool(re.search(r"could show, if the noise is [23]\.\d times as large as given\)", told)) is larger, told
-        assert ("they scatter by more than the noise that was given" in told) is larger
+        assert ("data beside each other differ by more than the noise that was given" in told) is larger
+        assert (d.settings["larger_noise"] != "") is larger

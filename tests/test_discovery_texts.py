@@ -210,6 +210,8 @@ def test_slivers_are_no_spans():
     sd = torch.where(x > 0.5, 2.0, 0.1)
     assert where._ranges(x, change, sd) == ((float(x[40]), float(x[99])),)
     assert where._ranges(x, change, 2 * torch.ones_like(x)) == where._ranges(x, change)
+    sd[150] = 0.01  # and what is surest is told, however narrow
+    assert where._ranges(x, change, sd) == ((float(x[40]), float(x[99])), (float(x[150]), float(x[150])))
 
 
 def test_the_missing_rate_is_told_where_the_change_without_a_name_acts():

@@ -644,7 +644,7 @@ def test_the_base_and_none_of_these_stay_in_a_short_ranking():
     assert sorted(names) == sorted(
         ["base model alone", "none of these", "candidate 30", "candidate 0", "candidate 1", "candidate 2"]
     )
-    assert "(probabilities include priors; 36 weaker ones not shown)" in ax.get_xlabel()
+    assert "(36 weaker ones not shown)" in ax.get_xlabel()
     with pytest.raises(DomainError, match="at least one hypothesis"):
         plots.ranking([])
     with pytest.raises(DomainError, match="Expected value"):

@@ -57,15 +57,18 @@ def with_unit(amount: str, unit: str | None) -> str:
 def rate_unit(unit: str | None, time: str) -> str | None:
     """That of the rate of what has a unit; None where that is not known.
 
-    >>> [rate_unit(unit, "s") for unit in ("m", "m/s", "m/s^2", "V s", "1", "")]
-    ['m/s', 'm/s^2', 'm/s^3', 'V', '1/s', '1/s']
+    >>> [rate_unit(unit, "s") for unit in ("m", "m/s", "m/s^2", "V s", "s", "1", "", "mol/L s", "counts per s")]
+    ['m/s', 'm/s^2', 'm/s^3', 'V', '1', '1/s', '1/s', 'mol/L s/s', 'counts per s/s']
     """
     if not unit:
         return None if unit is None else f"1/{time}"
-    if unit.endswith(f" {time}"):
-        return unit.removesuffix(f" {time}")
+    if unit == time:
+        return "1"
+    rest = unit.removesuffix(f" {time}")
+    if rest != unit and "/" not in rest and not rest.endswith("per"):
+        return rest
     whole, _, power = unit.partition(f"/{time}^")
-    if power.isdigit():
+    if power.isascii() and power.isdecimal() and int(power) > 0:
         return f"{whole}/{time}^{int(power) + 1}"
     return f"{unit}^2" if unit.endswith(f"/{time}") else f"{unit}/{time}"
 

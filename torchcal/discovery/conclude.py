@@ -175,7 +175,7 @@ def conclude(
             "nearly": decision.nearly,
             "lost": lost,
             "unlike": any_unlike,
-            "larger_noise": larger_than_given(search, best)[0],
+            "larger_noise": larger_than_given(search, best),
             "set_aside": suspect,
             "interrupted": interrupted,
             "region": None if best is None else best.where,

@@ -200,7 +200,7 @@ class Location:
         kind: ``"equation"``, ``"output"`` or ``"parameter"``.
         target: Name of that equation (its state), output or parameter.
         driver: What the mismatch varies with: a condition, ``"t"``, a state, an input, or ``"run"``, counted from 0.
-        spans: Ranges of the driver in which it sits, ``((low, high), …)``.
+        spans: Ranges of the driver in which it sits, as far as that is sure, ``((low, high), …)``.
         share: Share of the misfit beyond noise that a change there, varying with the driver, can remove.
         evidence: Log evidence of an unknown change there, smooth, an oscillation or in steps, against none.
         period: Of an oscillation, in units of the driver; None of any other change.

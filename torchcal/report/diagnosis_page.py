@@ -47,7 +47,7 @@ SETTINGS = {
     "nearly": "the name rests on the share of the misfit removed",
     "lost": "the base explains no more than a constant would",
     "unlike": "some runs, sweeps or outliers are unlike the others",
-    "larger_noise": "how many times the given noise the fastest part of the residual is",
+    "larger_noise": "the fastest part of the residual, beside the given noise",
     "set_aside": "these may explain the outliers",
     "interrupted": "left undone at an interruption",
     "region": "where the named term acts",

@@ -12,7 +12,7 @@ from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.noise import GRID, decorrelated, estimate
 from torchcal.discovery.verdicts.doubts import goes_on
 from torchcal.discovery.verdicts.explain import estimates, stated_sd
-from torchcal.display import with_unit
+from torchcal.display import up_to, with_unit
 
 __all__ = ["in_rows", "larger_than_given", "more_than_replicates", "symptoms", "unlike"]
 
@@ -54,10 +54,8 @@ def symptoms(search: Search, best: Model | None) -> list[str]:
             f"{count} of {search.problem.recording.n} rows are others once more, numbers and all, as of a table or a "
             "run that was read twice: they count once"
         )
-    times, output = larger_than_given(search, best)
-    if times > 1:
-        of = f" of {output}" if len(search.problem.recording.outputs) > 1 else ""
-        rows.append(f"the fastest part of the residual{of} is {times:.1f} times the noise sd that was given")
+    if larger := larger_than_given(search, best):
+        rows.append(f"the fastest part of the residual{larger} the noise sd that was given")
     if search.coarser > 1:
         rows.append(
             f"the calibrated base misses the data by so many times the noise sd that was given that arithmetic cannot "
@@ -69,16 +67,19 @@ def symptoms(search: Search, best: Model | None) -> list[str]:
     return rows
 
 
-def larger_than_given(search: Search, best: Model | None) -> tuple[float, str]:
-    """How many times the noise that was given the fastest part of what is left is, and of which output; 1 where it is
-    no larger than chance would make it."""
+def larger_than_given(search: Search, best: Model | None) -> str:
+    """How many times the noise that was given the fastest part of what is left is, and of which output where there are
+    several, as "of a is 2.8 times" behind a space; empty where it is no larger than chance would make it."""
     if search.noise.doubted <= 1:
-        return 1.0, ""
+        return ""
     # A misfit that is smooth on coarse spacing passes for fast: what leaves less tells more of the noise.
     base, leader = search.base, best or search.physical_leader
     left = base if leader is None or leader.found.chi2 > base.chi2 else leader.found
     noise = estimate(left.problem, left.residual, left.jacobian, search.problem.recording.noise)
-    return noise.doubted, search.problem.recording.outputs[int(noise.sizes[:, 0].argmax())]
+    if noise.doubted <= 1:
+        return ""
+    of = f" of {noise.doubted_of}" if len(search.problem.recording.outputs) > 1 else ""
+    return f"{of} is {up_to(noise.doubted * search.coarser)} times"
 
 
 def _too_large(search: Search, found: Fitted) -> list[str]:

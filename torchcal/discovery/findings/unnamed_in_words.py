@@ -45,11 +45,6 @@ def consistent(d: Any) -> list[str]:
     nothing = f"There is no {'sure ' if yet else ''}sign of missing physics.{yet}"
     if d.settings.get("unlike"):
         nothing = "There is no sign of missing physics, if the symptoms below are noise." + yet
-    elif d.settings.get("larger_noise", 1.0) > 1:
-        nothing = (
-            "There is no sign of missing physics in how the data follow one another, but they scatter by more than the "
-            f"noise that was given: it is larger, or something acts on single data.{yet}"
-        )
     elif d.p_detect < SELDOM:
         nothing = "There is no sure sign of missing physics: by chance noise does as much now and then." + yet
     if d.p_detect < 1 - d.confidence:
@@ -59,6 +54,9 @@ def consistent(d: Any) -> list[str]:
                 "Slow noise explains that structure at least as well as anything in the library, so that no physics is "
                 "called missing; a known noise sd, replicates or a repeated run would tell."
             )
+    if d.settings.get("larger_noise"):
+        nothing += " But data beside each other differ by more than the noise that was given: it is larger, or "
+        nothing += "something acts that changes from the one to the other."
     # What the base has is none of it.
     hidden = [one.term for one in d.detection_limit if math.isinf(one.smallest) and one.note != IN_BASE]
     if hidden:

@@ -47,12 +47,14 @@ def _spans(place: Place) -> tuple[tuple[float, float], ...]:
 
 
 def _ranges(values: Tensor, change: Tensor, sd: Tensor | None = None) -> tuple[tuple[float, float], ...]:
-    """Ranges of some values where a change at them is large, and larger than its sd if some of it is."""
+    """Ranges of some values where a change at them is large, and larger than its sd if some of it is; the one where it
+    is surest is among them, however narrow."""
     order = values.argsort(stable=True)
     along, size = values[order], change[order].abs()
     high = size >= SPAN_LEVEL * float(size.max())
+    surest = -1
     if sd is not None and bool((sure := high & (size > sd[order])).any()):
-        high = sure
+        high, surest = sure, int((size / sd[order]).where(sure, 0.0).argmax())
     least = SLIVER * len(along)
     found: list[list[int]] = []
     for k in high.nonzero()[:, 0].tolist():
@@ -60,7 +62,7 @@ def _ranges(values: Tensor, change: Tensor, sd: Tensor | None = None) -> tuple[t
             found[-1][1] = k
         else:
             found.append([k, k])
-    wide = [span for span in found if span[1] - span[0] + 1 > least]
+    wide = [span for span in found if span[1] - span[0] + 1 > least or span[0] <= surest <= span[1]]
     return tuple((float(along[low]), float(along[high])) for low, high in (wide or found)[:6])
 
 

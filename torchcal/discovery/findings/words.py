@@ -59,8 +59,8 @@ def _headline(d: Any) -> str:
     if d.verdict == "consistent":
         sign = likelier(d) or d.settings.get("unlike") or d.p_detect < 1 - d.confidence
         told = "nothing is surely missing" if sign else "nothing is missing that these data could show"
-        times = d.settings.get("larger_noise", 1.0)
-        told += f", if the noise is {times:.1f} times as large as given" if times > 1 else ""
+        larger = d.settings.get("larger_noise")
+        told += f", if the noise{larger} as large as given" if larger else ""
         return f"Verdict: consistent ({told})"
     if d.verdict == "named":
         return f"Verdict: named: {joined([with_region(d, name) for name in d.terms])}{_company(d)}"

@@ -55,6 +55,7 @@ class Noise:
         step: As in `NoiseModel`.
         unit: Of unknown noise, its sd in units of its median, ``(n_total,)``; see `growth`.
         log_density: Of what it was estimated from, with the prior of the correlation, up to a constant.
+        doubted_of: The output of which it is doubted most, where it is.
     """
 
     sd: Tensor
@@ -67,6 +68,7 @@ class Noise:
     step: dict[str, float] = dataclasses.field(default_factory=dict)
     unit: Tensor = dataclasses.field(default_factory=lambda: torch.ones(()))
     log_density: float = 0.0
+    doubted_of: str = ""
 
     @property
     def open(self) -> bool:
@@ -131,7 +133,7 @@ def estimate(
     known = given if isinstance(given, Tensor) else unit
     replicated = replicates(problem) if given is None else None
     sd = known.clone()
-    doubted, log_density = 1.0, 0.0
+    doubted, doubted_of, log_density = 1.0, "", 0.0
     for output in range(outputs):
         parts = problem.recorded_of(output)
         n = sum(len(places) for places in parts)
@@ -189,12 +191,13 @@ def estimate(
             else:
                 sd[mask], freedom[output] = scale * unit[mask], usable
         elif scale > EXCESS * (1 + 2 / math.sqrt(2 * usable)):
+            doubted_of = recording.outputs[output] if scale > doubted else doubted_of
             doubted = max(doubted, scale)
     step = quantisation(problem) if given is None else {}
     if given is None:
         sd = torch.maximum(sd, least(problem, step))
     source = "given" if isinstance(given, Tensor) else "replicates" if replicated is not None else "estimated"
-    return Noise(sd, correlation, freedom, posterior, source, table, doubted, step, unit, log_density)
+    return Noise(sd, correlation, freedom, posterior, source, table, doubted, step, unit, log_density, doubted_of)
 
 
 def _cautious(posterior: Tensor) -> int:

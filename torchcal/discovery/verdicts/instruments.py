@@ -13,6 +13,7 @@ from torchcal.discovery.fits.readings import Reading, are_instruments
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.own_noise import beside
 from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.misfit.channels import RUN
 from torchcal.discovery.verdicts.explain import stated_sd
 from torchcal.terms import extend
 
@@ -40,8 +41,9 @@ NEAR = 0.01
 #: Joint sd of an estimate and of what it is in nature, from which on it is not that.
 APART = 2.0
 #: Log odds by which a change of the output must be likelier than one of anything else for several errors of one
-#: instrument: those that were planted had 15 to 640, and what stood for physics that no list had 5 at most.
-OUTPUT = 5.0
+#: instrument: those that were planted had -0.4 to 640 (small ones the least; less where another output shares the
+#: base's parameters), and what stood for physics that no list had -15 to 0.4.
+OUTPUT = 1.0
 #: Sd by which an instrument's size beside other terms is off that alone from which on it is no property of its own.
 OFF = 3.0
 
@@ -113,11 +115,15 @@ def bends_to_physics(search: Search, model: Model) -> str:
     inside = [p.evidence for p in places if p.channel.kind == "output" and p.channel.target == output]
     others = [p for p in places if p.channel.kind != "output" or p.channel.target != output]
     rival = max(others, key=lambda p: p.evidence, default=None)
-    if rival is None or max(inside, default=0.0) > rival.evidence + OUTPUT:
+    lead = max(inside, default=0.0)
+    if rival is None or rival.evidence <= 0 or lead > rival.evidence + OUTPUT:
         return ""
+    along = "from run to run" if rival.driver == RUN else f"along {rival.driver}"
+    well = "nearly as well" if lead > rival.evidence else "as well"
     return (
-        f"Several errors of one instrument bend to much, and a change of {rival.channel.target} along {rival.driver} "
-        f"would do as well: a check of the instrument that reads {output} would tell."
+        f"Several errors of one instrument bend to much, and an unknown change of the {rival.channel.kind} "
+        f"{rival.channel.target} {along} would do {well} as one of what {output} reads: a check of that instrument "
+        "would tell."
     )
 
 

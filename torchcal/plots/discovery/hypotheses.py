@@ -116,9 +116,11 @@ def ranking(
         beside(ax, i, 92, percent(item.probability))
     beside(ax, None, 46, "ln K")
     beside(ax, None, 92, "prob.")
-    shown = "log evidence against the base, ln K [1]" if value == "log_evidence" else "probability [1]"
-    weaker = f"; {left_out} weaker ones not shown" if left_out else ""
-    ax.set_xlabel(f"{shown}\n(probabilities include priors{weaker})")
+    evidence = value == "log_evidence"
+    notes = ["probabilities include priors"] if evidence else []
+    notes += [f"{left_out} weaker ones not shown"] if left_out else []
+    shown = "log evidence against the base, ln K [1]" if evidence else "probability, priors included [1]"
+    ax.set_xlabel(shown + (f"\n({'; '.join(notes)})" if notes else ""))
     style.dress(ax)
     ax.tick_params(axis="y", length=0)
     if legend and len(set(kinds)) > 1:
