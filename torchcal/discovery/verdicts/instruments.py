@@ -121,7 +121,7 @@ def bends_to_physics(search: Search, model: Model) -> str:
     along = "from run to run" if rival.driver == RUN else f"along {rival.driver}"
     well = "nearly as well" if lead > rival.evidence else "as well"
     return (
-        f"Several errors of one instrument bend to much, and an unknown change of the {rival.channel.kind} "
+        f"Several errors of one instrument follow nearly any curve, and an unknown change of the {rival.channel.kind} "
         f"{rival.channel.target} {along} would do {well} as one of what {output} reads: a check of that instrument "
         "would tell."
     )
