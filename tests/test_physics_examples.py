@@ -149,11 +149,11 @@ def test_evaporation_predicts_the_second_half_of_the_mug(loss: str | None, rmse:
     assert fit_mug(loss, until=120.0)[2] == pytest.approx(rmse, abs=5e-3)
 
 
-LOSSES = ("natural convection", "radiation", "evaporation")
+NAMES = ("natural convection", "radiation", "evaporation")
 
 
 @pytest.mark.parametrize(
-    "among", [LOSSES[1:], *(pytest.param(each, marks=pytest.mark.slow) for each in (LOSSES, None))]
+    "among", [NAMES[1:], *(pytest.param(each, marks=pytest.mark.slow) for each in (NAMES, None))]
 )
 def test_the_mug_is_told_to_evaporate(among: tuple[str, ...] | None):
     needs_mug()
