@@ -491,3 +491,13 @@ def test_no_steps_are_sought_where_rates_have_no_value():
     assert not bound.begins(values).all()
     assert tc.simulators.workable(bound, values, torch.full((41,), 1e-3, dtype=torch.float64)) is bound
     assert _root(0.0).bind(_swing()).begins(values).all()
+
+
+@pytest.mark.parametrize("flag", [True, np.True_, torch.tensor(True)])
+def test_a_flag_is_no_number(flag):
+    for make in (
+        lambda: tc.likelihoods.ABC(epsilon=flag),
+        lambda: tc.NISP(tc.Simulator(line, AB), tc.embeddings.Gaussian(), x=X, trial_spread=flag),
+    ):
+        with pytest.raises(DomainError, match=r"> 0 and finite|as a positive number"):
+            make()

@@ -5,10 +5,11 @@ import operator
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from torchcal.errors import DomainError
 
-__all__ = ["as_seed", "by_default_on_cpu", "outside_inference_mode", "positive", "whole"]
+__all__ = ["as_seed", "by_default_on_cpu", "outside_inference_mode", "positive", "real_number", "whole"]
 
 #: The largest seed: generators take 32 bits, and chains add to it.
 LARGEST = 2**31 - 1
@@ -41,16 +42,33 @@ def outside_inference_mode() -> None:
         )
 
 
+def real_number(value: Any) -> float:
+    """One real number, Python's, NumPy's or torch's, as a float; NaN of a string, a flag or anything else.
+
+    >>> [real_number(value) for value in (2, torch.tensor(0.5), "1", True, [1.0])]
+    [2.0, 0.5, nan, nan, nan]
+    """
+    dtype = getattr(value, "dtype", None)
+    if dtype is not None:
+        count = value.numel() if isinstance(value, Tensor) else getattr(value, "size", 0)
+        if count != 1 or getattr(dtype, "kind", "f") not in "iuf":
+            return math.nan
+        value = value.item()
+    if isinstance(value, str | bytes | bytearray | bool):
+        return math.nan
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError):
+        return math.nan
+
+
 def positive(name: str, value: Any) -> float:
     """Return ``value`` as a ``float``.
 
     Raises:
         DomainError: If it is not a number above zero, or infinite.
     """
-    try:
-        number = math.nan if isinstance(value, bool | str) else float(value)
-    except (TypeError, ValueError, OverflowError):
-        number = math.nan
+    number = real_number(value)
     if not 0 < number < math.inf:
         raise DomainError(f"Expected {name} > 0 and finite. Got {value!r}.")
     return number

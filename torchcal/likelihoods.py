@@ -44,10 +44,12 @@ SMOOTHING = 1e-3
 
 def _positive(value: float | Tensor, name: str) -> None:
     if isinstance(value, float | int):  # the fast way: this is called at every step of a sampler
-        good = math.isfinite(value) and value > 0
+        good = math.isfinite(value) and value > 0 and not isinstance(value, bool)
     else:
         try:
             number = torch.as_tensor(value, dtype=torch.float64)
+            if torch.as_tensor(value).dtype == torch.bool:
+                raise TypeError(name)
         except (TypeError, ValueError, RuntimeError) as error:
             raise DomainError(f"Expected {name} as a positive number or a tensor of them. Got {value!r}.") from error
         good = bool((torch.isfinite(number) & (number > 0)).all())

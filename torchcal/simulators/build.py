@@ -14,14 +14,14 @@ import torch
 from torch import Tensor
 
 from torchcal import polychaos
-from torchcal.checks import as_seed, whole
+from torchcal.checks import as_seed, real_number, whole
 from torchcal.errors import DomainError, SimulatorError, SurrogateWarning, warn
 from torchcal.polychaos._checks import limit_rows
 from torchcal.simulators.design import Evaluations, evaluate_points
 from torchcal.simulators.executor import check_executor
 from torchcal.simulators.external import ExternalSimulator
 from torchcal.simulators.held_out import HeldOutError, mean_and_sd, root_mean_square
-from torchcal.simulators.parameter import Parameter, Scaling, real_number
+from torchcal.simulators.parameter import Parameter, Scaling
 from torchcal.simulators.points import PointCall, describe_point
 from torchcal.simulators.scattered import check_points, fit_scattered, scatter
 from torchcal.simulators.static import Conditions, Simulator, check_parameters, check_static

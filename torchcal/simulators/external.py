@@ -10,9 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchcal.checks import real_number
 from torchcal.errors import DomainError, ShapeError, SimulatorError
 from torchcal.simulators.executor import TaskError, check_executor, run_tasks
-from torchcal.simulators.parameter import Parameter, real_number
+from torchcal.simulators.parameter import Parameter
 from torchcal.simulators.points import ArrayCall, Forgiving, PointCall, Value, failed_evaluation, raised_at
 from torchcal.simulators.static import Conditions, Simulator, check_values
 

@@ -8,9 +8,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchcal.checks import real_number
 from torchcal.data import Recording, same_unit
 from torchcal.errors import DomainError, SimulatorError, UnitWarning, warn
-from torchcal.simulators.parameter import Parameter, real_number
+from torchcal.simulators.parameter import Parameter
 from torchcal.simulators.static import Conditions, Simulator, check_parameters
 from torchcal.simulators.trajectories import Trajectories
 

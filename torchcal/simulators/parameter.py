@@ -4,37 +4,17 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchcal.checks import real_number
 from torchcal.errors import DomainError, EmbeddingError, ShapeError
 
-__all__ = ["Parameter", "Scaling", "free_parameters", "in_run", "is_value_of", "real_number", "spans"]
+__all__ = ["Parameter", "Scaling", "free_parameters", "in_run", "is_value_of", "spans"]
 
 QUANTITY = "Give its magnitude in the parameter's unit, value.to(unit).magnitude."
 """What to do with a number that has a unit."""
-
-
-def real_number(value: Any) -> float:
-    """One real number, Python's, NumPy's or torch's, as a float; NaN of a string, a flag or anything else.
-
-    >>> [real_number(value) for value in (2, torch.tensor(0.5), "1", True, [1.0])]
-    [2.0, 0.5, nan, nan, nan]
-    """
-    dtype = getattr(value, "dtype", None)
-    if dtype is not None:
-        count = value.numel() if isinstance(value, Tensor) else getattr(value, "size", 0)
-        if count != 1 or getattr(dtype, "kind", "f") not in "iuf":
-            return math.nan
-        value = value.item()
-    if isinstance(value, str | bytes | bytearray | bool):
-        return math.nan
-    try:
-        return float(value)
-    except (TypeError, ValueError, OverflowError):
-        return math.nan
 
 
 def in_run(parameter: str, run: int) -> str:

@@ -15,11 +15,11 @@ import torch
 from torch import Tensor
 
 from torchcal import polychaos
-from torchcal.checks import whole
+from torchcal.checks import real_number, whole
 from torchcal.errors import DomainError, ExtrapolationWarning, ShapeError, SimulatorError, warn
 from torchcal.simulators.design import read_npz, write_npz
 from torchcal.simulators.held_out import NUMBERS, HeldOutError
-from torchcal.simulators.parameter import Parameter, Scaling, real_number
+from torchcal.simulators.parameter import Parameter, Scaling
 from torchcal.simulators.static import Conditions, Simulator, check_values
 
 __all__ = ["Box", "PolynomialSurrogate", "check_box", "warned_once"]
