@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 import torchcal as tc
 from examples.physics import cars, cooling_water, copper, data, mercury, photovoltaic, puromycin
 from torchcal.discovery import Diagnosis
+from torchcal.simulators import Trajectories
 
 integrate = pytest.importorskip("scipy.integrate")
 interpolate = pytest.importorskip("scipy.interpolate")
@@ -498,6 +499,15 @@ def test_relativity_is_named(years: float):
     assert estimates(diagnosis)["relativity.fraction"][0] == pytest.approx(1.0, abs=0.003)
     assert diagnosis.after.held_out.rmse < 0.01 * diagnosis.before.held_out.rmse
     assert diagnosis.remaining < 1e-4
+
+
+def test_every_candidate_of_mercury_can_be_evaluated():
+    needs_ephemeris()
+    candidates, recording = mercury.candidates(0.2), mercury.recording(0.2)
+    bound = Trajectories(tc.terms.extend(mercury.simulator(0.2), candidates), recording)
+    neutral = [q.initial if q.neutral is None else q.neutral for q in bound.parameters]
+    values = torch.tensor([[0.0 if value is None else value for value in neutral]], dtype=torch.float64)
+    assert bool(bound.linearise(recording.x, values, recording.outputs, []).y.isfinite().all())
 
 
 # --- loading -----------------------------------------------------------------------------------------------

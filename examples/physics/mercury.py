@@ -209,6 +209,7 @@ def _about(ellipse: Ellipse, term: tc.Term) -> tc.Term:
         formula=term.formula,
         description=term.description,
         scales=term.scales,
+        constants=term.constants,
     )
 
 
