@@ -56,6 +56,13 @@ def named(terms, *names):
     return [next(term for term in terms if term.name == name) for name in names]
 
 
+of_two_or_three = pytest.mark.parametrize(
+    "among",
+    [("quadratic drag", "bias force"),
+     pytest.param(("quadratic drag", "cubic stiffness", "bias force"), marks=pytest.mark.slow)],
+)  # fmt: skip
+
+
 def estimate_of(d, name):
     return next(e for e in d.final.estimates if e.name == name)
 
@@ -467,11 +474,7 @@ def test_the_proposed_experiment_tells_the_tied_apart(softening):
     assert d.terms == ["large-angle sine"]
 
 
-@pytest.mark.parametrize(
-    "among",
-    [("quadratic drag", "bias force"),
-     pytest.param(("quadratic drag", "cubic stiffness", "bias force"), marks=pytest.mark.slow)],
-)  # fmt: skip
+@of_two_or_three
 def test_an_effect_outside_the_library_is_unexplained(among):
     library = named(tc.terms.mechanics(), *among)
     outside = tc.Term(
@@ -522,11 +525,7 @@ def test_one_term_at_most_where_asked():
     assert len(d.terms) <= 1
 
 
-@pytest.mark.parametrize(
-    "among",
-    [("quadratic drag", "bias force"),
-     pytest.param(("quadratic drag", "cubic stiffness", "bias force"), marks=pytest.mark.slow)],
-)  # fmt: skip
+@of_two_or_three
 def test_an_effect_in_a_region_is_found_there(among):
     library = named(tc.terms.mechanics(), *among)
     gate = tc.Term(

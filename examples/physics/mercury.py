@@ -31,6 +31,7 @@ Runs as ``python -m examples.physics.mercury`` (4 years; ``--years 40`` takes it
 """
 
 import argparse
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -202,15 +203,7 @@ def _about(ellipse: Ellipse, term: tc.Term) -> tc.Term:
 
         return rate
 
-    return tc.Term(
-        term.name,
-        rates={state: whole(function) for state, function in term.rates.items()},
-        parameters=term.parameters,
-        formula=term.formula,
-        description=term.description,
-        scales=term.scales,
-        constants=term.constants,
-    )
+    return dataclasses.replace(term, rates={state: whole(function) for state, function in term.rates.items()})
 
 
 def main(argv: Sequence[str] | None = None) -> None:

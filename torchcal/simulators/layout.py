@@ -1,6 +1,7 @@
 """What each number is that the trajectories of a recording depend on: parameters, each run's own, initial states."""
 
 import dataclasses
+import functools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -110,7 +111,6 @@ class Layout:
                     parameters.append(Parameter(name, unit=unit, initial=guess, per_run=len(runs) > 1))
             self._initial.append(known)
         self.parameters = tuple(parameters)
-        self._fixed_slopes: Tensor | None = None
 
     @property
     def nuisance(self) -> tuple[str, ...]:
@@ -208,11 +208,16 @@ class Layout:
 
     def start_slopes(self, values: Tensor) -> Tensor:
         """∂ initial states / ∂ columns, ``(H, R, S, P)``."""
-        if any(callable(value) for known in self._initial for value in known.values()):
+        if self._fixed_slopes is None:
             return self._start_slopes(values)
-        if self._fixed_slopes is None:  # numbers, columns and other states, whatever their values are
-            self._fixed_slopes = self._start_slopes(values.new_zeros(1, values.shape[-1]))
         return self._fixed_slopes.to(values).expand(len(values), -1, -1, -1)
+
+    @functools.cached_property
+    def _fixed_slopes(self) -> Tensor | None:
+        """Of numbers, columns and other states, the same at all values; None where an initial state is a function."""
+        if any(callable(value) for known in self._initial for value in known.values()):
+            return None
+        return self._start_slopes(torch.zeros(1, len(self.parameters), dtype=torch.float64))
 
     def _start_slopes(self, values: Tensor) -> Tensor:
         with torch.enable_grad():
