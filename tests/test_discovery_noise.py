@@ -709,3 +709,72 @@ def test_data_that_scatter_by_more_than_the_noise_that_was_given_are_told_to():
         assert bool(re.search(r"could show, if the noise is [23]\.\d times as large as given\)", told)) is larger, told
         assert ("data beside each other differ by more than the noise that was given" in told) is larger
         assert (d.settings["larger_noise"] != "") is larger
+
+
+CURVE = tc.Simulator(
+    lambda x, p: p["a"] + p["b"] * x + p["c"] * x**2,
+    [tc.Parameter("a"), tc.Parameter("b"), tc.Parameter("c", neutral=0.0)],
+)
+
+
+def given_half(y, sd=0.05):
+    """A diagnosis of a curve with white noise of 0.1, of which another sd was given."""
+    x = torch.linspace(0, 2, len(y), dtype=F64)
+    return tc.diagnose(CURVE, tc.Recording(x=x, y=y, noise=sd), [tc.Term("bend", frees=["c"])], progress=False)
+
+
+def test_noise_of_twice_the_sd_that_was_given_is_no_physics():
+    x = torch.linspace(0, 2, 60, dtype=F64)
+    trials, source = 12, []
+    for seed in range(trials):
+        d = given_half(1 + x + draw(60, 0.1, 300 + seed))
+        assert d.verdict == "consistent"
+        source.append(d.noise.source)
+        if d.noise.source == "estimated":
+            assert "if the noise is " in str(d).splitlines()[0]
+            assert "Noise sd (estimated, larger than given)" in str(d)
+            assert float(d.noise.sd["y"]) == pytest.approx(0.1, rel=5 / math.sqrt(2 * 50))
+            assert d.settings["larger_noise"].startswith(" is ")
+    assert source.count("estimated") > trials / 2
+
+
+def test_what_is_missing_is_named_beside_noise_of_twice_the_sd_that_was_given():
+    x = torch.linspace(0, 2, 60, dtype=F64)
+    for seed in range(4):
+        d = given_half(1 + x + 0.6 * x**2 + draw(60, 0.1, 300 + seed))
+        assert (d.verdict, d.terms, d.noise.source) == ("named", ["bend"], "estimated"), str(d)
+        told = " ".join(str(d).split())
+        assert re.match(r"Verdict: named: bend, if the noise is [12]\.\d times as large as given", told)
+        assert "With the noise that was given nothing explains these data, as neighbours differ by more" in told
+        (estimate,) = [e for e in d.ranking[0].estimates if e.name == "c"]
+        assert abs(estimate.value - 0.6) < 4 * estimate.sd
+
+
+def test_what_nothing_explains_with_larger_noise_either_is_told_with_the_noise_that_was_given():
+    x = torch.linspace(0, 2, 60, dtype=F64)
+    for sd in (0.1, 0.03):
+        d = given_half(1 + x + 0.5 * torch.sin(6 * x) + draw(60, 0.1, 300), sd)
+        assert (d.verdict, d.noise.source) == ("unexplained", "given")
+        assert any("fastest part" in row for row in d.symptoms) is (sd < 0.1)
+
+
+def test_a_given_noise_that_varies_keeps_its_pattern_where_it_is_larger():
+    x = torch.linspace(0, 2, 60, dtype=F64)
+    sizes = torch.linspace(0.02, 0.2, 60, dtype=F64)
+    d = given_half(1 + x + sizes * draw(60, 1.0, 301), sizes / 3)
+    assert (d.verdict, d.noise.source) == ("consistent", "estimated")
+    low, high = d.noise.range["y"]
+    assert high / low == pytest.approx(10, rel=1e-6)
+    assert float(d.noise.sd["y"]) == pytest.approx(float(sizes.median()), rel=5 / math.sqrt(2 * 50))
+
+
+def test_a_given_noise_that_is_right_is_kept(monkeypatch):
+    asked = []
+    with_noise = tc.Recording.with_noise
+    monkeypatch.setattr(tc.Recording, "with_noise", lambda self, noise: asked.append(noise) or with_noise(self, noise))
+    x = torch.linspace(0, 2, 60, dtype=F64)
+    for seed in range(8):
+        for effect in (0.0, 0.6):
+            d = given_half(1 + x + effect * x**2 + draw(60, 0.1, 300 + seed), 0.1)
+            assert d.noise.source == "given"
+    assert len(asked) <= most(16, 0.03)

@@ -495,7 +495,7 @@ def searched(*args):
     found = []
     with pytest.MonkeyPatch.context() as patch:
         spy = lambda search: (refit_nameless(search), found.append(search))  # noqa: E731
-        patch.setattr(sys.modules["torchcal.discovery.diagnose"], "refit_nameless", spy)
+        patch.setattr(sys.modules["torchcal.discovery.judged"], "refit_nameless", spy)
         d = diagnose(*args)
     return d, found[-1]
 
@@ -763,7 +763,7 @@ def test_a_level_at_the_end_of_a_condition_is_a_window():
 def test_a_constant_of_one_sign_has_no_name_with_the_other(monkeypatch, low, high, side):
     """A push was a window of another term, as a loss that cannot push was in the list."""
     seen = []
-    monkeypatch.setattr(sys.modules["torchcal.discovery.diagnose"], "refit_nameless", seen.append)
+    monkeypatch.setattr(sys.modules["torchcal.discovery.judged"], "refit_nameless", seen.append)
     monkeypatch.setattr("torchcal.discovery.rounds.refit_local", lambda search: None)
     time = torch.linspace(0, 20, 41, dtype=torch.float64)
     base = tc.ODESimulator(
@@ -790,7 +790,7 @@ def test_a_constant_of_one_sign_has_no_name_with_the_other(monkeypatch, low, hig
 def test_a_constant_of_two_equations_takes_no_nameless_change_of_both(monkeypatch):
     """What one loses the other gains: no single sign is that of both."""
     seen = []
-    monkeypatch.setattr(sys.modules["torchcal.discovery.diagnose"], "refit_nameless", seen.append)
+    monkeypatch.setattr(sys.modules["torchcal.discovery.judged"], "refit_nameless", seen.append)
     monkeypatch.setattr("torchcal.discovery.rounds.refit_local", lambda search: None)
     time = torch.linspace(0, 20, 41, dtype=torch.float64)
     base = tc.ODESimulator(

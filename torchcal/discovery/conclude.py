@@ -20,6 +20,7 @@ from torchcal.discovery.hypotheses import verify
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.own_noise import beside
 from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.judged import Judged
 from torchcal.discovery.misfit.embedded import embed_each, model_error_sd
 from torchcal.discovery.misfit.noise import Noise
 from torchcal.discovery.records import Scores, Table
@@ -63,25 +64,15 @@ class Asked:
     feasible: Feasible
 
 
-def conclude(
-    search: Search,
-    decision: Decision,
-    mask: Tensor | None,
-    asked: Asked,
-    *,
-    suspect: tuple[str, ...] = (),
-    interrupted: str = "",
-) -> Diagnosis:
+def conclude(judged: Judged, asked: Asked, *, interrupted: str = "") -> Diagnosis:
     """The diagnosis of a search that has ended.
 
     Args:
-        search: With its models; estimates of noise are still made for those that are told.
-        decision: The verdict on them.
-        mask: Which data are held out, or None.
+        judged: The search and the verdict; estimates of noise are still made for the models that are told.
         asked: By the user.
-        suspect: Terms that may explain what was set aside as outliers.
         interrupted: In words, or empty.
     """
+    search, decision, mask = judged.search, judged.decision, judged.mask
     best = decision.best
     if best is not None and (found := explain.deeper(search, best)) is not None:
         best.found, best.structure, best.residual = found, None, None
@@ -104,6 +95,7 @@ def conclude(
     aside = asked.recording.observed_once & ~search.problem.keep
     apart += side_by_side(search.problem, final.residual / search.noise.sd, aside)
     any_unlike = bool(apart)
+    larger_noise = judged.larger_noise or larger_than_given(search, best)
     if decision.verdict != "consistent":
         apart = [*unbounded(search), *begun_elsewhere(search), *more_than_replicates(search, left), *apart]
         # Of what has no name the best fit tells the noise: the base leaves the misfit too, which goes on along rows.
@@ -136,7 +128,7 @@ def conclude(
         before=before,
         after=after,
         improved=improved,
-        symptoms=[*apart, *symptoms(search, best)],
+        symptoms=[*apart, *symptoms(search, best, larger_noise)],
         noise=dataclasses.replace(
             _told_noise(search, decision, 1.0 - asked.confidence).record(search.problem), enlarged=search.coarser
         ),
@@ -175,8 +167,8 @@ def conclude(
             "nearly": decision.nearly,
             "lost": lost,
             "unlike": any_unlike,
-            "larger_noise": larger_than_given(search, best),
-            "set_aside": suspect,
+            "larger_noise": larger_noise,
+            "set_aside": judged.suspect,
             "interrupted": interrupted,
             "region": None if best is None else best.where,
             "solver": _solver(search.problem.simulator),

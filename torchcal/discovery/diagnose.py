@@ -16,19 +16,15 @@ from torchcal.discovery.conclude import Asked, conclude
 from torchcal.discovery.findings.feasible import Feasible
 from torchcal.discovery.findings.result import Diagnosis
 from torchcal.discovery.fits.candidates import base_columns
-from torchcal.discovery.fits.fitting import Fitted, starts
+from torchcal.discovery.fits.fitting import starts
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.ranges import check_measured
 from torchcal.discovery.fits.trial import check_repeats, warn_if_coarse, warn_if_long
 from torchcal.discovery.hypotheses import verify
-from torchcal.discovery.hypotheses.own_noise import explains
 from torchcal.discovery.hypotheses.search import Search
-from torchcal.discovery.nameless import refit_nameless
-from torchcal.discovery.rounds import settle, with_all, with_explained, without_others
-from torchcal.discovery.several import refit_several
+from torchcal.discovery.judged import judged
 from torchcal.discovery.verdicts.decision import Decision
 from torchcal.discovery.verdicts.given import resolved, told_apart
-from torchcal.discovery.verdicts.verdict import decide
 from torchcal.display import NONE, units_of
 from torchcal.errors import DomainError, EmbeddingError, InterruptionWarning, RecordingError, UnitWarning, warn
 from torchcal.simulators import ODESimulator, Simulator, is_value_of
@@ -156,30 +152,11 @@ def diagnose(
                 search.calibrate_base()
             if holdout is not None and mask is not None:
                 verify.check_left(search.base, mask)
-            if holdout is None and mask is not None and _beyond_prediction(search, search.base, mask):
-                mask = verify.within(recording)
-            search, detected = settle(search, problem, confidence)
-            suspect: tuple[str, ...] = ()
-            aside = search.problem.n < problem.n and not search.stop.is_set()
-            if terms and aside and not (detected and explains(search)):
-                # What the best model misses is no outlier of it; where there is none, all physics may have been set
-                # aside.
-                every, suspect = with_all(search, problem, detected, confidence)
-                if every is not None:
-                    search, detected = every, True
-            if detected and terms and not search.stop.is_set():
-                refit_several(search)
-                search = with_explained(search, problem, confidence) or without_others(search, problem)
-                refit_nameless(search)
-            decision = decide(search, detected, mask)
-            best = decision.best or (search.physical_leader if decision.verdict == "ambiguous" else None)
-            if holdout is None and mask is not None and best and _beyond_prediction(search, best.found, mask):
-                mask = verify.within(recording)
-                decision = decide(search, detected, mask)
-            interrupted = _interruption(search)
+            found = judged(search, problem, mask, confidence, movable=holdout is None)
+            interrupted = _interruption(found.search)
             if interrupted:
-                _hold_back(search, decision)
-            return conclude(search, decision, mask, asked, suspect=suspect, interrupted=interrupted)
+                _hold_back(found.search, found.decision)
+            return conclude(found, asked, interrupted=interrupted)
     finally:
         bar.close()
 
@@ -265,13 +242,3 @@ def _contains(simulator: Simulator, term: Term) -> bool:
     if term.parameters:
         return all(term.full(q.name) in simulator.names for q in term.parameters)
     return set(term.frees) <= freed
-
-
-def _beyond_prediction(search: Search, found: Fitted, mask: Tensor) -> bool:
-    """Whether the rest of the data leaves a model so open that its predictions of the held-out ones mean nothing."""
-    apart = search.held_out(found, mask)
-    seen = mask & search.problem.keep
-    if apart is None or not bool(seen.any()):
-        return False
-    own = (apart.sd.square() - search.noise.sd.square()).clamp_min(0).sqrt()[seen]
-    return bool((own > search.problem.recording.spread[seen]).any())

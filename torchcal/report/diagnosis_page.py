@@ -330,6 +330,8 @@ def _noise(diagnosis: Any, units: Mapping[str, str]) -> str:
     text = known.get(noise.source, str(noise.source))
     if (times := getattr(noise, "enlarged", 1.0)) > 1:
         text = f"Noise sd given, and taken for {times:.2g} times as large, since arithmetic cannot weigh it."
+    if noise.source != "given" and getattr(diagnosis, "settings", {}).get("larger_noise"):
+        text += " It is larger than given."
     if noise.outliers:
         text += f" Samples set aside as outliers: {noise.outliers}."
     rows = [

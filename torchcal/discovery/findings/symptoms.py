@@ -32,8 +32,11 @@ COMPARED, UNLIKE, RATIO = 12, 0.01, 2.0
 SCATTER, MEANS, RARELY = 1.5, 8, 0.005
 
 
-def symptoms(search: Search, best: Model | None) -> list[str]:
-    """Calibrated values, and sizes of the residual, that give the mismatch away, in words."""
+def symptoms(search: Search, best: Model | None, larger: str) -> list[str]:
+    """Calibrated values, and sizes of the residual, that give the mismatch away, in words.
+
+    ``larger`` is what `larger_than_given` says.
+    """
     base, then = search.base, {}
     if best is not None:
         then = {e.name: e for e in estimates(best.found, range(len(best.found.values)))}
@@ -54,7 +57,7 @@ def symptoms(search: Search, best: Model | None) -> list[str]:
             f"{count} of {search.problem.recording.n} rows are others once more, numbers and all, as of a table or a "
             "run that was read twice: they count once"
         )
-    if larger := larger_than_given(search, best):
+    if larger:
         rows.append(f"the fastest part of the residual{larger} the noise sd that was given")
     if search.coarser > 1:
         rows.append(

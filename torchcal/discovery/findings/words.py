@@ -32,7 +32,7 @@ def paragraph(d: Any) -> str:
         "unexplained": unexplained,
     }[d.verdict](d)
     lines = [_headline(d), ""]
-    said = [_detected(d), _lost(d), *parts, _set_aside(d), d.settings.get("interrupted")]
+    said = [_detected(d), _lost(d), *parts, _larger(d), _set_aside(d), d.settings.get("interrupted")]
     text = " ".join(part for part in said if part)
     lines += textwrap.wrap(text, 100)
     for title, rows in (("Equation", d.equations), ("Symptoms", d.symptoms), ("Not identified", d.identifiability)):
@@ -59,11 +59,10 @@ def _headline(d: Any) -> str:
     if d.verdict == "consistent":
         sign = likelier(d) or d.settings.get("unlike") or d.p_detect < 1 - d.confidence
         told = "nothing is surely missing" if sign else "nothing is missing that these data could show"
-        larger = d.settings.get("larger_noise")
-        told += f", if the noise{larger} as large as given" if larger else ""
-        return f"Verdict: consistent ({told})"
+        return f"Verdict: consistent ({told}{_if_larger(d)})"
     if d.verdict == "named":
-        return f"Verdict: named: {joined([with_region(d, name) for name in d.terms])}{_company(d)}"
+        larger = _if_larger(d) if d.noise.source != "given" else ""
+        return f"Verdict: named: {joined([with_region(d, name) for name in d.terms])}{_company(d)}{larger}"
     if d.verdict == "ambiguous":
         known = [tied for tied in d.tied if tuple(tied) != NONE]
         if len(known) == 1 and unknown_share(d) < LISTED:
@@ -74,6 +73,12 @@ def _headline(d: Any) -> str:
         choices += [called(d, NONE)] if len(known) < len(d.tied) else []
         return "Verdict: ambiguous: " + ", or ".join(choices)
     return "Verdict: unexplained (something is missing that is not in this library)"
+
+
+def _if_larger(d: Any) -> str:
+    """On which noise the verdict rests."""
+    larger = d.settings.get("larger_noise")
+    return f", if the noise{larger} as large as given" if larger else ""
 
 
 def _company(d: Any) -> str:
@@ -102,7 +107,9 @@ def _detected(d: Any) -> str:
         unit = rmse_unit(d)
         return f"The recording is declared free of noise; the calibrated base leaves an RMSE of {rmse:.4g}{unit}."
     times = getattr(noise, "enlarged", 1.0)
-    text = f"Noise sd ({noise.source}{f', and taken for {times:.2g} times as large' if times > 1 else ''}): {sd}"
+    source = noise.source + (f", and taken for {times:.2g} times as large" if times > 1 else "")
+    source += ", larger than given" if noise.source != "given" and d.settings.get("larger_noise") else ""
+    text = f"Noise sd ({source}): {sd}"
     correlated = [f"{name} {c:.2f}" for name, c in noise.correlation.items() if c >= 0.05]
     over = {"time": "over the usual gap", "sample": "from sample to sample, however far apart"}
     how = over.get(noise.memory, "from sample to sample")
@@ -119,6 +126,16 @@ def _lost(d: Any) -> str:
     return (
         "The calibrated base explains no more than a constant would: before anything is called missing, or nothing, "
         "look at its units, and give initial= or bounds to its parameters, as its best fit may not have been found."
+    )
+
+
+def _larger(d: Any) -> str:
+    """What a name rests on that takes the noise for larger than it was given."""
+    if d.verdict == "consistent" or d.noise.source == "given" or not d.settings.get("larger_noise"):
+        return ""
+    return (
+        "With the noise that was given nothing explains these data, as neighbours differ by more: it is larger, or "
+        "something else acts that changes from one datum to the next."
     )
 
 

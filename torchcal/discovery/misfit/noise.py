@@ -35,7 +35,7 @@ FLOOR = 1e-7
 #: Ratio of the largest to the smallest sd of an output from which on both are told.
 VARIES = 1.05
 #: How much larger the noise found may be than the noise given before the given one is doubted.
-EXCESS = 1.5
+EXCESS = 1.1
 
 
 @dataclass(frozen=True, eq=False)

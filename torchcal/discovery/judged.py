@@ -1,0 +1,118 @@
+"""A search and its verdict, with the noise that was given, or with its own where that explains nothing."""
+
+import dataclasses
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcal.discovery.findings.symptoms import larger_than_given
+from torchcal.discovery.fits.fitting import Fitted
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.hypotheses import verify
+from torchcal.discovery.hypotheses.model import Model
+from torchcal.discovery.hypotheses.own_noise import explains
+from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.misfit.noise import mine
+from torchcal.discovery.nameless import refit_nameless
+from torchcal.discovery.rounds import settle, with_all, with_explained, without_others
+from torchcal.discovery.several import refit_several
+from torchcal.discovery.verdicts.decision import Decision
+from torchcal.discovery.verdicts.verdict import decide
+
+__all__ = ["Judged", "judged"]
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """A search that has ended, and the verdict.
+
+    Attributes:
+        search: With its models.
+        decision: The verdict on them.
+        mask: Which data are held out, or None.
+        suspect: Terms that may explain what was set aside as outliers.
+        larger_noise: How many times larger than given the noise was taken to be, as `larger_than_given`; or empty.
+    """
+
+    search: Search
+    decision: Decision
+    mask: Tensor | None
+    suspect: tuple[str, ...] = ()
+    larger_noise: str = ""
+
+    @property
+    def best(self) -> Model | None:
+        """What is named, or else the best of what is tied."""
+        tied = self.search.physical_leader if self.decision.verdict == "ambiguous" else None
+        return self.decision.best or tied
+
+
+def judged(search: Search, problem: Problem, mask: Tensor | None, confidence: float, *, movable: bool) -> Judged:
+    """The verdict of a search whose base is calibrated.
+
+    A noise sd is often that of an instrument's data sheet. Where what changes from datum to datum contradicts the one
+    that was given, it is estimated instead, unless the data are explained with the one and not with the other.
+
+    Args:
+        search: With its base calibrated.
+        problem: All the data.
+        mask: Which data are held out, or None.
+        confidence: As for `diagnose`.
+        movable: Whether other data may be held out, where the rest leaves a model too open to predict these.
+    """
+    found = _judge(search, problem, mask, confidence, movable)
+    before = found.decision.verdict
+    larger = "" if before == "named" or search.stop.is_set() else larger_than_given(found.search, found.best)
+    if not larger:
+        return found
+    problem = dataclasses.replace(problem, recording=problem.recording.with_noise(None))
+    search = dataclasses.replace(search, problem=problem, unit=_pattern(problem, found.search.noise.sd), coarser=1.0)
+    search.calibrate_base()
+    other = _judge(search, problem, mask, confidence, movable)
+    after = other.decision.verdict
+    if search.stop.is_set() or after == "unexplained" or (before == "consistent" and after != before):
+        return found
+    return dataclasses.replace(other, larger_noise=larger)
+
+
+def _judge(search: Search, problem: Problem, mask: Tensor | None, confidence: float, movable: bool) -> Judged:
+    if movable and mask is not None and _beyond_prediction(search, search.base, mask):
+        mask = verify.within(problem.recording)
+    search, detected = settle(search, problem, confidence)
+    suspect: tuple[str, ...] = ()
+    aside = search.problem.n < problem.n and not search.stop.is_set()
+    if search.terms and aside and not (detected and explains(search)):
+        # What the best model misses is no outlier of it; where there is none, all physics may have been set aside.
+        every, suspect = with_all(search, problem, detected, confidence)
+        if every is not None:
+            search, detected = every, True
+    if detected and search.terms and not search.stop.is_set():
+        refit_several(search)
+        search = with_explained(search, problem, confidence) or without_others(search, problem)
+        refit_nameless(search)
+    found = Judged(search, decide(search, detected, mask), mask, suspect)
+    best = found.best
+    if movable and mask is not None and best and _beyond_prediction(search, best.found, mask):
+        mask = verify.within(problem.recording)
+        found = dataclasses.replace(found, decision=decide(search, detected, mask), mask=mask)
+    return found
+
+
+def _pattern(problem: Problem, sd: Tensor) -> Tensor | None:
+    """Sizes of a noise ``(n_total,)`` in units of their median by output; None where each output has one size."""
+    unit = sd.clone()
+    for output in range(len(problem.recording.outputs)):
+        of = mine(problem, output)
+        unit[of] /= unit[of].median()
+    return None if torch.allclose(unit, torch.ones_like(unit)) else unit
+
+
+def _beyond_prediction(search: Search, found: Fitted, mask: Tensor) -> bool:
+    """Whether the rest of the data leaves a model so open that its predictions of the held-out ones mean nothing."""
+    apart = search.held_out(found, mask)
+    seen = mask & search.problem.keep
+    if apart is None or not bool(seen.any()):
+        return False
+    own = (apart.sd.square() - search.noise.sd.square()).clamp_min(0).sqrt()[seen]
+    return bool((own > search.problem.recording.spread[seen]).any())
