@@ -10,8 +10,9 @@ from torch.autograd import forward_ad
 
 import torchcal as tc
 from torchcal.discovery.fits.candidates import Candidate
-from torchcal.discovery.fits.fitting import FINISH, finished, fit, refit, starts
+from torchcal.discovery.fits.fitting import FINISH, finished, fit, refit
 from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.fits.starts import starts
 from torchcal.discovery.hypotheses import refitting
 from torchcal.discovery.hypotheses.base import calibrate_base
 from torchcal.discovery.misfit.noise import GRID, Noise

@@ -1,6 +1,7 @@
 """What looks like an instrument and may be a change of the physics that has no name, and where that is located."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -192,3 +193,45 @@ def test_what_is_correlated_along_the_rows_of_a_grid_is_told():
     shuffled = rng.permutation(len(x))  # the same in another order, which tells nothing
     again = tc.Recording(x={"x": x[shuffled], "L": load[shuffled]}, y=(1 + x * load + 0.05 * e)[shuffled], noise=0.05)
     assert not any("correlated from row to row" in row for row in diagnose(model, again, []).symptoms)
+
+
+# --- terms in a range that another condition of few levels takes the shape from --------------------------------------
+
+
+def flights(seed, currents, *, strong=0.0, walk=0.0, sd=0.003):
+    """Flight times of ions at a few currents: late for strong peaks around one mass, or with a walk of the
+    discriminator in a range of masses."""
+    mass, current = (v.ravel() for v in np.meshgrid(np.linspace(25, 1000, 40), currents, indexing="ij"))
+    t = 0.3 + 2.6 * np.sqrt(mass)
+    t += strong * (current == max(currents)) * np.exp(-0.5 * ((mass - 350) / 90) ** 2)
+    t += walk * np.log(current) * ((mass > 200) & (mass < 500))
+    t += sd * np.random.default_rng(seed).standard_normal(len(t))
+    base = tc.Simulator(
+        lambda x, p: p["t0"] + p["a"] * torch.sqrt(x["m"]),
+        [tc.Parameter("t0", initial=0.2), tc.Parameter("a", initial=2.5)],
+    )
+    terms = [
+        tc.Term("walk", outputs={"y": lambda x, p, y: y + p["w"] * torch.log(x["I"])}, parameters=[tc.Parameter("w")]),
+        tc.Term("space charge", shifts={"a": lambda x, p: p["a"] * p["c"] * x["I"]}, parameters=[tc.Parameter("c")]),
+    ]
+    return base, tc.Recording(x={"m": mass, "I": current}, y=t, noise=sd), terms
+
+
+def test_a_term_in_a_range_is_no_name_where_two_levels_alone_show_its_shape():
+    d = diagnose(*flights(1, [1.0, 4.0], strong=0.02))
+    assert d.verdict == "ambiguous"
+    assert list(NONE) in d.tied
+    (row,) = [row for row in d.ranking if row.terms == NONE]
+    assert re.match(r"a change of a where I = 4 and \d+.* < m < \d+", row.note)
+    assert re.search(r"jumps with m \(at [^)]*\) where I = 4: one constant change in between", " ".join(str(d).split()))
+    true = diagnose(*flights(1, [1.0, 4.0], walk=0.01))
+    assert true.verdict == "ambiguous"
+    assert true.tied[0] == ["walk"]
+    assert "in a range of m would do nearly as well" in true.settings["doubt"]
+
+
+def test_a_term_in_a_range_is_named_where_more_levels_show_its_shape():
+    for seed in range(2):
+        d = diagnose(*flights(seed, [1.0, 2.0, 4.0, 8.0], walk=0.01))
+        assert (d.verdict, d.terms) == ("named", ["walk"])
+        assert diagnose(*flights(seed, [1.0, 2.0, 4.0, 8.0], strong=0.02)).verdict == "unexplained"

@@ -15,8 +15,9 @@ import torchcal as tc
 from torchcal.discovery import rounds
 from torchcal.discovery.findings import conditions
 from torchcal.discovery.findings.words import paragraph
-from torchcal.discovery.fits.fitting import starts
 from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.fits.starts import follow_slopes, starts
+from torchcal.discovery.hypotheses.base import calibrate_base
 
 F64 = torch.float64
 
@@ -239,6 +240,70 @@ def test_rates_are_guessed_from_the_length_of_long_runs():
     d = diagnose(base, recording, list(tc.terms.sensor("y", dynamic=False)))
     assert d.verdict == "consistent"
     assert float(d.base.estimates[0].value) == pytest.approx(8e-8, rel=0.02)
+
+
+def sugars(seed=0):
+    """Cells that eat a second sugar, which nobody records, once the first is gone; what both runs began with of it is
+    unknown."""
+    t = torch.cat([torch.linspace(0, 6, 10, dtype=F64), torch.linspace(6.5, 14, 20, dtype=F64)])
+
+    def rates(t, s, p, u):
+        first, second = torch.relu(s["S1"]), torch.relu(s["S2"])
+        a = p["mu1"] * first / (p["K1"] + first)
+        b = p["mu2"] * second / (0.1 + second) * p["Ki"] / (p["Ki"] + first)
+        return {"X": (a + b) * s["X"], "S1": -a * s["X"] / p["Y"], "S2": -b * s["X"] / 0.4}
+
+    limits = {"mu1": (0.05, 2, 0.5), "K1": (0.01, 3, 0.4), "mu2": (0.02, 2, 0.25), "Ki": (0.01, 5, 0.3),
+              "Y": (0.1, 1, 0.5)}  # fmt: skip
+    parameters = [tc.Parameter(name, low=low, high=high, initial=at) for name, (low, high, at) in limits.items()]
+    base = tc.ODESimulator(rates, {"X": "g/L", "S1": "g/L", "S2": "g/L"}, parameters, observe=("X", "S1"))
+    begun = [{"X": 0.15, "S1": 4.0}, {"X": 0.4, "S1": 6.0}]
+    empty = tc.Recording(runs=[
+        tc.Run(t, {"X": torch.zeros(30), "S1": torch.zeros(30)}, initial={**first, "S2": second})
+        for first, second in zip(begun, (5.0, 3.0), strict=True)
+    ])  # fmt: skip
+    true = torch.tensor([0.55, 0.3, 0.3, 0.25, 0.45], dtype=F64)
+    y = Problem.of(base, empty).evaluate(true[None], [])[0][0]
+    sd = torch.tensor([0.02, 0.03]).repeat_interleave(60)
+    values = empty.split(y + sd * torch.tensor(np.random.default_rng(seed).normal(size=len(y))))
+    runs = [
+        tc.Run(t, {name: each[30 * k : 30 * k + 30] for name, each in values.items()}, initial=first)
+        for k, first in enumerate(begun)
+    ]
+    return base, tc.Recording(runs=runs, noise={"X": 0.02, "S1": 0.03})
+
+
+def test_a_state_that_nothing_records_is_guessed_like_those_in_its_unit():
+    problem = Problem.of(*sugars())
+    guesses = starts(problem, 12, 0)[:, -2:]
+    assert bool((guesses[1::2] >= 0).all())  # an amount
+    assert float(guesses[1::2].mean()) == pytest.approx(2.0, abs=1.0)
+    assert float(guesses[0].abs().max()) == 0
+    ball = tc.ODESimulator(
+        lambda t, s, p, u: {"z": s["v"], "v": -p["g"] + 0 * s["v"]},
+        {"z": "m", "v": "m/s"},
+        [tc.Parameter("g", low=0.0)],
+    )
+    t = torch.linspace(0, 1, 20, dtype=F64)
+    fall = Problem.of(ball, tc.Recording(runs=[tc.Run(t, {"z": 500 + 7 * t - 4.9 * t**2})]))
+    others = starts(fall, 12, 0)
+    assert float(others[:, -1].abs().max()) < 4  # in another unit: of no known size
+    moved = follow_slopes(fall, others)
+    torch.testing.assert_close(moved[::4, -1], torch.full((3,), 7.0, dtype=F64), atol=1e-6, rtol=0)
+
+
+def test_a_state_without_a_say_in_the_first_slope_is_left_where_it_was_guessed():
+    problem = Problem.of(*sugars())
+    begin = starts(problem, 12, 0)
+    torch.testing.assert_close(follow_slopes(problem, begin)[:, -2:], begin[:, -2:])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_base_is_found_where_a_state_that_nothing_records_takes_over_late(seed):
+    problem = Problem.of(*sugars(seed))
+    found, _ = calibrate_base(problem, {}, 12, 0)
+    assert found.chi2 < 120 + 5 * math.sqrt(2 * 120)
+    assert found.by_name["S2(0)[0]"] == pytest.approx(5.0, abs=5 * float(found.sd()[-2]))
 
 
 def test_a_mistake_in_a_term_is_told_as_this_terms():

@@ -3,7 +3,8 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,6 +17,7 @@ from torchcal.discovery.fits.local import (
     WIDTH_OF_EDGE,
     WIDTHS,
     Span,
+    driver_at,
     is_window,
     localised,
     multiplied,
@@ -37,6 +39,8 @@ MOVES = (0.0, -0.15, 0.15, -0.3, 0.3)
 FADING = "a fading "
 #: Relative size from which on two effects are independent.
 RANK = 1e-7
+#: Levels up to which a condition has so few that a change on one side of it does what a function of it does.
+FEW_LEVELS = 3
 
 
 def wanted_changes(
@@ -45,11 +49,12 @@ def wanted_changes(
     where: Places,
     prior: float,
     named: Mapping[Places | None, int],
-    only: Collection[str] = ("step", "edge", "grown", "faded"),
+    only: Collection[str] = ("step", "edge", "grown", "faded", "crossed"),
 ) -> tuple[list[Hypothetical], float]:
     """A constant in a model's window, with steep edges and with edges to fit; an open window closed as well, with a
-    change that grows from its end, and with one that fades towards it; or ``only`` some of these. And the least χ² of
-    all their beginnings, for linear."""
+    change that grows from its end, and with one that fades towards it; and, of a static recording, the best constant on
+    one side of another condition of few levels; or ``only`` some of these. And the least χ² of all their beginnings,
+    for linear."""
     w = model.window
     if w is None:
         return [], math.inf
@@ -67,18 +72,20 @@ def wanted_changes(
     side = named.get(where)  # what has a name is no nameless one, but with the other sign
     still = constant_change(where, search.problem.in_time, side=-(side or 0))
     edges = {"step": False, "edge": True}
-    shapes = [(kind, still, chosen) for chosen in ends for kind in edges] if side != 0 else []
+    shapes = [(kind, still, chosen, "") for chosen in ends for kind in edges] if side != 0 else []
     if len(ends) > 1:
         in_time, end = search.problem.in_time, ENDS["from" if math.isfinite(w.low) else "to"]
         grows = distance(w.driver, end, span, in_time)
-        shapes.append(("grown", constant_change(where, in_time, grows), ends[0]))
+        shapes.append(("grown", constant_change(where, in_time, grows), ends[0], ""))
         fading = fading_to(w.driver, end, span, in_time)
-        shapes.append(("faded", constant_change(where, in_time, fading), ends[0]))
+        shapes.append(("faded", constant_change(where, in_time, fading), ends[0], ""))
         term = search.candidates[model.numbers[0]].terms[0]
         if where == places_of(model.candidate) and not term.elapsed:  # whose t is not the window's
-            shapes.append(("faded", multiplied(term, f"{FADING}{term.name}", fading), ends[0]))
-    found, least = [], math.inf
-    for kind, change, chosen in shapes:
+            shapes.append(("faded", multiplied(term, f"{FADING}{term.name}", fading), ends[0], ""))
+    sides = _sides(search, w.driver) if side != 0 else []
+    shapes += [("crossed", multiplied(still, still.name, share), ends[0], at) for at, share in sides]
+    found, crossed, least = [], [], math.inf
+    for kind, change, chosen, at in shapes:
         if kind not in only:
             continue
         low, high = chosen[0]
@@ -92,10 +99,39 @@ def wanted_changes(
             begin, chi2 = _begin(search, model, candidate, chosen, span)
         except (SimulatorError, DomainError):
             continue
-        window = dataclasses.replace(w, low=low, high=high, span=near)
-        found.append(Hypothetical((), candidate, begin, prior, window))
+        window = dataclasses.replace(w, low=low, high=high, span=near, at=at)
+        one = Hypothetical((), candidate, begin, prior - (math.log(len(sides)) if at else 0.0), window)
+        if at:
+            crossed.append((chi2, one))
+        else:
+            found.append(one)
         least = min(least, chi2)
+    found += [one for _, one in sorted(crossed, key=lambda one: one[0])[:1]]
     return found, least
+
+
+def _sides(search: Search, driver: str) -> list[tuple[str, Callable[..., Any]]]:
+    """Every side of another condition of few levels, in words and as a share of a static term."""
+    if search.problem.in_time:
+        return []
+    found = []
+    for name, values in search.drivers().items():
+        levels = values.unique().tolist()
+        if name == driver or not 1 < len(levels) <= FEW_LEVELS:
+            continue
+        for low, high in itertools.pairwise(levels):
+            for sign in (-1, 1):
+                there = [level for level in levels if (level > low) is (sign > 0)]
+                cut = 0.5 * (low + high)
+                text = f"= {there[0]:.4g}" if len(there) == 1 else f"{'<>'[sign > 0]} {cut:.4g}"
+                found.append((f"{name} {text}", _beyond(name, cut, sign)))
+    return found
+
+
+def _beyond(condition: str, cut: float, sign: int) -> Callable[..., Any]:
+    """1 on one side of a value of a condition, else 0; of what a static term's functions are given."""
+    at = driver_at(condition, static=True)
+    return lambda *given: (sign * (at(*given) - cut) > 0).to(torch.float64)
 
 
 def in_any_window(search: Search, model: Model) -> Hypothetical | None:

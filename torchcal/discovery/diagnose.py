@@ -16,9 +16,9 @@ from torchcal.discovery.conclude import Asked, conclude
 from torchcal.discovery.findings.feasible import Feasible
 from torchcal.discovery.findings.result import Diagnosis
 from torchcal.discovery.fits.candidates import base_columns
-from torchcal.discovery.fits.fitting import starts
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.ranges import check_measured
+from torchcal.discovery.fits.starts import starts
 from torchcal.discovery.fits.trial import check_repeats, warn_if_coarse, warn_if_long
 from torchcal.discovery.hypotheses import verify
 from torchcal.discovery.hypotheses.search import Search

@@ -210,6 +210,7 @@ class Location:
         run: Of a change in one run of several alone, which, counted from 0.
         also: Kinds and targets of what else some terms together act on: what varies with the driver is then what they
             do together.
+        at: The levels of another condition at which it changes alone, in words; empty where it does at all.
     """
 
     kind: str
@@ -224,6 +225,7 @@ class Location:
     terms: tuple[str, ...] = ()
     run: int | None = None
     also: tuple[tuple[str, str], ...] = ()
+    at: str = ""
 
     @property
     def called(self) -> str:

@@ -130,7 +130,7 @@ def locate(
         share, evidence, extent = removed(search, local), _evidence(search, local), _extent(drivers)
         span = (low, high)
         if local is search.unnamed:
-            told: dict[str, Any] = {"edges": tuple(end for end in (w.low, w.high) if math.isfinite(end))}
+            told: dict[str, Any] = {"edges": tuple(end for end in (w.low, w.high) if math.isfinite(end)), "at": w.at}
         else:
             told = {"terms": local.names, "also": tuple(also)}
             span = _met(drivers, low, high) if _has_levels(search, w.driver) else span

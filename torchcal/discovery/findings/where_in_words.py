@@ -62,8 +62,9 @@ def where_in_words(d: Any) -> str:
             low, high = place.edges
             side = "in between" if any(low < 0.5 * sum(span) < high for span in place.spans) else "outside of these"
         at = with_unit(" and ".join(between([(edge, edge) for edge in place.edges], "to", place.extent)), unit)
+        alone = f" where {place.at}" if place.at else ""
         return (
-            f"The mismatch sits in the {place.called} and jumps with {place.driver} (at {at}): one "
+            f"The mismatch sits in the {place.called} and jumps with {place.driver} (at {at}){alone}: one "
             f"constant change {side} {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
         )
     return (

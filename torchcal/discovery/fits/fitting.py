@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.fits.problem import Problem, Whitening
-from torchcal.simulators import Solution, Trajectories
+from torchcal.simulators import Solution
 
-__all__ = ["Fitted", "finished", "fit", "follow_slopes", "refit", "starts", "weighed"]
+__all__ = ["Fitted", "finished", "fit", "refit", "weighed"]
 
 #: Relative change of χ² below which a fit has converged.
 TOLERANCE = 1e-7
@@ -24,10 +24,6 @@ PACE, FASTER = 0.05, 3.0
 AHEAD, TURN = 0.1, 0.75
 #: More steps of the best alone, where it has not converged in those: along a bent valley they are short.
 FINISH = 240
-#: Samples that the slope at the beginning is taken from.
-SLOPES = (12, 5, 24, 48)
-#: How many times longer or shorter than 1 a run must be for rates to be guessed from it.
-LONG = 30.0
 #: How far below the smallest start of a parameter on a logarithmic scale one begins that would not be positive.
 BELOW = 0.05
 
@@ -114,102 +110,6 @@ def _positive(values: Tensor, log: Tensor) -> Tensor:
     smallest = torch.where(values > 0, values, torch.full_like(values, torch.inf)).amin(0)
     small = torch.where(smallest.isfinite(), BELOW * smallest, torch.full_like(smallest, BELOW))
     return torch.where(log & (values <= 0), small, values)
-
-
-def starts(problem: Problem, count: int, seed: int, fixed: dict[int, float] | None = None) -> Tensor:
-    """Starting values ``(count, P)``: first guesses, then ever wilder ones within the bounds.
-
-    Of runs that are far from 1 long, in whatever unit, every second start guesses positive parameters of which nothing
-    is known as rates: about 1 over the length.
-    """
-    length = max((float(run.time[-1] - run.time[0]) for run in problem.recording.runs or ()), default=1.0)
-    rate = torch.ones(count, dtype=torch.float64)
-    if not 1 / LONG < length < LONG:
-        rate[1::2] = 1.0 / length
-    generator = torch.Generator().manual_seed(seed)
-    columns = []
-    spread = torch.linspace(0.0, 1.0, count, dtype=torch.float64) if count > 1 else torch.zeros(1, dtype=torch.float64)
-    for i, q in enumerate(problem.parameters):
-        noise = torch.randn(count, generator=generator, dtype=torch.float64) * spread
-        unit = torch.rand(count, generator=generator, dtype=torch.float64)
-        positive = q.transform == "log" or (q.low is not None and q.low >= 0)
-        if fixed is not None and i in fixed:
-            columns.append(torch.full((count,), fixed[i], dtype=torch.float64))
-            continue
-        if q.initial is not None and q.initial != 0:
-            guess = q.initial * noise.exp() if positive else q.initial + abs(q.initial) * noise
-        elif q.low is not None and q.high is not None:
-            at = 0.5 + (unit - 0.5) * spread if q.initial is None else spread * unit * 0.2
-            base = q.low if q.initial is None else q.initial
-            width = q.high - q.low
-            guess = base + at * width
-            if q.transform == "log":
-                guess = q.low * (q.high / q.low) ** at
-        elif positive:
-            guess = (1.5 * noise).exp() * rate + (q.low or 0.0)
-        else:
-            guess = (q.initial or 0.0) + noise
-        low = -torch.inf if q.low is None else q.low
-        high = torch.inf if q.high is None else q.high
-        columns.append(guess.clamp(low, high))
-    return torch.stack(columns, dim=-1)
-
-
-def follow_slopes(problem: Problem, begin: Tensor) -> Tensor:
-    """Unknown initial states moved so that observed states begin with the slope that was recorded.
-
-    An unobserved velocity, say, is then the recorded position's slope, whatever the other parameters are. The slope is
-    that of a parabola through the first samples, more or fewer of them from start to start.
-    """
-    bound = problem.simulator
-    if not isinstance(bound, Trajectories) or not bound.initial_names:
-        return begin
-    names = list(bound.ode.states)
-    targets: list[tuple[int, int, Tensor, float]] = []
-    for r, run in enumerate(bound.runs):
-        for name, y in run.outputs.items():
-            state = bound.ode.reads.get(name)
-            if state is None or name not in problem.recording.outputs:
-                continue
-            every = (~torch.isnan(y)).nonzero()[:, 0]
-            if len(every) < 4:
-                continue
-            slopes = []
-            for count in SLOPES:  # few samples are noisy, many are bent
-                seen = every[:count]
-                t = run.time[seen] - run.time[seen[0]]
-                design = torch.stack([torch.ones_like(t), t, t.square()], dim=-1)
-                slopes.append(torch.linalg.lstsq(design, y[seen][:, None]).solution[1, 0])
-            seen = every[: SLOPES[0]]
-            length = float(run.time[seen[-1]] - run.time[seen[0]])
-            scale = float((y[seen] - y[seen].mean()).abs().max()) / max(length, 1e-300)
-            each = torch.stack(slopes)[torch.arange(len(begin)) % len(SLOPES)]
-            targets.append((r, names.index(state), each, max(scale, 1e-12)))
-    if not targets:
-        return begin
-    places = [i for i, q in enumerate(problem.parameters) if q.name in bound.initial_names and q.initial is None]
-    if not places:
-        return begin
-    values = begin.clone()
-    for _ in range(3):
-        with torch.enable_grad():
-            leaf = values[:, places].clone().requires_grad_(True)
-            full = values.clone()
-            full[:, places] = leaf
-            rates = bound.slopes(full, bound.layout.start(full))
-            left = torch.stack([(rates[:, r, i] - slope) / scale for r, i, slope, scale in targets], dim=-1)
-            rows = [torch.autograd.grad(left[:, k].sum(), leaf, retain_graph=True, allow_unused=True)[0]
-                    if left.requires_grad else None for k in range(left.shape[1])]  # fmt: skip
-        jacobian = torch.stack([torch.zeros_like(leaf) if row is None else row for row in rows], dim=-2)
-        sound = torch.isfinite(jacobian).flatten(1).all(-1) & torch.isfinite(left).all(-1)
-        jacobian = torch.where(sound[:, None, None], jacobian, torch.zeros_like(jacobian))
-        left = torch.nan_to_num(left.detach(), nan=0.0, posinf=0.0, neginf=0.0)
-        change = torch.linalg.pinv(jacobian, rtol=1e-6) @ left.detach().unsqueeze(-1)
-        moved = values[:, places] - change[..., 0]
-        good = torch.isfinite(moved).all(-1)
-        values[good] = values[good].index_copy(1, torch.tensor(places), moved[good])
-    low, high = problem.limits()
-    return values.clamp(low, high)
 
 
 def fit(

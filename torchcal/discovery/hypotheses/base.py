@@ -8,9 +8,10 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.fits.candidates import base_columns
-from torchcal.discovery.fits.fitting import Fitted, fit, follow_slopes, refit, starts
+from torchcal.discovery.fits.fitting import Fitted, fit, refit
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.sharpen import SOLVER_SHARE, sharpen
+from torchcal.discovery.fits.starts import follow_slopes, starts
 from torchcal.discovery.misfit.growth import growth
 from torchcal.discovery.misfit.noise import Noise, estimate
 from torchcal.discovery.misfit.outliers import spikes

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.fits.candidates import Candidate, base_columns
-from torchcal.discovery.fits.fitting import Fitted, fit, follow_slopes, starts
+from torchcal.discovery.fits.fitting import Fitted, fit
+from torchcal.discovery.fits.starts import follow_slopes, starts
 from torchcal.discovery.hypotheses.screen import Screening
 from torchcal.discovery.misfit.residual import Residual
 from torchcal.errors import SimulatorError

@@ -62,7 +62,10 @@ class Model:
     def where(self) -> str | None:
         """Where it acts, if locally, in words."""
         w = self.window
-        return None if w is None else region_text(w.driver, w.low, w.high, w.span)
+        if w is None:
+            return None
+        region = region_text(w.driver, w.low, w.high, w.span)
+        return f"{w.at} and {region}" if w.at else region
 
     @property
     def weight(self) -> float:

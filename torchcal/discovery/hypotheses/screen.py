@@ -153,6 +153,7 @@ class Window:
         z: Score statistic.
         amplitude: Linear estimate of the amplitude.
         span: Scale on which its edges are laid out, once it is fitted.
+        at: The levels of another condition at which it acts alone, in words.
     """
 
     candidate: int
@@ -162,6 +163,7 @@ class Window:
     z: float
     amplitude: float
     span: Span | None = None
+    at: str = ""
 
 
 def contributions(

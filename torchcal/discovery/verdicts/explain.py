@@ -7,8 +7,9 @@ from collections.abc import Collection, Sequence
 import torch
 from torch import Tensor
 
-from torchcal.discovery.fits.fitting import Fitted, fit, starts
+from torchcal.discovery.fits.fitting import Fitted, fit
 from torchcal.discovery.fits.local import ENDS, WIDTH_OF_EDGE, is_window
+from torchcal.discovery.fits.starts import starts
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.screen import Window
 from torchcal.discovery.hypotheses.search import Search
