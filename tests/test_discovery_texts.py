@@ -266,6 +266,20 @@ def test_another_place_in_one_run_is_told_with_that_run():
     assert "and one of the equation z of run 1 (counted from 0) with t about as much" in text
 
 
+def test_a_change_of_an_output_that_removes_more_is_told_to_copy_any_other():
+    physics = Location("equation", "v", "t", PART, 0.84, 20.0)
+    text = where_in_words(finding("unexplained", where=[physics, Location("output", "y", "t", PART, 0.97, 25.0)]))
+    assert "and one of the output y with t 97 %, though a change of an output can copy that of any equation" in text
+    text = where_in_words(finding("unexplained", where=[physics, Location("output", "y", "t", PART, 0.87, 25.0)]))
+    assert "and one of the output y with t about as much" in text
+
+
+def test_a_change_at_some_levels_of_another_condition_is_told_with_these():
+    step = Location("parameter", "a", "m", PART, 0.5, 20.0, edges=(2.0, 5.0), at="I = 4")
+    text = where_in_words(finding(where=[step]))
+    assert "jumps with m (at 2 and 5) where I = 4: one constant change in between removes" in text
+
+
 def test_what_varies_with_a_driver_is_what_several_terms_do_together():
     terms = [
         tc.Term("one", frees=("D",)), tc.Term("two", frees=("d",)), tc.Term("three", frees=("d",)),

@@ -13,6 +13,8 @@ __all__ = ["share_in_words", "where_in_words"]
 CLOSE = 3.0
 #: Share of a driver's range from which on spans say nothing.
 EVERYWHERE = 0.9
+#: Share of the misfit by which another one removes more.
+MORE = 0.05
 #: Sd up to which the changes of all runs are one, and from which on that is none of 0.
 SAME = 2.0
 
@@ -121,7 +123,12 @@ def _elsewhere(d: Any) -> str:
     first = d.where[0]
     close = [place for place in d.where[1:] if place.evidence > first.evidence - CLOSE and place.driver != RUN]
     other = next((place for place in close if (place.kind, place.target) != (first.kind, first.target)), None)
-    return "" if other is None else f", and one of the {other.called} with {other.driver} about as much"
+    if other is None:
+        return ""
+    text = f", and one of the {other.called} with {other.driver}"
+    if other.kind == "output" and first.kind != "output" and other.share > first.share + MORE:
+        return f"{text} {share_in_words(other.share)}, though a change of an output can copy that of any equation"
+    return f"{text} about as much"
 
 
 def _embedded(d: Any) -> str:

@@ -106,7 +106,7 @@ def left_open(search: Search, model: Model) -> str:
             return told + looks if bound else told
     if model.window is not None and _levels(model) < LEVELS:
         return (
-            f"Its range takes in, or leaves out, hardly more than one value of {model.window.driver}, at which "
+            f"It acts in full, or not at all, at hardly more than one value of {model.window.driver}, at which "
             f"something else may be missing as well: more values of {model.window.driver} would tell."
         )
     # As many to spare as are added: else there is a curve through the data, whatever they are.
