@@ -12,6 +12,7 @@ import torchcal as tc
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.base import calibrate_base
 from torchcal.discovery.misfit.channels import channels
+from torchcal.discovery.misfit.replicates import in_common_at
 from torchcal.display import NONE
 
 F64 = torch.float64
@@ -193,6 +194,48 @@ def test_what_is_correlated_along_the_rows_of_a_grid_is_told():
     shuffled = rng.permutation(len(x))  # the same in another order, which tells nothing
     again = tc.Recording(x={"x": x[shuffled], "L": load[shuffled]}, y=(1 + x * load + 0.05 * e)[shuffled], noise=0.05)
     assert not any("correlated from row to row" in row for row in diagnose(model, again, []).symptoms)
+
+
+# --- what data at one value of a condition share ---------------------------------------------------------------------
+
+
+def grid(levels, loads, *, shared=0.0, sd=1.0, seed=0, noise=1.0):
+    """A plane over a grid, with errors that data at one value of x have in common."""
+    rng = np.random.default_rng(seed)
+    x, load = (v.ravel() for v in np.meshgrid(np.linspace(0, 1, levels), np.arange(float(loads)), indexing="ij"))
+    y = 1 + 20 * x + 2 * load + sd * rng.standard_normal(len(x))
+    y += shared * np.repeat(rng.standard_normal(levels), loads)
+    plane = tc.Simulator(
+        lambda x, p: p["a"] + p["b"] * x["x"] + p["c"] * x["L"], [tc.Parameter(name) for name in "abc"]
+    )
+    return plane, tc.Recording(x={"x": x, "L": load}, y=y, noise=noise)
+
+
+@pytest.mark.parametrize(("levels", "loads"), [(12, 2), (20, 3)])
+def test_white_noise_shares_nothing_at_the_values_of_a_condition(levels, loads):
+    trials, told, meant = 200, 0, 0
+    for seed in range(trials):
+        for error in (0.0, 3.0):
+            problem = Problem.of(*grid(levels, loads, shared=error, seed=seed))
+            columns = torch.stack([torch.ones(problem.n, dtype=F64), *problem.recording.x.values()], dim=1)
+            left = problem.y - columns @ torch.linalg.lstsq(columns, problem.y[:, None]).solution[:, 0]
+            found = in_common_at(problem, left)
+            told, meant = told + bool(found and not error), meant + bool(found and error)
+    stats = pytest.importorskip("scipy.stats")
+    assert told <= stats.binom.ppf(1 - 1e-4, trials, 0.005)
+    assert meant >= stats.binom.ppf(1e-4, trials, 0.8)
+
+
+def test_what_data_at_one_value_share_is_no_larger_noise():
+    for noise, verdict in ((1.0, "unexplained"), (None, "consistent")):
+        d = diagnose(*grid(20, 3, shared=3.0, noise=noise), [])
+        assert d.verdict == verdict
+        assert d.noise.source == ("estimated" if noise is None else "given")
+        assert any("data at one x share what is left" in row for row in d.symptoms)
+    assert "if the symptoms below are noise" in " ".join(str(d).split())
+    larger = diagnose(*grid(20, 3, sd=3.0), [])
+    assert (larger.verdict, larger.noise.source) == ("consistent", "estimated")
+    assert not any("share what is left" in row for row in larger.symptoms)
 
 
 # --- terms in a range that another condition of few levels takes the shape from --------------------------------------

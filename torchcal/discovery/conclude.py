@@ -13,7 +13,14 @@ from torchcal.discovery.findings.feasible import Feasible
 from torchcal.discovery.findings.limits import limits
 from torchcal.discovery.findings.ranking import ranking
 from torchcal.discovery.findings.result import Diagnosis
-from torchcal.discovery.findings.symptoms import in_rows, larger_than_given, more_than_replicates, symptoms, unlike
+from torchcal.discovery.findings.symptoms import (
+    in_rows,
+    larger_than_given,
+    more_than_replicates,
+    shared,
+    symptoms,
+    unlike,
+)
 from torchcal.discovery.findings.where import locate, missing_rate, needed_shifts, sharpened
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.hypotheses import verify
@@ -91,16 +98,17 @@ def conclude(judged: Judged, asked: Asked, *, interrupted: str = "") -> Diagnosi
     after = None if best is None else _scores(search, best.found, mask)
     improved = asked.simulator if best is None else _improved(asked.simulator, best)
     left = search.base if best is None else best.found
-    apart = unlike(search, left) if decision.verdict in ("consistent", "named") else []
+    apart = [*unlike(search, left), *shared(search, left)] if decision.verdict in ("consistent", "named") else []
     aside = asked.recording.observed_once & ~search.problem.keep
     apart += side_by_side(search.problem, final.residual / search.noise.sd, aside)
     any_unlike = bool(apart)
     larger_noise = judged.larger_noise or larger_than_given(search, best)
     if decision.verdict != "consistent":
-        apart = [*unbounded(search), *begun_elsewhere(search), *more_than_replicates(search, left), *apart]
         # Of what has no name the best fit tells the noise: the base leaves the misfit too, which goes on along rows.
         every = () if best is not None else (model.found for model in (*search.models, *search.nameless))
-        apart += in_rows(search, min(every, key=lambda found: found.chi2, default=left))
+        least = min(every, key=lambda found: found.chi2, default=left)
+        apart = [*unbounded(search), *begun_elsewhere(search), *more_than_replicates(search, least), *apart]
+        apart += in_rows(search, least) + (shared(search, least) if decision.verdict != "named" else [])
     if decision.verdict in ("ambiguous", "unexplained"):
         apart = [*held_otherwise(search), *apart]
     remaining, depends = 0.0 if decision.verdict == "consistent" else 1.0, ""

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchcal.discovery.findings.symptoms import larger_than_given
+from torchcal.discovery.findings.symptoms import larger_than_given, shared
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses import verify
@@ -72,6 +72,8 @@ def judged(search: Search, problem: Problem, mask: Tensor | None, confidence: fl
     other = _judge(search, problem, mask, confidence, movable)
     after = other.decision.verdict
     if search.stop.is_set() or after == "unexplained" or (before == "consistent" and after != before):
+        return found
+    if after == "consistent" and shared(other.search, other.search.base):  # that is no noise of each datum
         return found
     return dataclasses.replace(other, larger_noise=larger)
 

@@ -115,7 +115,7 @@ def _absorption(v: str, label: str | None, volt: str, time: str) -> Term:
                hidden: lambda t, s, p, u: (s[v] - s[hidden]) / p["tau"]},
         states={hidden: volt}, initial={hidden: v},
         parameters=[amplitude("k", f"1/{time}", low=0.0), shape("tau", time)], scales={"tau": "t"},
-        formula=f"d{v}/dt ∋ -k ({v} - z), dz/dt = ({v} - z)/tau, z(0) = {v}(0)",
+        formula=f"d{v}/dt ∋ -k ({v} - {v}_slow), d{v}_slow/dt = ({v} - {v}_slow)/tau, {v}_slow(0) = {v}(0)",
         description="Charge that creeps into the dielectric and back, as a resistor and capacitor in parallel do.",
     )  # fmt: skip
 

@@ -159,7 +159,7 @@ def _adsorption(a: str, amount: str, time: str, label: str | None) -> Term:
                hidden: lambda t, s, p, u: (s[a] - s[hidden]) / p["tau"]},
         states={hidden: amount}, initial={hidden: 0.0},
         parameters=[amplitude("k", f"1/{time}", low=0.0), shape("tau", time)], scales={"tau": "t"},
-        formula=f"d{a}/dt ∋ -k ({a} - z), dz/dt = ({a} - z)/tau, z(0) = 0",
+        formula=f"d{a}/dt ∋ -k ({a} - {a}_bound), d{a}_bound/dt = ({a} - {a}_bound)/tau, {a}_bound(0) = 0",
         description="A wall or an unseen phase, empty at first, takes up the reactant and gives it back.",
     )  # fmt: skip
 

@@ -159,7 +159,7 @@ def _viscoelastic(v: str, label: str | None, units: Units) -> Term:
         rates={v: lambda t, s, p, u: -p["k"] * s[hidden], hidden: lambda t, s, p, u: s[v] - s[hidden] / p["tau"]},
         states={hidden: units.length}, initial={hidden: 0.0},
         parameters=[amplitude("k", units(0, 2), low=0.0), shape("tau", units(0, -1))], scales={"tau": "t"},
-        formula=f"d{v}/dt ∋ -k z, dz/dt = {v} - z/tau, z(0) = 0",
+        formula=f"d{v}/dt ∋ -k stretch, d stretch/dt = {v} - stretch/tau, stretch(0) = 0",
         description="Spring in series with a damper (a Maxwell element): stiff when moved fast, relaxing in tau.",
     )  # fmt: skip
 

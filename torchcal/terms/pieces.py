@@ -97,7 +97,8 @@ def lagging(name: str, equation: str, drive: str, unit: str, time: str, descript
         parameters=[amplitude("g", unit, low=0.0), shape("tau", time)],
         scales={"tau": "t"},
         takes=drive,
-        formula=f"d{equation}/dt ∋ g (z - {drive}), dz/dt = ({drive} - z)/tau, z(0) = 0",
+        formula=f"d{equation}/dt ∋ g ({drive}_late - {drive}), "
+        f"d{drive}_late/dt = ({drive} - {drive}_late)/tau, {drive}_late(0) = 0",
         description=description,
     )
 

@@ -209,7 +209,8 @@ def _dynamic(output: str, unit: str, time: str, given: Signal) -> list[Term]:
              outputs={output: lambda t, s, p, u, y: y + p["a"] * (s[shown] - y)},
              parameters=[amplitude("a", "1", low=0.0, high=1.5), shape("t90", time)], scales={"t90": "t"},
              expected={"a": NATURE},
-             formula=f"{output} → {output} + a (z - {output}), dz/dt = 2.303 ({output} - z)/t90",
+             formula=f"{output} → {output} + a ({output}_shown - {output}), "
+             f"d{output}_shown/dt = 2.303 ({output} - {output}_shown)/t90",
              description="The instrument follows with a response time t90 (to 90 % of a step); a = 1 in nature."),
         Term(delay,
              rates={smooth: lambda t, s, p, u: s[slope], slope: lambda t, s, p, u: s[bend], bend: jerk},

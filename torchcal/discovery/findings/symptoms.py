@@ -10,11 +10,12 @@ from torchcal.discovery.fits.problem import SWEEP, Problem, breaks, remembered
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.noise import GRID, decorrelated, estimate
+from torchcal.discovery.misfit.replicates import in_common_at
 from torchcal.discovery.verdicts.doubts import goes_on
 from torchcal.discovery.verdicts.explain import estimates, stated_sd
 from torchcal.display import up_to, with_unit
 
-__all__ = ["in_rows", "larger_than_given", "more_than_replicates", "symptoms", "unlike"]
+__all__ = ["in_rows", "larger_than_given", "more_than_replicates", "shared", "symptoms", "unlike"]
 
 #: A base parameter that moves by this many sd when a term is added was bent by it.
 BENT = 3.0
@@ -179,6 +180,19 @@ def in_rows(search: Search, found: Fitted) -> list[str]:
         "what is left is correlated from row to row: noise with a memory looks like this, and is not sought where the "
         f"rows of a grid are in such an order (but along one condition, or in sweeps of {SWEEP} rows and more): all sd "
         "here are those of independent noise"
+    ]
+
+
+def shared(search: Search, found: Fitted) -> list[str]:
+    """Outputs of which data at one value of a condition share what a fit leaves, in words."""
+    if search.exact:
+        return []
+    several = len(search.problem.recording.outputs) > 1
+    return [
+        f"data at one {condition} share what is left{f' of {name}' if several else ''}, {size:.1f} times what they "
+        f"differ by, in no order along {condition}: that is no noise of each datum, but something faster than the "
+        f"values of {condition} are apart, or an error that data at one {condition} have in common, as of a setting"
+        for name, condition, size in in_common_at(found.problem, found.residual / search.noise.sd[found.problem.index])
     ]
 
 

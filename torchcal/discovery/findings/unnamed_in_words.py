@@ -103,7 +103,7 @@ def ambiguous(d: Any) -> list[str]:
         if d.settings.get("doubt"):
             return [
                 where_in_words(d),
-                f"The best explanation in the library is {called(d, known[0])} (probability {sure:.2f}).",
+                f"The best explanation in the library is {called(d, known[0])} (probability {sure:.2f}).{_left(d)}",
                 d.settings["doubt"],
                 *_unknown_too(unknown),
             ]
@@ -126,7 +126,7 @@ def ambiguous(d: Any) -> list[str]:
         unequal = f"with probabilities from {shares[best]:.2f} to {chance(least)}"
         well = "about as well" if least > AS_WELL * shares[best] else unequal
         told = f"{len(known)} hypotheses explain it {well}, and these data cannot exclude {which} of them."
-    parts = [where_in_words(d), told]
+    parts = [where_in_words(d), told + _left(d)]
     sets = [set(tied) for tied in known]
     beside = sum(
         row.probability for row in d.ranking
@@ -164,6 +164,13 @@ def ambiguous(d: Any) -> list[str]:
         which = " that are feasible and" if d.settings.get("feasible") else " that"
         parts.append(f"None of the experiments{which} were tried in thought would tell them apart.")
     return parts
+
+
+def _left(d: Any) -> str:
+    """That what is tied explains the data beside noise that is larger than given."""
+    if d.noise.source != "given" or not d.settings.get("larger_noise"):
+        return ""
+    return " What is left is larger than the noise that was given, and taken for noise."
 
 
 def _unknown_too(unknown: float) -> list[str]:

@@ -1,4 +1,4 @@
-"""What data at identical conditions tell of the noise, whatever the misfit."""
+"""What data at identical conditions, or at one value of a condition, tell of the noise, whatever the misfit."""
 
 import math
 from dataclasses import dataclass
@@ -8,12 +8,16 @@ from torch import Tensor
 
 from torchcal.discovery.fits.problem import Problem, remembered
 
-__all__ = ["Replicates", "replicates"]
+__all__ = ["Replicates", "in_common_at", "replicates"]
 
 #: Difference of replicates, in the size of the data, up to which they agree.
 ROUNDING = 1e-12
 #: Degrees of freedom of every output at least; and how many conditions noise with memory is told beside at most.
 FEWEST, MOST = 3, 1024
+#: Values of a condition at which data may have something in common; how many times what they differ by that is; share
+#: of its square that is shared from value to value up to which it is in no order; its probability by chance; and
+#: points at which the tail of that is taken.
+GROUPS, LARGER, SLOW, SHARED, TAIL = 8, 1.5, 0.4, 0.005, 2001
 
 
 @dataclass(frozen=True)
@@ -105,3 +109,37 @@ def replicates(problem: Problem) -> list[Replicates] | None:
     if not any(bool((one.off.abs() > ROUNDING * problem.recording.y.nan_to_num().abs().max()).any()) for one in found):
         return None  # what always agrees, as coarse readings do, tells nothing of the noise
     return found if min(one.freedom for one in found) >= FEWEST else None
+
+
+def in_common_at(problem: Problem, standard: Tensor) -> list[tuple[str, str, float]]:
+    """Outputs, and conditions at whose values residuals ``(n,)``, in noise sd, have something in common, whatever the
+    other conditions are, but in no order; and how many times it is what they differ by. Noise of each datum has not."""
+    found: list[tuple[str, str, float]] = []
+    conditions, outputs = problem.recording.x, problem.recording.outputs
+    if problem.in_time or not isinstance(conditions, dict) or len(conditions) < 2:
+        return found
+    for number, name in enumerate(outputs):
+        mine = problem.output_of == number
+        left, n = standard[mine], int(mine.sum())
+        for condition, values in conditions.items():
+            _, which, count = values[problem.condition_of[mine]].unique(return_inverse=True, return_counts=True)
+            groups = len(count)
+            if groups < GROUPS or n < 2 * groups or len(problem.levels[0]) < 2 * groups:
+                continue
+            mean = torch.zeros(groups, dtype=torch.float64).index_add_(0, which, left) / count.sqrt()
+            between, whole = float(mean.square().sum()), float(left.square().sum())
+            size = math.sqrt(between / groups / max((whole - between) / (n - groups), 1e-300))
+            slow = float(mean[1:] @ mean[:-1]) >= SLOW * between
+            often = len(outputs) * len(conditions)
+            if size > LARGER and not slow and _by_chance(between / whole, groups, n - groups) * often < SHARED:
+                found.append((name, condition, size))
+    return found
+
+
+def _by_chance(share: float, one: int, other: int) -> float:
+    """Probability of so large a share of a sum of squares for one of two sums of as many squares of white noise: the
+    tail of a beta distribution."""
+    a, b = 0.5 * one, 0.5 * other
+    t = torch.linspace(share, 1.0, TAIL, dtype=torch.float64)[:-1]
+    scale = math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b)
+    return float(torch.trapezoid((scale + (a - 1) * t.log() + (b - 1) * (1 - t).log()).exp(), t))

@@ -11,6 +11,7 @@ from torchcal.discovery.hypotheses.own_noise import weigh_alone
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.noise import estimate
 from torchcal.discovery.misfit.places import Place
+from torchcal.discovery.misfit.replicates import in_common_at
 from torchcal.discovery.misfit.structure import Structure
 from torchcal.discovery.verdicts.by_share import decide_exact, nearly
 from torchcal.discovery.verdicts.decision import Decision, certain, groups_of, other_names, tie_other_names, weigh
@@ -265,20 +266,20 @@ def base_alone(search: Search) -> float:
 def _small(search: Search, model: Model) -> bool:
     """Whether a model leaves no more than the noise that is given: correlated noise can look like what is left.
 
-    Where the fastest part of what one term leaves is larger than what is given, that is taken for the noise. Several
-    bend to more, and are held to what is given.
+    Where the fastest part of what one term leaves is larger than what is given, that is taken for the noise, unless
+    data at one value of a condition share it. Several bend to more, and are held to what is given.
     """
     noise, found = search.noise, model.found
     if noise.source != "given":
         return True
     problem = found.problem
+    standard = found.residual / noise.sd[problem.index]
     largest = [LARGER_TOGETHER] * len(noise.correlation)
-    if len(model.names) == 1:
+    if len(model.names) == 1 and not in_common_at(problem, standard):
         fastest = estimate(problem, found.residual, found.jacobian, problem.recording.noise).sizes[:, 0]
         largest = (LARGER * fastest.clamp_min(1.0)).tolist()
-    standard = (found.residual / noise.sd[problem.index]).square()
     for number, (rho, size) in enumerate(zip(noise.correlation.tolist(), largest, strict=True)):
-        mine = standard[problem.output_of == number]
+        mine = standard[problem.output_of == number].square()
         if not len(mine):
             continue
         independent = len(mine) * (1 - rho**2) / (1 + rho**2)  # as many squares tell as much of their mean
