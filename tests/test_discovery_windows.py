@@ -338,6 +338,26 @@ def test_the_sd_of_a_steps_place_says_how_far_it_may_be_off():
     assert max(abs(one) for one in z) < 5
 
 
+def test_an_end_between_two_values_of_a_condition_is_no_better_known_than_these():
+    levels = np.array([0.05, 0.1, 0.2, 0.5, 1.0, 1.5, 2.1])
+    c, wave = (v.ravel() for v in np.meshgrid(levels, np.arange(475.0, 550, 10), indexing="ij"))
+    line = 0.84 * c * np.exp(-(((wave - 510) / 28) ** 2))
+    base = tc.Simulator(
+        lambda x, p: p["e"] * x["c"] * torch.exp(-(((x["w"] - p["l"]) / 28) ** 2)),
+        [tc.Parameter("e", initial=1.0), tc.Parameter("l", initial=505.0)],
+    )
+    for seed in (0, 3):  # with edges of a given width
+        y = line * (1 - 0.12 * (c > 1.2)) + 0.008 * np.random.default_rng(seed).standard_normal(len(c))
+        recording = tc.Recording(x={"c": c, "w": wave}, y=y, noise=0.008)
+        d = diagnose(base, recording, tc.terms.sensor(outputs=("y",), static=True))
+        row = next(row for row in d.ranking if row.region and row.estimates)
+        ends = [e for e in row.estimates if e.name.endswith(("window from", "window to"))]
+        assert ends
+        for end in ends:
+            at = int(np.searchsorted(levels, end.value))
+            assert end.sd >= 0.99 * (levels[at] - levels[at - 1]) / math.sqrt(12)
+
+
 def dip(seed):
     """A dip of a current at 1.2 V, in no list: a saturation that ends by itself draws a triangle there."""
     v = np.tile(np.linspace(0.05, 2, 30), 4)

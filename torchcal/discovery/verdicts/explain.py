@@ -70,7 +70,7 @@ def estimates(found: Fitted, places: Sequence[int], window: Window | None = None
         value = float(found.values[i])
         spread = float(sd[i])
         if window is not None and not found.problem.in_time and q.name.endswith(tuple(ENDS.values())):
-            spread = _stepped_sd(found, i, window.driver, spread)
+            spread = _stepped_sd(found, i, window, spread)
         allowed = math.inf if q.low is None or q.high is None else q.high - q.low
         if spread > min(1e5 * abs(value) or math.inf, allowed):
             spread = math.inf
@@ -84,12 +84,17 @@ def stated_sd(found: Fitted) -> Tensor:
     return found.sd() * (misfit_size(found) if isinstance(found.problem.recording.noise, str) else 1.0)
 
 
-def _stepped_sd(found: Fitted, i: int, driver: str, spread: float) -> float:
-    """Sd of a window's end whose edge is a step, over the gaps that the misfit allows; else as the curvature says."""
+def _stepped_sd(found: Fitted, i: int, window: Window, spread: float) -> float:
+    """Sd of a window's end whose edge is a step beside the gaps around, over those that the misfit allows; else as the
+    curvature says."""
     pairs = zip(found.problem.parameters, found.values.tolist(), strict=True)
-    width = next((value for q, value in pairs if q.name.endswith(WIDTH_OF_EDGE)), math.inf)
-    along = found.problem.drivers_at_data(found.values[None], None)[driver].unique()
-    if width > float(along.diff().median()):
+    along = found.problem.drivers_at_data(found.values[None], None)[window.driver].unique()
+    if window.span is None or len(along) < 2:
+        return spread
+    own = next((value for q, value in pairs if q.name.endswith(WIDTH_OF_EDGE)), None)
+    at = int(torch.searchsorted(along, found.values[i]).clamp(1, len(along) - 1))
+    width = window.span.edge * window.span.size if own is None else own
+    if width > float(window.span.distance(along[at], along[at - 1])):
         return spread
     middle, gap = 0.5 * (along[1:] + along[:-1]), along.diff()
     near = (middle - found.values[i]).abs().argsort()[:GAPS]
