@@ -10,6 +10,7 @@ from unittest import mock
 import numpy as np
 import pytest
 import torch
+from scipy.integrate import solve_ivp
 
 import torchcal as tc
 from torchcal.discovery.findings import called, symptoms, where, words
@@ -75,7 +76,7 @@ def located(term, *, inside=(), named=True):
     model = SimpleNamespace(
         window=None, candidate=SimpleNamespace(terms=[term]), structure=SimpleNamespace(channels=list(inside))
     )
-    with mock.patch.object(where, "_reads", return_value=set()):
+    with mock.patch.multiple(where, _reads=lambda model: set(), removed=lambda search, model: 0.5):
         return [(place.kind, place.target) for place in where.locate(search, places, model, named=named)]
 
 
@@ -264,6 +265,27 @@ def test_another_place_in_one_run_is_told_with_that_run():
     ]  # fmt: skip
     text = where_in_words(finding("unexplained", where=places))
     assert "and one of the equation z of run 1 (counted from 0) with t about as much" in text
+
+
+def test_a_named_instrument_that_remembers_is_told_by_what_it_removes():
+    t = np.linspace(0, 30, 121)
+    u = np.where((t // 5) % 2 == 0, 1.0, 0.0)
+    rate = lambda s, y: [-0.4 * (y[0] - np.interp(s, t, u)), (y[0] - y[1]) / 1.5]  # noqa: E731
+    y = solve_ivp(rate, (0, 30), [0.0, 0.0], t_eval=t, max_step=0.05, rtol=1e-8).y[1]
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"x": -p["k"] * (s["x"] - p["g"] * u["u"])},
+        {"x": "m"},
+        [tc.Parameter("k", low=0.0, initial=0.5), tc.Parameter("g", initial=1.0)],
+    )
+    y += 0.01 * np.random.default_rng(0).standard_normal(121)
+    runs = [tc.Run(t, {"x": y}, initial={"x": 0.0}, inputs={"u": u})]
+    terms = [term for term in tc.terms.sensor(outputs=("x",), units={"x": "m"}) if term.name != "delay of x"]
+    d = tc.diagnose(base, tc.Recording(runs=runs, noise=0.01, units={"time": "s"}), terms, seed=0, progress=False)
+    assert (d.verdict, d.terms) == ("named", ["lag of x"])
+    assert (d.where[0].kind, d.where[0].target, d.where[0].driver) == ("output", "x", "t")
+    assert d.where[0].share > 0.99
+    assert "adding lag of x there removes" in " ".join(str(d).split())
+    assert d.equations[0].startswith("x → x + a (x_shown - x), dx_shown/dt = 2.303 (x - x_shown)/t90")
 
 
 def test_a_change_of_an_output_that_removes_more_is_told_to_copy_any_other():

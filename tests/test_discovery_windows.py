@@ -348,7 +348,7 @@ def test_an_end_between_two_values_of_a_condition_is_no_better_known_than_these(
     )
     for seed in (0, 3):  # with edges of a given width
         y = line * (1 - 0.12 * (c > 1.2)) + 0.008 * np.random.default_rng(seed).standard_normal(len(c))
-        recording = tc.Recording(x={"c": c, "w": wave}, y=y, noise=0.008)
+        recording = tc.Recording(x={"c": c, "w": wave}, y=y, noise=0.008, units={"c": "mM"})
         d = diagnose(base, recording, tc.terms.sensor(outputs=("y",), static=True))
         row = next(row for row in d.ranking if row.region and row.estimates)
         ends = [e for e in row.estimates if e.name.endswith(("window from", "window to"))]
@@ -356,6 +356,7 @@ def test_an_end_between_two_values_of_a_condition_is_no_better_known_than_these(
         for end in ends:
             at = int(np.searchsorted(levels, end.value))
             assert end.sd >= 0.99 * (levels[at] - levels[at - 1]) / math.sqrt(12)
+            assert end.unit == "mM"
 
 
 def dip(seed):

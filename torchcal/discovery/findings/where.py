@@ -29,6 +29,8 @@ SPAN_LEVEL = 0.3
 SLIVER = 0.02
 #: Digits of log evidence to which two changes are as likely.
 TIED = 4
+#: Share of what a name removes below which an unknown change of the same place does not tell what it does.
+PART = 0.5
 #: Log evidence from which on a place is listed, and how many are.
 LEAST_EVIDENCE, LISTED = 2.0, 8
 
@@ -144,8 +146,10 @@ def locate(
     if named and best is not None and best.window is None:
         own, reads = _own_places(search, best), _reads(best)
         places.sort(key=lambda place: _rank(place, own, reads))
-        if not places or (places[0].channel.kind, places[0].channel.target) not in own:
-            rows.append(_contributed(search, best, [place.driver for place in places]))
+        mine = bool(places) and (places[0].channel.kind, places[0].channel.target) in own
+        if not mine or places[0].share < PART * removed(search, best):  # as of what an instrument remembers
+            likely = sorted(places, key=lambda place: -place.evidence)
+            rows.append(_contributed(search, best, [place.driver for place in likely]))
     seen: set[tuple[str, str]] = set()
     known = {(row.kind, row.target, row.driver) for row in rows}
     for place in places:

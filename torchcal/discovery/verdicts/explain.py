@@ -15,6 +15,7 @@ from torchcal.discovery.hypotheses.screen import Window
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.structure import Structure
 from torchcal.discovery.records import Estimate, Fit
+from torchcal.display import unit_of, units_of
 
 __all__ = [
     "deeper",
@@ -67,15 +68,17 @@ def estimates(found: Fitted, places: Sequence[int], window: Window | None = None
     result = []
     for i in places:
         q = found.problem.parameters[i]
-        value = float(found.values[i])
+        value, unit = float(found.values[i]), q.unit
         spread = float(sd[i])
+        if window is not None and q.name.endswith(tuple(ENDS.values())):
+            unit = unit_of(window.driver, units_of(found.problem.recording, found.problem.simulator)) or None
         if window is not None and not found.problem.in_time and q.name.endswith(tuple(ENDS.values())):
             spread = _stepped_sd(found, i, window, spread)
         allowed = math.inf if q.low is None or q.high is None else q.high - q.low
         if spread > min(1e5 * abs(value) or math.inf, allowed):
             spread = math.inf
         at_bound = i in bound or (i in found.free and value in (q.low, q.high) and not is_window(q.name))
-        result.append(Estimate(q.name, value, spread, q.unit, at_bound))
+        result.append(Estimate(q.name, value, spread, unit, at_bound))
     return tuple(result)
 
 
