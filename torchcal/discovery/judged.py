@@ -13,7 +13,7 @@ from torchcal.discovery.hypotheses import verify
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.own_noise import explains
 from torchcal.discovery.hypotheses.search import Search
-from torchcal.discovery.misfit.noise import mine
+from torchcal.discovery.misfit.noise import estimate, mine
 from torchcal.discovery.nameless import refit_nameless
 from torchcal.discovery.rounds import settle, with_all, with_explained, without_others
 from torchcal.discovery.several import refit_several
@@ -21,6 +21,10 @@ from torchcal.discovery.verdicts.decision import Decision
 from torchcal.discovery.verdicts.verdict import decide
 
 __all__ = ["Judged", "judged"]
+
+#: Models that come nearest, by what they leave; and how many times as large as its fastest part that may be, to be
+#: noise.
+NEAREST, SLOWER = 12, 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +68,7 @@ def judged(search: Search, problem: Problem, mask: Tensor | None, confidence: fl
     found = _judge(search, problem, mask, confidence, movable)
     before = found.decision.verdict
     larger = "" if before == "named" or search.stop.is_set() else larger_than_given(found.search, found.best)
-    if not larger:
+    if not larger or not _may_be_noise(found.search):
         return found
     problem = dataclasses.replace(problem, recording=problem.recording.with_noise(None))
     search = dataclasses.replace(search, problem=problem, unit=_pattern(problem, found.search.noise.sd), coarser=1.0)
@@ -99,6 +103,22 @@ def _judge(search: Search, problem: Problem, mask: Tensor | None, confidence: fl
         mask = verify.within(problem.recording)
         found = dataclasses.replace(found, decision=decide(search, detected, mask), mask=mask)
     return found
+
+
+def _may_be_noise(search: Search) -> bool:
+    """Whether the base, or one of the models that come nearest, leaves hardly more than its fastest part, of any size:
+    else a larger noise leaves as much unexplained."""
+    nearest = sorted((model.found for model in search.models), key=lambda found: found.chi2)[:NEAREST]
+    return any(_is_fast(search, found) for found in (search.base, *nearest))
+
+
+def _is_fast(search: Search, found: Fitted) -> bool:
+    problem = found.problem
+    fastest = estimate(problem, found.residual, found.jacobian, problem.recording.noise).sizes[:, 0]
+    size = found.residual / search.noise.sd[problem.index]
+    each = (size[problem.output_of == number] for number in range(len(fastest)))
+    pairs = zip(each, fastest.tolist(), strict=True)
+    return all(float(left.square().mean()) <= (SLOWER * fast) ** 2 for left, fast in pairs if len(left))
 
 
 def _pattern(problem: Problem, sd: Tensor) -> Tensor | None:
