@@ -750,12 +750,17 @@ def test_what_is_missing_is_named_beside_noise_of_twice_the_sd_that_was_given():
         assert abs(estimate.value - 0.6) < 4 * estimate.sd
 
 
-def test_what_nothing_explains_with_larger_noise_either_is_told_with_the_noise_that_was_given():
+def test_what_nothing_explains_with_larger_noise_either_is_told_with_the_noise_that_was_given(monkeypatch):
+    asked = []
+    with_noise = tc.Recording.with_noise
+    monkeypatch.setattr(tc.Recording, "with_noise", lambda self, noise: asked.append(noise) or with_noise(self, noise))
     x = torch.linspace(0, 2, 60, dtype=F64)
-    for sd in (0.1, 0.03):
-        d = given_half(1 + x + 0.5 * torch.sin(6 * x) + draw(60, 0.1, 300), sd)
+    for sd, size, searches in ((0.1, 0.5, 1), (0.03, 0.5, 1), (0.03, 0.15, 2)):  # where it is far larger, no second one
+        asked.clear()
+        d = given_half(1 + x + size * torch.sin(6 * x) + draw(60, 0.1, 300), sd)
         assert (d.verdict, d.noise.source) == ("unexplained", "given")
         assert any("fastest part" in row for row in d.symptoms) is (sd < 0.1)
+        assert 1 + len(asked) == searches
 
 
 def test_a_given_noise_that_varies_keeps_its_pattern_where_it_is_larger():
