@@ -196,6 +196,30 @@ def test_what_is_correlated_along_the_rows_of_a_grid_is_told():
     assert not any("correlated from row to row" in row for row in diagnose(model, again, []).symptoms)
 
 
+def up_and_down(seed, gap=0.0, sd=0.02, sorted_rows=False):
+    """A curve that is read on the way up and on the way down, at other values."""
+    up, down = np.linspace(0.02, 0.98, 13), np.linspace(0.94, 0.06, 13)
+    x = np.concatenate([up, down])
+    y = 40 * x - 3 * x**2 + sd * np.random.default_rng(seed).standard_normal(26)
+    y[13:] += gap * (x * (1 - x))[13:]
+    order = np.argsort(x) if sorted_rows else np.arange(26)
+    line = tc.Simulator(lambda x, p: p["a"] * x + p["b"] * x**2, [tc.Parameter("a"), tc.Parameter("b")])
+    return line, tc.Recording(x=x[order], y=y[order])
+
+
+def test_few_data_that_go_on_in_the_order_of_the_recording_are_told():
+    told = "in the order of the recording: a drift, a hysteresis or noise with a memory"
+    for seed in range(3):
+        d = diagnose(*up_and_down(seed, gap=0.8), tc.terms.sensor(outputs=("y",), static=True))
+        assert d.verdict == "consistent"
+        assert str(d).startswith("Verdict: consistent (nothing is surely missing)")
+        assert told in " ".join(str(d).split())
+    seen = sum(told in " ".join(str(diagnose(*up_and_down(seed), [])).split()) for seed in range(20))
+    assert seen <= 1
+    lost = diagnose(*up_and_down(0, gap=0.8, sorted_rows=True), [])  # in whose rows there is no order of the recording
+    assert told not in " ".join(str(lost).split())
+
+
 # --- what data at one value of a condition share ---------------------------------------------------------------------
 
 

@@ -99,6 +99,7 @@ def conclude(judged: Judged, asked: Asked, *, interrupted: str = "") -> Diagnosi
     improved = asked.simulator if best is None else _improved(asked.simulator, best)
     left = search.base if best is None else best.found
     apart = [*unlike(search, left), *shared(search, left)] if decision.verdict in ("consistent", "named") else []
+    apart += in_rows(search, left) if decision.verdict == "consistent" else []
     aside = asked.recording.observed_once & ~search.problem.keep
     apart += side_by_side(search.problem, final.residual / search.noise.sd, aside)
     any_unlike = bool(apart)

@@ -9,9 +9,9 @@ from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.problem import SWEEP, Problem, breaks, remembered
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.search import Search
-from torchcal.discovery.misfit.noise import GRID, decorrelated, estimate
+from torchcal.discovery.misfit.noise import GRID, LEAST, decorrelated, estimate
 from torchcal.discovery.misfit.replicates import in_common_at
-from torchcal.discovery.verdicts.doubts import goes_on
+from torchcal.discovery.verdicts.doubts import ALONG, along_rows, goes_on
 from torchcal.discovery.verdicts.explain import estimates, stated_sd
 from torchcal.display import up_to, with_unit
 
@@ -172,10 +172,22 @@ def _by_memory(problem: Problem, places: Tensor, residual: Tensor) -> tuple[Tens
 
 
 def in_rows(search: Search, found: Fitted) -> list[str]:
-    """That a fit leaves what is correlated along the rows of a grid, in whose order no memory of the noise is sought,
-    in words."""
-    if search.exact or not goes_on(found, search.noise):
+    """That a fit leaves what is correlated from row to row, where no memory of the noise is sought in that order, in
+    words: along the rows of a grid, or of few data that are not in the order of their condition."""
+    if search.exact:
         return []
+    if not goes_on(found, search.noise):
+        problem = found.problem
+        rows = None if problem.in_time or problem.order is None else problem.order.diff()
+        count = int(torch.bincount(problem.output_of).max())
+        if rows is None or count >= LEAST or bool((rows >= 0).all() | (rows <= 0).all()):
+            return []
+        if along_rows(problem, search.noise.whitening(problem).vector(found.residual)) <= ALONG:
+            return []
+        return [
+            "what is left is correlated from row to row, in the order of the recording: a drift, a hysteresis or noise "
+            f"with a memory looks like this, and none is sought in fewer than {LEAST} data"
+        ]
     return [
         "what is left is correlated from row to row: noise with a memory looks like this, and is not sought where the "
         f"rows of a grid are in such an order (but along one condition, or in sweeps of {SWEEP} rows and more): all sd "

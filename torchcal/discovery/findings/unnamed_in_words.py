@@ -49,6 +49,7 @@ def consistent(d: Any) -> list[str]:
         nothing = "There is no sure sign of missing physics: by chance noise does as much now and then." + yet
     if d.p_detect < 1 - d.confidence:
         nothing = "Yet the base alone remains likelier than all that was tried beside it."
+        nothing += " What the symptoms below tell may be physics." if d.settings.get("unlike") else ""
         if d.noise.source == "estimated" and max(d.noise.correlation.values(), default=0.0) >= SLOW:
             nothing = (
                 "Slow noise explains that structure at least as well as anything in the library, so that no physics is "
