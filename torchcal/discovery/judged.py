@@ -1,6 +1,7 @@
 """A search and its verdict, with the noise that was given, or with its own where that explains nothing."""
 
 import dataclasses
+import math
 from dataclasses import dataclass
 
 import torch
@@ -25,6 +26,8 @@ __all__ = ["Judged", "judged"]
 #: Models that come nearest, by what they leave; and how many times as large as its fastest part that may be, to be
 #: noise.
 NEAREST, SLOWER = 12, 1.5
+#: Sd by which χ² may exceed its expectation by chance.
+CHANCE = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +71,7 @@ def judged(search: Search, problem: Problem, mask: Tensor | None, confidence: fl
     found = _judge(search, problem, mask, confidence, movable)
     before = found.decision.verdict
     larger = "" if before == "named" or search.stop.is_set() else larger_than_given(found.search, found.best)
-    if not larger or not _may_be_noise(found.search):
+    if not larger or not _may_be_noise(found.search) or _explained_by_place(found.search):
         return found
     problem = dataclasses.replace(problem, recording=problem.recording.with_noise(None))
     search = dataclasses.replace(search, problem=problem, unit=_pattern(problem, found.search.noise.sd), coarser=1.0)
@@ -110,6 +113,14 @@ def _may_be_noise(search: Search) -> bool:
     else a larger noise leaves as much unexplained."""
     nearest = sorted((model.found for model in search.models), key=lambda found: found.chi2)[:NEAREST]
     return any(_is_fast(search, found) for found in (search.base, *nearest))
+
+
+def _explained_by_place(search: Search) -> bool:
+    """Whether an unknown change in one place leaves no more than the noise that was given."""
+    freedom = max(search.problem.n - len(search.base.free), 1)
+    share = max((place.share for place in search.structure.places), default=0.0)
+    left = 1 + (1 - share) * (search.base.chi2 / freedom - 1)
+    return left <= 1 + CHANCE * math.sqrt(2 / freedom)
 
 
 def _is_fast(search: Search, found: Fitted) -> bool:
