@@ -19,6 +19,7 @@ from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.curves import orthonormal, smooth_columns
 from torchcal.discovery.misfit.noise import Noise, estimate
 from torchcal.discovery.misfit.outliers import lone, spikes
+from torchcal.discovery.misfit.replicates import goes_on_along
 
 F64 = torch.float64
 
@@ -764,18 +765,35 @@ def test_what_nothing_explains_with_larger_noise_either_is_told_with_the_noise_t
         assert 1 + len(asked) == searches
 
 
-def test_what_a_smooth_change_explains_with_the_noise_that_was_given_is_no_larger_noise():
-    """A ripple that is faster than the sampling leaves of smooth curves: along the rows, which are in no order."""
-    rng = np.random.default_rng(3)
+@pytest.mark.parametrize("seed", range(3))
+def test_what_goes_with_a_condition_is_no_larger_noise(seed):
+    """A ripple along one of two conditions, by which the rows are not sorted: smooth curves leave it, or follow it."""
+    rng = np.random.default_rng(seed)
     dose, age = np.exp(rng.uniform(np.log(0.05), np.log(50), 60)), rng.uniform(20, 70, 60)
-    y = dose / (1 + dose) + 0.08 * np.sin(2.5 * np.log(dose)) + 0.018 * rng.standard_normal(60)
+    y = dose / (1 + dose) + 0.05 * np.sin(6 * np.log(dose)) + 0.018 * rng.standard_normal(60)
     bind = tc.Simulator(
         lambda x, p: p["top"] * x["dose"] / (p["half"] + x["dose"]),
         [tc.Parameter("top", low=0.0, initial=1.0), tc.Parameter("half", low=0.0, initial=0.8)],
     )
-    d = tc.diagnose(bind, tc.Recording(x={"dose": dose, "age": age}, y=y, noise=0.018), [], seed=0, progress=False)
-    assert (d.verdict, d.noise.source) == ("unexplained", "given")
-    assert "varies with dose" in str(d)
+    for noise in (0.018, None):
+        recording = tc.Recording(x={"dose": dose, "age": age}, y=y, noise=noise)
+        d = tc.diagnose(bind, recording, [], seed=0, progress=False)
+        assert d.noise.source == ("given" if noise else "estimated")
+        if noise:
+            assert d.verdict == "unexplained"
+        elif seed < 2:  # where noise alone may be enough, it is told what it looks like; of the third it does not show
+            assert d.verdict == "consistent"
+            assert any("what is left goes on along dose" in row for row in d.symptoms)
+
+
+def test_white_noise_goes_on_along_no_condition():
+    told = 0
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        x = {name: rng.uniform(0, 1, 50) for name in "ab"}
+        problem = Problem.of(LINE, tc.Recording(x=x, y=rng.standard_normal(50), noise=1.0))
+        told += bool(goes_on_along(problem, problem.y))
+    assert told <= most(300, 2 * 5e-4)
 
 
 def test_a_given_noise_that_varies_keeps_its_pattern_where_it_is_larger():

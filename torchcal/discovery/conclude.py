@@ -14,6 +14,7 @@ from torchcal.discovery.findings.limits import limits
 from torchcal.discovery.findings.ranking import ranking
 from torchcal.discovery.findings.result import Diagnosis
 from torchcal.discovery.findings.symptoms import (
+    along,
     in_rows,
     larger_than_given,
     more_than_replicates,
@@ -99,7 +100,7 @@ def conclude(judged: Judged, asked: Asked, *, interrupted: str = "") -> Diagnosi
     improved = asked.simulator if best is None else _improved(asked.simulator, best)
     left = search.base if best is None else best.found
     apart = [*unlike(search, left), *shared(search, left)] if decision.verdict in ("consistent", "named") else []
-    apart += in_rows(search, left) if decision.verdict == "consistent" else []
+    apart += [*in_rows(search, left), *along(search, left)] if decision.verdict == "consistent" else []
     aside = asked.recording.observed_once & ~search.problem.keep
     apart += side_by_side(search.problem, final.residual / search.noise.sd, aside)
     any_unlike = bool(apart)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchcal.discovery.findings.symptoms import larger_than_given, shared
+from torchcal.discovery.findings.symptoms import larger_than_given
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses import verify
@@ -15,6 +15,7 @@ from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.own_noise import explains
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.noise import estimate, mine
+from torchcal.discovery.misfit.replicates import goes_on_along, in_common_at
 from torchcal.discovery.nameless import refit_nameless
 from torchcal.discovery.rounds import settle, with_all, with_explained, without_others
 from torchcal.discovery.several import refit_several
@@ -80,7 +81,7 @@ def judged(search: Search, problem: Problem, mask: Tensor | None, confidence: fl
     after = other.decision.verdict
     if search.stop.is_set() or after == "unexplained" or (before == "consistent" and after != before):
         return found
-    if after == "consistent" and shared(other.search, other.search.base):  # that is no noise of each datum
+    if after == "consistent" and _no_noise_of_each(other.search):
         return found
     return dataclasses.replace(other, larger_noise=larger)
 
@@ -113,6 +114,13 @@ def _may_be_noise(search: Search) -> bool:
     else a larger noise leaves as much unexplained."""
     nearest = sorted((model.found for model in search.models), key=lambda found: found.chi2)[:NEAREST]
     return any(_is_fast(search, found) for found in (search.base, *nearest))
+
+
+def _no_noise_of_each(search: Search) -> bool:
+    """Whether what the base leaves goes with a condition of several, which noise of each datum does not."""
+    problem = search.base.problem
+    left = search.base.residual / search.noise.sd[problem.index]
+    return bool(in_common_at(problem, left) or goes_on_along(problem, left))
 
 
 def _explained_by_place(search: Search) -> bool:

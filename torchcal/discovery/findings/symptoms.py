@@ -10,12 +10,12 @@ from torchcal.discovery.fits.problem import SWEEP, Problem, breaks, remembered
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.noise import GRID, LEAST, decorrelated, estimate
-from torchcal.discovery.misfit.replicates import in_common_at
+from torchcal.discovery.misfit.replicates import goes_on_along, in_common_at
 from torchcal.discovery.verdicts.doubts import ALONG, along_rows, goes_on
 from torchcal.discovery.verdicts.explain import estimates, stated_sd
 from torchcal.display import up_to, with_unit
 
-__all__ = ["in_rows", "larger_than_given", "more_than_replicates", "shared", "symptoms", "unlike"]
+__all__ = ["along", "in_rows", "larger_than_given", "more_than_replicates", "shared", "symptoms", "unlike"]
 
 #: A base parameter that moves by this many sd when a term is added was bent by it.
 BENT = 3.0
@@ -205,6 +205,19 @@ def shared(search: Search, found: Fitted) -> list[str]:
         f"differ by, in no order along {condition}: that is no noise of each datum, but something faster than the "
         f"values of {condition} are apart, or an error that data at one {condition} have in common, as of a setting"
         for name, condition, size in in_common_at(found.problem, found.residual / search.noise.sd[found.problem.index])
+    ]
+
+
+def along(search: Search, found: Fitted) -> list[str]:
+    """Outputs of which what a fit leaves goes on along a condition of several, in words."""
+    if search.exact:
+        return []
+    problem = found.problem
+    several = len(problem.recording.outputs) > 1
+    return [
+        f"what is left{f' of {name}' if several else ''} goes on along {condition}, from one datum to the next: that "
+        "is no noise of each, but something that changes faster than what was looked for"
+        for name, condition in goes_on_along(problem, search.noise.whitening(problem).vector(found.residual))
     ]
 
 

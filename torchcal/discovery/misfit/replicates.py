@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchcal.discovery.fits.problem import Problem, remembered
 
-__all__ = ["Replicates", "in_common_at", "replicates"]
+__all__ = ["Replicates", "goes_on_along", "in_common_at", "replicates"]
 
 #: Difference of replicates, in the size of the data, up to which they agree.
 ROUNDING = 1e-12
@@ -18,6 +18,8 @@ FEWEST, MOST = 3, 1024
 #: of its square that is shared from value to value up to which it is in no order; its probability by chance; and
 #: points at which the tail of that is taken.
 GROUPS, LARGER, SLOW, SHARED, TAIL = 8, 1.5, 0.4, 0.005, 2001
+#: Correlation of neighbours along a condition, in sd, from which on they go on.
+TOGETHER = 3.3
 
 
 @dataclass(frozen=True)
@@ -133,6 +135,23 @@ def in_common_at(problem: Problem, standard: Tensor) -> list[tuple[str, str, flo
             often = len(outputs) * len(conditions)
             if size > LARGER and not slow and _by_chance(between / whole, groups, n - groups) * often < SHARED:
                 found.append((name, condition, size))
+    return found
+
+
+def goes_on_along(problem: Problem, standard: Tensor) -> list[tuple[str, str]]:
+    """Outputs, and conditions of several in whose order residuals ``(n,)`` go on from each to the next. Noise of each
+    datum does not."""
+    conditions, outputs = problem.recording.x, problem.recording.outputs
+    if problem.in_time or not isinstance(conditions, dict) or len(conditions) < 2:
+        return []
+    found = []
+    for number, name in enumerate(outputs):
+        mine = (problem.output_of == number).nonzero()[:, 0]
+        for condition, values in conditions.items():
+            e = standard[mine[values[problem.condition_of[mine]].argsort(stable=True)]]
+            together = float(e[1:] @ e[:-1]) / max(float(e @ e), 1e-300) * math.sqrt(len(e))
+            if len(e) >= GROUPS and together > TOGETHER:
+                found.append((name, condition))
     return found
 
 
