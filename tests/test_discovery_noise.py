@@ -796,6 +796,20 @@ def test_white_noise_goes_on_along_no_condition():
     assert told <= most(300, 2 * 5e-4)
 
 
+def test_a_given_noise_is_kept_where_an_output_has_too_few_data_to_tell_another():
+    x = torch.linspace(0, 2, 60, dtype=F64)
+    w = torch.full_like(x, math.nan)
+    w[::30] = torch.tensor([1.0, 2.0], dtype=F64)
+    base = tc.Simulator(
+        lambda x, p: {"u": p["a"] + p["b"] * x, "w": p["c"] + p["d"] * x}, [tc.Parameter(name) for name in "abcd"]
+    )
+    y = {"u": 1 + x + draw(60, 0.1, 302), "w": w}
+    recording = tc.Recording(x=x, y=y, noise={"u": 0.03, "w": 0.1}, missing=True)
+    d = tc.diagnose(base, recording, [], progress=False)
+    assert d.noise.source == "given"
+    assert d.settings["larger_noise"].startswith(" of u is ")
+
+
 def test_a_given_noise_that_varies_keeps_its_pattern_where_it_is_larger():
     x = torch.linspace(0, 2, 60, dtype=F64)
     sizes = torch.linspace(0.02, 0.2, 60, dtype=F64)

@@ -21,6 +21,7 @@ from torchcal.discovery.rounds import settle, with_all, with_explained, without_
 from torchcal.discovery.several import refit_several
 from torchcal.discovery.verdicts.decision import Decision
 from torchcal.discovery.verdicts.verdict import decide
+from torchcal.errors import TorchcalError
 
 __all__ = ["Judged", "judged"]
 
@@ -76,7 +77,10 @@ def judged(search: Search, problem: Problem, mask: Tensor | None, confidence: fl
         return found
     problem = dataclasses.replace(problem, recording=problem.recording.with_noise(None))
     search = dataclasses.replace(search, problem=problem, unit=_pattern(problem, found.search.noise.sd), coarser=1.0)
-    search.calibrate_base()
+    try:
+        search.calibrate_base()
+    except TorchcalError:  # there may be too few data of one output to tell its noise
+        return found
     other = _judge(search, problem, mask, confidence, movable)
     after = other.decision.verdict
     if search.stop.is_set() or after == "unexplained" or (before == "consistent" and after != before):
