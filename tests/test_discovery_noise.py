@@ -108,14 +108,14 @@ def test_given_noise_is_taken():
     noise = noise_of(x, x + draw(60, 0.1, 1), 0.1)
     assert noise.source == "given"
     assert noise.freedom.tolist() == [math.inf]
-    assert noise.doubted == 1.0
+    assert noise.excess == {}
     torch.testing.assert_close(noise.sd, torch.full((60,), 0.1, dtype=F64))
 
 
 def test_given_noise_that_the_data_contradict_is_doubted():
     x = torch.linspace(0, 1, 60, dtype=F64)
     noise = noise_of(x, x + draw(60, 0.1, 1), 0.02)
-    assert noise.doubted == pytest.approx(5.0, rel=0.3)
+    assert noise.excess["y"] == pytest.approx(5.0, rel=0.3)
 
 
 def test_a_detailed_simulation_has_none():
@@ -808,6 +808,46 @@ def test_a_given_noise_is_kept_where_an_output_has_too_few_data_to_tell_another(
     d = tc.diagnose(base, recording, [], progress=False)
     assert d.noise.source == "given"
     assert d.settings["larger_noise"].startswith(" of u is ")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_misfit_of_one_output_is_not_hidden_by_the_noise_of_another(seed):
+    x = torch.linspace(0, 2, 60, dtype=F64)
+    w = torch.full_like(x, math.nan)
+    few = torch.arange(8) * 8
+    w[few] = (1 + x + 0.06 * x**2)[few] + draw(8, 0.01, 400 + seed)
+    base = tc.Simulator(
+        lambda x, p: {"u": p["a"] + p["b"] * x, "w": p["c"] + p["d"] * x}, [tc.Parameter(name) for name in "abcd"]
+    )
+    y = {"u": 1 + x + draw(60, 0.1, 410 + seed), "w": w}
+    recording = tc.Recording(x=x, y=y, noise={"u": 0.05, "w": 0.01}, missing=True)
+    d = tc.diagnose(base, recording, [], progress=False)
+    assert (d.verdict, d.noise.source) == ("unexplained", "given")
+
+
+def test_every_output_is_told_whose_noise_is_larger():
+    x = torch.linspace(0, 2, 60, dtype=F64)
+    base = tc.Simulator(
+        lambda x, p: {"u": p["a"] + p["b"] * x, "w": p["c"] + p["d"] * x}, [tc.Parameter(name) for name in "abcd"]
+    )
+    y = {"u": 1 + x + draw(60, 0.1, 302), "w": 2 - x + draw(60, 0.03, 303)}
+    d = tc.diagnose(base, tc.Recording(x=x, y=y, noise={"u": 0.04, "w": 0.01}), [], progress=False)
+    told = " ".join(str(d).split())
+    found = re.search(r"if the noise of u is (\d\.\d) times and that of w (\d\.\d) times as large as given", told)
+    assert found is not None, told
+    for times, (name, given) in zip(found.groups(), (("u", 0.04), ("w", 0.01)), strict=True):
+        assert float(times) == pytest.approx(d.noise.sd[name] / given, rel=0.05)
+
+
+def test_the_order_of_rows_is_no_order_of_a_condition():
+    rng = np.random.default_rng(5)
+    e = draw(36, 1.0, 5, phi=0.9)
+    x = {"dose": rng.uniform(0, 1, 36), "T": np.full(36, 300.0), "sex": np.arange(36) % 2.0}
+    problem = Problem.of(LINE, tc.Recording(x=x, y=e, noise=1.0))
+    assert {condition for _, condition in goes_on_along(problem, problem.y)} <= {"dose"}  # by chance
+    age, dose = (v.ravel() for v in np.meshgrid(np.linspace(0, 6, 12), np.linspace(0, 1, 12), indexing="ij"))
+    problem = Problem.of(LINE, tc.Recording(x={"dose": dose, "age": age}, y=np.sin(age), noise=1.0))
+    assert [condition for _, condition in goes_on_along(problem, problem.y)] == ["age"]
 
 
 def test_a_given_noise_that_varies_keeps_its_pattern_where_it_is_larger():

@@ -548,10 +548,10 @@ def test_the_fastest_part_is_that_of_the_best_model(monkeypatch):
     x = torch.linspace(-1, 1, 30, dtype=F64)
     rough = 0.5 * torch.sin(40 * x)  # no curve that is smooth on this spacing follows it
     base = dataclasses.replace(search.base, y=search.problem.y - rough, chi2=1e9)
-    search.base, search.noise = base, dataclasses.replace(search.noise, doubted=8.2)
-    assert symptoms.larger_than_given(search, best) == symptoms.larger_than_given(search, None) == ""
+    search.base, search.noise = base, dataclasses.replace(search.noise, excess={"y": 8.2})
+    assert symptoms.larger_than_given(search, best) == symptoms.larger_than_given(search, None) == {}
     search.models = []
-    assert symptoms.larger_than_given(search, None).endswith(" times")
+    assert symptoms.larger_than_given(search, None)["y"] > 2
 
 
 def untold(columns, sd):
@@ -644,6 +644,9 @@ def test_noise_that_is_given_too_small_says_of_what():
     y = {"y": x + 0.01 * torch.randn(60, generator=generator, dtype=F64),
          "z": 1 + 1.0 * torch.randn(60, generator=generator, dtype=F64)}  # fmt: skip
     d = tc.diagnose(base, tc.Recording(x=x, y=y, noise=0.01), [], progress=False)
+    assert any(row.startswith("the noise of z is ") and row.endswith(" the sd that was given") for row in d.symptoms)
+    recording = tc.Recording(x=x, y={"y": y["y"], "z": y["z"] + 5 * (x > 0)}, noise=0.01)
+    d = tc.diagnose(base, recording, [], progress=False)
     assert any(row.startswith("the fastest part of the residual of z is ") for row in d.symptoms)
 
 

@@ -16,6 +16,7 @@ from torchcal.discovery.findings.result import Diagnosis
 from torchcal.discovery.findings.symptoms import (
     along,
     in_rows,
+    in_times,
     larger_than_given,
     more_than_replicates,
     shared,
@@ -104,7 +105,7 @@ def conclude(judged: Judged, asked: Asked, *, interrupted: str = "") -> Diagnosi
     aside = asked.recording.observed_once & ~search.problem.keep
     apart += side_by_side(search.problem, final.residual / search.noise.sd, aside)
     any_unlike = bool(apart)
-    larger_noise = judged.larger_noise or larger_than_given(search, best)
+    larger_noise = in_times(judged.larger_noise or larger_than_given(search, best), search.problem.recording.outputs)
     if decision.verdict != "consistent":
         # Of what has no name the best fit tells the noise: the base leaves the misfit too, which goes on along rows.
         every = () if best is not None else (model.found for model in (*search.models, *search.nameless))

@@ -22,7 +22,7 @@ from torchcal.discovery.fits.starts import starts
 from torchcal.discovery.fits.trial import check_repeats, warn_if_coarse, warn_if_long
 from torchcal.discovery.hypotheses import verify
 from torchcal.discovery.hypotheses.search import Search
-from torchcal.discovery.judged import judged
+from torchcal.discovery.judged import Judged, judged
 from torchcal.discovery.verdicts.decision import Decision
 from torchcal.discovery.verdicts.given import resolved, told_apart
 from torchcal.display import NONE, units_of
@@ -153,7 +153,7 @@ def diagnose(
             if holdout is not None and mask is not None:
                 verify.check_left(search.base, mask)
             found = judged(search, problem, mask, confidence, movable=holdout is None)
-            interrupted = _interruption(found.search)
+            interrupted = _interruption(found)
             if interrupted:
                 _hold_back(found.search, found.decision)
             return conclude(found, asked, interrupted=interrupted)
@@ -174,10 +174,13 @@ def _hold_back(search: Search, decision: Decision) -> None:
         decision.doubt = "As the search was interrupted, that is no name."
 
 
-def _interruption(search: Search) -> str:
+def _interruption(found: Judged) -> str:
     """In words; empty where there was none."""
+    search = found.search
     if not search.stop.is_set():
         return ""
+    if found.cut:
+        return "The search was interrupted before the same had been tried with a larger noise than was given."
     left = search.unfinished
     missing = f"{', '.join(left)} had been refitted" if left else "all their combinations and ranges had been compared"
     return f"The search was interrupted before {missing}."

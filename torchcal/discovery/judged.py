@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from torchcal.discovery.hypotheses import verify
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.own_noise import explains
 from torchcal.discovery.hypotheses.search import Search
-from torchcal.discovery.misfit.noise import estimate, mine
+from torchcal.discovery.misfit.noise import EXCESS, estimate, mine
 from torchcal.discovery.misfit.replicates import goes_on_along, in_common_at
 from torchcal.discovery.nameless import refit_nameless
 from torchcal.discovery.rounds import settle, with_all, with_explained, without_others
@@ -41,14 +41,16 @@ class Judged:
         decision: The verdict on them.
         mask: Which data are held out, or None.
         suspect: Terms that may explain what was set aside as outliers.
-        larger_noise: How many times larger than given the noise was taken to be, as `larger_than_given`; or empty.
+        larger_noise: How many times as large as given the noise was taken to be, by output; empty where it was not.
+        cut: Whether a second search, with a larger noise, was interrupted.
     """
 
     search: Search
     decision: Decision
     mask: Tensor | None
     suspect: tuple[str, ...] = ()
-    larger_noise: str = ""
+    larger_noise: dict[str, float] = field(default_factory=dict)
+    cut: bool = False
 
     @property
     def best(self) -> Model | None:
@@ -72,22 +74,41 @@ def judged(search: Search, problem: Problem, mask: Tensor | None, confidence: fl
     """
     found = _judge(search, problem, mask, confidence, movable)
     before = found.decision.verdict
-    larger = "" if before == "named" or search.stop.is_set() else larger_than_given(found.search, found.best)
+    larger = {} if before == "named" or search.stop.is_set() else larger_than_given(found.search, found.best)
     if not larger or not _may_be_noise(found.search) or _explained_by_place(found.search):
         return found
     problem = dataclasses.replace(problem, recording=problem.recording.with_noise(None))
     search = dataclasses.replace(search, problem=problem, unit=_pattern(problem, found.search.noise.sd), coarser=1.0)
     try:
         search.calibrate_base()
+        other = _judge(search, problem, mask, confidence, movable)
     except TorchcalError:  # there may be too few data of one output to tell its noise
         return found
-    other = _judge(search, problem, mask, confidence, movable)
+    if search.stop.is_set():
+        return dataclasses.replace(found, cut=True)
     after = other.decision.verdict
-    if search.stop.is_set() or after == "unexplained" or (before == "consistent" and after != before):
+    if after == "unexplained" or (before == "consistent" and after != before):
         return found
     if after == "consistent" and _no_noise_of_each(other.search):
         return found
-    return dataclasses.replace(other, larger_noise=larger)
+    times = _times(found.search.noise.sd, other.search)
+    if not times or any(_grown(other.search, name, size) for name, size in times.items() if name not in larger):
+        return found
+    return dataclasses.replace(other, larger_noise=times)
+
+
+def _times(given: Tensor, search: Search) -> dict[str, float]:
+    """How many times as large as given the noise of a search is, of the outputs where it is larger."""
+    ratio = search.noise.sd / given
+    each = {name: ratio[mine(search.problem, k)] for k, name in enumerate(search.problem.recording.outputs)}
+    return {name: float(own.median()) for name, own in each.items() if float(own.median()) > EXCESS}
+
+
+def _grown(search: Search, output: str, times: float) -> bool:
+    """Whether the noise of an output, which nothing contradicts, is taken for larger than chance makes it: that hides
+    what it misses."""
+    freedom = float(search.noise.freedom[search.problem.recording.outputs.index(output)])
+    return times > EXCESS * (1 + CHANCE / math.sqrt(2 * max(freedom, 1.0)))
 
 
 def _judge(search: Search, problem: Problem, mask: Tensor | None, confidence: float, movable: bool) -> Judged:
@@ -123,7 +144,7 @@ def _may_be_noise(search: Search) -> bool:
 def _no_noise_of_each(search: Search) -> bool:
     """Whether what the base leaves goes with a condition of several, which noise of each datum does not."""
     problem = search.base.problem
-    left = search.base.residual / search.noise.sd[problem.index]
+    left = search.noise.whitening(problem).vector(search.base.residual)
     return bool(in_common_at(problem, left) or goes_on_along(problem, left))
 
 

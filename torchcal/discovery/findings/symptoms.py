@@ -1,6 +1,7 @@
 """What gives a mismatch away beside the residual's structure: bent values, and noise that is not as it should be."""
 
 import math
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -15,7 +16,7 @@ from torchcal.discovery.verdicts.doubts import ALONG, along_rows, goes_on
 from torchcal.discovery.verdicts.explain import estimates, stated_sd
 from torchcal.display import up_to, with_unit
 
-__all__ = ["along", "in_rows", "larger_than_given", "more_than_replicates", "shared", "symptoms", "unlike"]
+__all__ = ["along", "in_rows", "in_times", "larger_than_given", "more_than_replicates", "shared", "symptoms", "unlike"]
 
 #: A base parameter that moves by this many sd when a term is added was bent by it.
 BENT = 3.0
@@ -36,7 +37,7 @@ SCATTER, MEANS, RARELY = 1.5, 8, 0.005
 def symptoms(search: Search, best: Model | None, larger: str) -> list[str]:
     """Calibrated values, and sizes of the residual, that give the mismatch away, in words.
 
-    ``larger`` is what `larger_than_given` says.
+    ``larger`` is what `in_times` says of the noise.
     """
     base, then = search.base, {}
     if best is not None:
@@ -58,8 +59,10 @@ def symptoms(search: Search, best: Model | None, larger: str) -> list[str]:
             f"{count} of {search.problem.recording.n} rows are others once more, numbers and all, as of a table or a "
             "run that was read twice: they count once"
         )
-    if larger:
+    if larger and search.noise.source == "given":
         rows.append(f"the fastest part of the residual{larger} the noise sd that was given")
+    elif larger:
+        rows.append(f"the noise{larger} the sd that was given")
     if search.coarser > 1:
         rows.append(
             f"the calibrated base misses the data by so many times the noise sd that was given that arithmetic cannot "
@@ -71,19 +74,31 @@ def symptoms(search: Search, best: Model | None, larger: str) -> list[str]:
     return rows
 
 
-def larger_than_given(search: Search, best: Model | None) -> str:
-    """How many times the noise that was given the fastest part of what is left is, and of which output where there are
-    several, as "of a is 2.8 times" behind a space; empty where it is no larger than chance would make it."""
-    if search.noise.doubted <= 1:
-        return ""
+def larger_than_given(search: Search, best: Model | None) -> dict[str, float]:
+    """How many times the noise that was given the fastest part of what is left is, of the outputs where it is larger
+    than chance would make it."""
+    if not search.noise.excess:
+        return {}
     # A misfit that is smooth on coarse spacing passes for fast: what leaves less tells more of the noise.
     base, leader = search.base, best or search.physical_leader
     left = base if leader is None or leader.found.chi2 > base.chi2 else leader.found
     noise = estimate(left.problem, left.residual, left.jacobian, search.problem.recording.noise)
-    if noise.doubted <= 1:
+    return {name: times * search.coarser for name, times in noise.excess.items()}
+
+
+def in_times(larger: Mapping[str, float], outputs: Sequence[str]) -> str:
+    """Factors in a sentence, behind a space, with the outputs where there are several; empty without any.
+
+    >>> in_times({"a": 2.84}, ["a"]), in_times({"a": 2.84, "b": 1.4}, ["a", "b"])
+    (' is 2.8 times', ' of a is 2.8 times and that of b 1.4 times')
+    """
+    if not larger:
         return ""
-    of = f" of {noise.doubted_of}" if len(search.problem.recording.outputs) > 1 else ""
-    return f"{of} is {up_to(noise.doubted * search.coarser)} times"
+    if len(outputs) == 1:
+        return f" is {up_to(next(iter(larger.values())))} times"
+    (first, times), *others = larger.items()
+    text = f" of {first} is {up_to(times)} times"
+    return text + "".join(f" and that of {name} {up_to(more)} times" for name, more in others)
 
 
 def _too_large(search: Search, found: Fitted) -> list[str]:
@@ -204,7 +219,9 @@ def shared(search: Search, found: Fitted) -> list[str]:
         f"data at one {condition} share what is left{f' of {name}' if several else ''}, {size:.1f} times what they "
         f"differ by, in no order along {condition}: that is no noise of each datum, but something faster than the "
         f"values of {condition} are apart, or an error that data at one {condition} have in common, as of a setting"
-        for name, condition, size in in_common_at(found.problem, found.residual / search.noise.sd[found.problem.index])
+        for name, condition, size in in_common_at(
+            found.problem, search.noise.whitening(found.problem).vector(found.residual)
+        )
     ]
 
 
@@ -215,8 +232,8 @@ def along(search: Search, found: Fitted) -> list[str]:
     problem = found.problem
     several = len(problem.recording.outputs) > 1
     return [
-        f"what is left{f' of {name}' if several else ''} goes on along {condition}, from one datum to the next: that "
-        "is no noise of each, but something that changes faster than what was looked for"
+        f"what is left{f' of {name}' if several else ''} goes on along {condition}, from one value to the next: that "
+        "is no noise of each datum, but something that changes faster than what was looked for"
         for name, condition in goes_on_along(problem, search.noise.whitening(problem).vector(found.residual))
     ]
 

@@ -71,7 +71,7 @@ def _headline(d: Any) -> str:
         choices = [called(d, tied) for tied in first]
         choices += [f"one of {len(known) - HEADLINE} others"] if len(first) < len(known) else []
         choices += [called(d, NONE)] if len(known) < len(d.tied) else []
-        return "Verdict: ambiguous: " + ", or ".join(choices)
+        return "Verdict: ambiguous: " + ", or ".join(choices) + (_if_larger(d) if d.noise.source != "given" else "")
     return "Verdict: unexplained (something is missing that is not in this library)"
 
 

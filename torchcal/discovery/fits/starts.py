@@ -75,7 +75,7 @@ def _alike(problem: Problem) -> dict[int, tuple[float, float, bool]]:
     for r, run in enumerate(bound.runs):
         for state, unit in states.items():
             name = initial_name(state, r, len(bound.runs))
-            if name not in bound.initial_names or name not in places:
+            if name not in bound.initial_names or name not in places or not unit:
                 continue
             like = [y for one, y in run.outputs.items() if one in reads and states[reads[one]] == unit]
             values = torch.cat([y[torch.isfinite(y)] for y in like]) if like else torch.zeros(0)
@@ -134,12 +134,13 @@ def follow_slopes(problem: Problem, begin: Tensor) -> Tensor:
             left = torch.stack([(rates[:, r, i] - slope) / scale for r, i, slope, scale in targets], dim=-1)
             rows = [torch.autograd.grad(left[:, k].sum(), leaf, retain_graph=True, allow_unused=True)[0]
                     if left.requires_grad else None for k in range(left.shape[1])]  # fmt: skip
-        now = torch.zeros_like(off).index_add(1, run_of_target, left.detach().square())
+        jacobian = torch.stack([torch.zeros_like(leaf) if row is None else row for row in rows], dim=-2)
+        acts = (jacobian != 0).any(-1).any(0)  # others are no matter of what a run begins with
+        now = torch.zeros_like(off).index_add(1, run_of_target, torch.where(acts, left.detach().square(), 0.0))
         nearer = (now <= NEARER * off)[:, run_of_place]  # what a state has no say in leads ever farther away
         values = values.index_copy(1, torch.tensor(places), values[:, places].where(nearer, before[:, places]))
         if step == STEPS:
             break
-        jacobian = torch.stack([torch.zeros_like(leaf) if row is None else row for row in rows], dim=-2)
         sound = torch.isfinite(jacobian).flatten(1).all(-1) & torch.isfinite(left).all(-1)
         jacobian = torch.where(sound[:, None, None], jacobian, torch.zeros_like(jacobian))
         change = torch.linalg.pinv(jacobian, rtol=1e-6) @ torch.nan_to_num(left.detach(), 0.0, 0.0, 0.0).unsqueeze(-1)

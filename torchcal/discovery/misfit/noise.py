@@ -18,7 +18,7 @@ from torchcal.discovery.records import NoiseModel
 from torchcal.errors import DomainError
 
 __all__ = [
-    "GRID", "LEAST", "Noise", "decorrelated", "estimate", "least", "log_prior", "mine", "quantisation"
+    "EXCESS", "GRID", "LEAST", "Noise", "decorrelated", "estimate", "least", "log_prior", "mine", "quantisation"
 ]  # fmt: skip
 
 #: AR(1) coefficients that are tried.
@@ -51,11 +51,11 @@ class Noise:
         source: As in `NoiseModel`.
         sizes: Noise sd at each coefficient in `GRID`, by output, ``(outputs, grid)``; of a known noise, in its sd; of
             an unknown one, in `unit`.
-        doubted: By how much the residual's fastest part exceeds the noise given, where that is a contradiction; else 1.
+        excess: How many times the noise given the residual's fastest part is, of the outputs where that is a
+            contradiction.
         step: As in `NoiseModel`.
         unit: Of unknown noise, its sd in units of its median, ``(n_total,)``; see `growth`.
         log_density: Of what it was estimated from, with the prior of the correlation, up to a constant.
-        doubted_of: The output of which it is doubted most, where it is.
     """
 
     sd: Tensor
@@ -64,11 +64,10 @@ class Noise:
     posterior: Tensor
     source: str
     sizes: Tensor
-    doubted: float = 1.0
+    excess: dict[str, float] = dataclasses.field(default_factory=dict)
     step: dict[str, float] = dataclasses.field(default_factory=dict)
     unit: Tensor = dataclasses.field(default_factory=lambda: torch.ones(()))
     log_density: float = 0.0
-    doubted_of: str = ""
 
     @property
     def open(self) -> bool:
@@ -133,7 +132,8 @@ def estimate(
     known = given if isinstance(given, Tensor) else unit
     replicated = replicates(problem) if given is None else None
     sd = known.clone()
-    doubted, doubted_of, log_density = 1.0, "", 0.0
+    excess: dict[str, float] = {}
+    log_density = 0.0
     for output in range(outputs):
         parts = problem.recorded_of(output)
         n = sum(len(places) for places in parts)
@@ -191,13 +191,12 @@ def estimate(
             else:
                 sd[mask], freedom[output] = scale * unit[mask], usable
         elif scale > EXCESS * (1 + 2 / math.sqrt(2 * usable)):
-            doubted_of = recording.outputs[output] if scale > doubted else doubted_of
-            doubted = max(doubted, scale)
+            excess[recording.outputs[output]] = scale
     step = quantisation(problem) if given is None else {}
     if given is None:
         sd = torch.maximum(sd, least(problem, step))
     source = "given" if isinstance(given, Tensor) else "replicates" if replicated is not None else "estimated"
-    return Noise(sd, correlation, freedom, posterior, source, table, doubted, step, unit, log_density, doubted_of)
+    return Noise(sd, correlation, freedom, posterior, source, table, excess, step, unit, log_density)
 
 
 def _cautious(posterior: Tensor) -> int:

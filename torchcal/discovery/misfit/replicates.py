@@ -139,8 +139,8 @@ def in_common_at(problem: Problem, standard: Tensor) -> list[tuple[str, str, flo
 
 
 def goes_on_along(problem: Problem, standard: Tensor) -> list[tuple[str, str]]:
-    """Outputs, and conditions of several in whose order residuals ``(n,)`` go on from each to the next. Noise of each
-    datum does not."""
+    """Outputs, and conditions of several along which residuals ``(n,)`` go on from each value to the next, whatever the
+    other conditions are. Noise of each datum does not."""
     conditions, outputs = problem.recording.x, problem.recording.outputs
     if problem.in_time or not isinstance(conditions, dict) or len(conditions) < 2:
         return []
@@ -148,9 +148,12 @@ def goes_on_along(problem: Problem, standard: Tensor) -> list[tuple[str, str]]:
     for number, name in enumerate(outputs):
         mine = (problem.output_of == number).nonzero()[:, 0]
         for condition, values in conditions.items():
-            e = standard[mine[values[problem.condition_of[mine]].argsort(stable=True)]]
+            _, which, count = values[problem.condition_of[mine]].unique(return_inverse=True, return_counts=True)
+            if len(count) < GROUPS:
+                continue
+            e = torch.zeros(len(count), dtype=torch.float64).index_add_(0, which, standard[mine]) / count.sqrt()
             together = float(e[1:] @ e[:-1]) / max(float(e @ e), 1e-300) * math.sqrt(len(e))
-            if len(e) >= GROUPS and together > TOGETHER:
+            if together > TOGETHER:
                 found.append((name, condition))
     return found
 
@@ -159,6 +162,6 @@ def _by_chance(share: float, one: int, other: int) -> float:
     """Probability of so large a share of a sum of squares for one of two sums of as many squares of white noise: the
     tail of a beta distribution."""
     a, b = 0.5 * one, 0.5 * other
-    t = torch.linspace(share, 1.0, TAIL, dtype=torch.float64)[:-1]
+    t = torch.linspace(min(share, 1 - 1e-9), 1.0, TAIL, dtype=torch.float64)[:-1]
     scale = math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b)
     return float(torch.trapezoid((scale + (a - 1) * t.log() + (b - 1) * (1 - t).log()).exp(), t))
