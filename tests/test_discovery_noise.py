@@ -845,7 +845,7 @@ def test_the_order_of_rows_is_no_order_of_a_condition():
     x = {"dose": rng.uniform(0, 1, 36), "T": np.full(36, 300.0), "sex": np.arange(36) % 2.0}
     problem = Problem.of(LINE, tc.Recording(x=x, y=e, noise=1.0))
     assert {condition for _, condition in goes_on_along(problem, problem.y)} <= {"dose"}  # by chance
-    age, dose = (v.ravel() for v in np.meshgrid(np.linspace(0, 6, 12), np.linspace(0, 1, 12), indexing="ij"))
+    age, dose = (v.ravel() for v in np.meshgrid(np.linspace(0, 6, 24), np.linspace(0, 1, 12), indexing="ij"))
     problem = Problem.of(LINE, tc.Recording(x={"dose": dose, "age": age}, y=np.sin(age), noise=1.0))
     assert [condition for _, condition in goes_on_along(problem, problem.y)] == ["age"]
 
