@@ -1,6 +1,7 @@
 """Cases at the edge of what `diagnose` is made for: names, bounds at one side, runs with nothing in them, no misfit."""
 
 import math
+import re
 import warnings
 
 import numpy as np
@@ -418,12 +419,14 @@ def test_noise_in_few_data_is_no_pair():
     assert sum(d.verdict != "consistent" for d in found) < 2
 
 
-@pytest.mark.parametrize(("ratio", "name"), [(1.0, True), (1.5, False)])
-def test_a_name_leaves_no_more_than_the_noise_that_is_given(ratio, name):
+@pytest.mark.parametrize(("ratio", "source"), [(1.0, "given"), (1.5, "estimated")])
+def test_a_name_leaves_no_more_than_the_noise_that_is_given_or_says_so(ratio, source):
     x = torch.linspace(-1, 1, 120, dtype=F64)
     y = 1 + x + 2 * x**2 + 0.1 * ratio * noise(120, 5)
     d = diagnose(LINE, tc.Recording(x=x, y=y, noise=0.1), [SQUARE])
-    assert (d.terms == ["square"]) is name
+    assert (d.terms, d.noise.source) == (["square"], source)
+    larger = re.search(r"named: square, if the noise is 1\.[3-7] times as large as given", str(d))
+    assert (larger is not None) is (ratio > 1)
 
 
 def test_an_output_without_noise_is_not_judged_by_its_rounding():
