@@ -117,11 +117,10 @@ def follow_slopes(problem: Problem, begin: Tensor) -> Tensor:
             targets.append((r, names.index(state), each, max(scale, 1e-12)))
     if not targets:
         return begin
-    own = {initial_name(name, r, len(bound.runs)): r for r in range(len(bound.runs)) for name in names}
     places = [i for i, q in enumerate(problem.parameters) if q.name in bound.initial_names and q.initial is None]
     if not places:
         return begin
-    run_of_place = torch.tensor([own[problem.parameters[i].name] for i in places])
+    run_of_place = torch.tensor([bound.layout.origins[i][1] for i in places])
     run_of_target = torch.tensor([r for r, *_ in targets])
     low, high = problem.limits()
     values, before, off = begin, begin, torch.full((len(begin), len(bound.runs)), torch.inf, dtype=torch.float64)
