@@ -36,6 +36,7 @@ from torchcal.discovery.records import Scores, Table
 from torchcal.discovery.verdicts import explain
 from torchcal.discovery.verdicts.decision import Decision
 from torchcal.discovery.verdicts.given import begun_elsewhere, held_otherwise, unbounded
+from torchcal.discovery.verdicts.intervals import by_profile
 from torchcal.discovery.verdicts.lost import is_lost, misfit_in_spreads
 from torchcal.discovery.verdicts.verdict import PLAINLY_WHITE
 from torchcal.errors import ConvergenceWarning, warn
@@ -93,7 +94,11 @@ def conclude(judged: Judged, asked: Asked, *, interrupted: str = "") -> Diagnosi
     if shown is not None:
         search.examine(shown)
     base = explain.fit_record(search.base, search.structure, ())
-    final = base if best is None else explain.fit_record(best.found, best.structure, best.names, best.window)
+    final = base
+    if best is not None:
+        if not search.exact:
+            best.intervals = by_profile(best.found, best.candidate.own)
+        final = explain.fit_record(best.found, best.structure, best.names, best.window, best.intervals)
     lost = is_lost(search, decision)
     _warn(search, lost)
     before = _scores(search, search.base, mask)

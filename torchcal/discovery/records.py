@@ -90,6 +90,8 @@ class Estimate:
         sd: Standard deviation; infinite where the data do not say.
         unit: Its unit, where known.
         at_bound: Whether the estimate lies on one of its bounds.
+        interval: 95 % interval by profile likelihood where ``value ± 1.96 sd`` is none, of what is named; an end is
+            infinite where the data leave it open. Else None.
     """
 
     name: str
@@ -97,6 +99,7 @@ class Estimate:
     sd: float
     unit: str | None = None
     at_bound: bool = False
+    interval: tuple[float, float] | None = None
 
     def __str__(self) -> str:
         return f"{self.name} = {self.amount}"
@@ -106,7 +109,17 @@ class Estimate:
         """Value, sd and unit in words."""
         spread = f" ± {self.sd:.2g}" if math.isfinite(self.sd) else " (not determined)"
         text = f"{placed(self.value, 100 * self.sd)}{spread}"  # to where the sd begins at least
-        return with_unit(text, self.unit) + (" (at its bound)" if self.at_bound else "")
+        return with_unit(text, self.unit) + (" (at its bound)" if self.at_bound else "") + self.asymmetry
+
+    @property
+    def asymmetry(self) -> str:
+        """The interval in words that the sd do not tell; empty where they do."""
+        if self.interval is None:
+            return ""
+        low, high = (placed(end, 100 * self.sd) for end in self.interval)
+        if math.isinf(self.interval[0]):
+            return f" (95 %: below {high})"
+        return f" (95 %: {low} to {high})" if math.isfinite(self.interval[1]) else f" (95 %: above {low})"
 
 
 @dataclass(frozen=True)

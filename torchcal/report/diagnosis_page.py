@@ -253,7 +253,10 @@ def _estimates(diagnosis: Any) -> str:
         if final:
             row["accepted model"] = Right(_estimate(final.get(name)))
         rows.append(row)
-    return section("Estimates", table(rows, "Value ± standard deviation, fitted to all data."))
+    caption = "Value ± standard deviation, fitted to all data"
+    if any(item.interval for item in final.values()):
+        caption += "; the 95 % interval, by profile likelihood, where 1.96 standard deviations on either side are none"
+    return section("Estimates", table(rows, f"{caption}."))
 
 
 def _held_out(diagnosis: Any) -> str:
@@ -389,7 +392,7 @@ def _estimate(item: Any) -> str:
     if item is None:
         return "–"
     text = f"{in_digits(item.value)} ± {in_digits(item.sd, 2)}"
-    return text + (" (at its bound)" if item.at_bound else "")
+    return text + (" (at its bound)" if item.at_bound else "") + item.asymmetry
 
 
 def _flat(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

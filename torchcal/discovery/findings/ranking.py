@@ -87,7 +87,7 @@ def _refitted(search: Search, model: Model, share: float, others: list[int], hel
         terms=model.names,
         log_evidence=model.log_evidence,
         probability=share,
-        estimates=explain.estimates(model.found, model.candidate.own, model.window),
+        estimates=explain.estimates(model.found, model.candidate.own, model.window, model.intervals),
         physical=model.physical,
         misfit_removed=explain.removed(search, model),
         p_white=model.structure.p_value if model.structure else None,

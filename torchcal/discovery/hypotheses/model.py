@@ -1,6 +1,6 @@
 """A hypothesis: the base with terms that might have been left out."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from torch import Tensor
 
@@ -33,6 +33,7 @@ class Model:
         note: What speaks against it.
         window: Where it acts, if locally.
         structure: What is left; filled in for the best.
+        intervals: 95 % intervals of what its sd mislead about, by place; filled in for what is named.
     """
 
     numbers: tuple[int, ...]
@@ -47,6 +48,7 @@ class Model:
     window: Window | None = None
     structure: Structure | None = None
     residual: Residual | None = None
+    intervals: dict[int, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:

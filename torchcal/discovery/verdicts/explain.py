@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -57,8 +57,13 @@ HARDLY, TOGETHER = 0.05, 0.98
 MOVED = 2.0
 
 
-def estimates(found: Fitted, places: Sequence[int], window: Window | None = None) -> tuple[Estimate, ...]:
-    """Estimates of some parameters. Without noise the misfit takes its place.
+def estimates(
+    found: Fitted,
+    places: Sequence[int],
+    window: Window | None = None,
+    intervals: Mapping[int, tuple[float, float]] | None = None,
+) -> tuple[Estimate, ...]:
+    """Estimates of some parameters, with their intervals where there are any. Without noise the misfit takes its place.
 
     An sd beyond what the bounds allow, or far beyond the estimate, says that the data do not determine it. Where the
     edge of a static window is a step, its end is known by the gaps between data that it may lie in.
@@ -78,7 +83,7 @@ def estimates(found: Fitted, places: Sequence[int], window: Window | None = None
         if spread > min(1e5 * abs(value) or math.inf, allowed):
             spread = math.inf
         at_bound = i in bound or (i in found.free and value in (q.low, q.high) and not is_window(q.name))
-        result.append(Estimate(q.name, value, spread, unit, at_bound))
+        result.append(Estimate(q.name, value, spread, unit, at_bound, (intervals or {}).get(i)))
     return tuple(result)
 
 
@@ -118,7 +123,11 @@ def misfit_size(found: Fitted) -> float:
 
 
 def fit_record(
-    found: Fitted, structure: Structure | None, terms: tuple[str, ...], window: Window | None = None
+    found: Fitted,
+    structure: Structure | None,
+    terms: tuple[str, ...],
+    window: Window | None = None,
+    intervals: Mapping[int, tuple[float, float]] | None = None,
 ) -> Fit:
     """A fit as a record."""
     recording = found.problem.recording
@@ -126,7 +135,7 @@ def fit_record(
     residual = torch.where(recording.observed, recording.y - whole.y[0], torch.full_like(recording.y, math.nan))
     return Fit(
         terms,
-        estimates(found, found.free, window),
+        estimates(found, found.free, window, intervals),
         whole.y[0],
         residual,
         found.chi2,

@@ -1,0 +1,132 @@
+"""Intervals of estimates by the profile of χ², against a grid of values that are held one by one."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import torchcal as tc
+from torchcal.discovery.fits.fitting import fit
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.records import Estimate
+from torchcal.discovery.verdicts.intervals import SIDES, by_profile
+
+F64 = torch.float64
+X = torch.linspace(0.1, 6, 40, dtype=F64)
+K = 2
+
+
+def uptake(x, p):
+    return p["a"] + p["c"] * x / (x + p["K"])
+
+
+def line(x, p):
+    return p["a"] + p["c"] * x
+
+
+def fitted(y, sd, model=uptake, truth=(1.0, 3.0, 4.0), **k):
+    """The best fit, from the truth."""
+    parameters = [tc.Parameter("a"), tc.Parameter("c")]
+    if len(truth) > 2:
+        parameters.append(tc.Parameter("K", **{"low": 0.01, "initial": 1.0} | k))
+    problem = Problem.of(tc.Simulator(model, parameters), tc.Recording(x=X, y=y, noise=sd))
+    whitening = problem.whitening(torch.full_like(y, sd), torch.zeros(1, dtype=F64))
+    return fit(problem, whitening, torch.tensor([truth], dtype=F64), list(range(len(truth))))
+
+
+def data(seed, sd=0.03, truth=(1.0, 3.0, 4.0)):
+    a, c, k = truth
+    noise = torch.randn(len(X), generator=torch.Generator().manual_seed(seed), dtype=F64)
+    return a + c * X / (X + k) + sd * noise
+
+
+def on_a_grid(y, sd, grid):
+    """χ² at values of K that are held, the others by linear least squares."""
+    x, y = X.numpy(), y.numpy()
+    designs = (np.stack([np.ones_like(x), x / (x + k)], 1) for k in grid)
+    return np.array([((y - a @ np.linalg.lstsq(a, y, rcond=None)[0]) ** 2).sum() / sd**2 for a in designs])
+
+
+@pytest.mark.parametrize("scale", [{}, {"transform": "log"}])
+@pytest.mark.parametrize("seed", range(3))
+def test_ends_are_where_chi2_has_risen_enough(seed, scale):
+    y = data(seed, 0.2)
+    found = fitted(y, 0.2, **scale)
+    low, high = by_profile(found, [K])[K]
+    rise = on_a_grid(y, 0.2, [low, high]) - found.chi2
+    assert rise == pytest.approx(SIDES**2, rel=0.05)
+    value, sd = float(found.values[K]), float(found.sd()[K])
+    assert high - value > 1.3 * SIDES * sd > SIDES * sd > value - low  # it is skewed, towards large values
+
+
+def test_where_the_sd_tell_it_there_is_no_interval():
+    y = 1.0 + 0.5 * X + 0.1 * torch.randn(40, generator=torch.Generator().manual_seed(1), dtype=F64)
+    found = fitted(y, 0.1, line, (1.0, 0.5))
+    assert by_profile(found, [0, 1]) == {}
+    assert by_profile(fitted(data(0, 1e-3), 1e-3), [0, 1, K]) == {}  # so precise that the curve is straight
+
+
+def test_an_end_on_a_bound_is_the_bound():
+    y = data(0, 0.2)
+    low, high = by_profile(fitted(y, 0.2), [K])[K]
+    wall = 0.95 * high
+    assert by_profile(fitted(y, 0.2, high=wall), [K])[K] == (pytest.approx(low), wall)
+
+
+def test_an_end_that_the_data_leave_open_is_infinite():
+    """Where a curve saturates far beyond the data it is nearly straight: any larger K will do."""
+    truth = (1.0, 6.0, 25.0)
+    y = data(2, 0.1, truth)
+    found = fitted(y, 0.1, truth=truth)
+    low, high = by_profile(found, [K])[K]
+    assert on_a_grid(y, 0.1, [1e6])[0] - found.chi2 < SIDES**2
+    assert math.isinf(high)
+    assert on_a_grid(y, 0.1, [low])[0] - found.chi2 == pytest.approx(SIDES**2, rel=0.05)
+
+
+def test_what_lies_at_a_bound_or_is_held_is_left_out():
+    y = data(0, 0.1)
+    found = fitted(y, 0.1, high=2.0)
+    assert found.stuck == ["K"]
+    assert by_profile(found, [K]) == {}
+
+
+def test_they_hold_the_truth_as_often_as_they_say():
+    """Of 200 recordings; the standard deviations, of the same fits, do so less often."""
+    truth, trials = (1.0, 3.0, 4.0), 200
+    held = usual = 0
+    for seed in range(trials):
+        found = fitted(data(100 + seed, 0.2), 0.2)
+        value, sd = float(found.values[K]), float(found.sd()[K])
+        low, high = by_profile(found, [K]).get(K, (value - SIDES * sd, value + SIDES * sd))
+        held += low <= truth[2] <= high
+        usual += abs(value - truth[2]) <= SIDES * sd
+    tolerance = 3.0 * math.sqrt(0.95 * 0.05 * trials)
+    assert abs(held - 0.95 * trials) <= tolerance
+    assert held > usual
+
+
+def test_a_diagnosis_tells_them():
+    term = tc.Term(
+        "uptake",
+        outputs={"y": lambda x, p, y: y + p["c"] * x / (x + p["K"])},
+        parameters=[tc.Parameter("c"), tc.Parameter("K", low=0.01, high=200.0, initial=1.0)],
+    )
+    base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    diagnosis = tc.diagnose(base, tc.Recording(x=X, y=data(0, 0.1) + 0.5 * X, noise=0.1), [term], progress=False)
+    assert diagnosis.verdict == "named"
+    estimate = next(e for e in diagnosis.final.estimates if e.name == "uptake.K")
+    assert estimate.interval is not None
+    assert estimate.interval[0] < estimate.value < estimate.interval[1]
+    assert str(estimate) in str(diagnosis)
+    assert "95 %: " in str(estimate)
+    assert all(e.interval is None for e in diagnosis.base.estimates)
+
+
+def test_in_words():
+    both = Estimate("drag.c", 2.744, 0.58, "1/m", interval=(1.963, 4.574))
+    assert str(both) == "drag.c = 2.744 ± 0.58 1/m (95 %: 1.963 to 4.574)"
+    assert str(Estimate("k", 2.0, 0.5, interval=(1.1, math.inf))) == "k = 2 ± 0.5 (95 %: above 1.1)"
+    assert str(Estimate("k", 2.0, 0.5, interval=(-math.inf, 2.5))) == "k = 2 ± 0.5 (95 %: below 2.5)"
+    assert both.asymmetry == " (95 %: 1.963 to 4.574)"
