@@ -11,6 +11,10 @@ import pytest
 import torch
 
 import torchcal as tc
+from torchcal.discovery.fits.candidates import prepare
+from torchcal.discovery.fits.fitting import fit
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.fits.starts import starts
 from torchcal.discovery.hypotheses.verify import within
 from torchcal.discovery.records import (
     Estimate,
@@ -1003,6 +1007,38 @@ def test_a_threshold_whose_tangent_vanishes_at_neutral():
     d = quiet(simulator, tc.Recording(x=x, y=y, noise=0.1), [term])
     assert d.verdict == "named"
     assert d.terms == ["product"]
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_an_amount_that_is_absorbed_begins_at_every_rate(swapped):
+    """Neither a rate nor an amount does anything alone, and at a rate of nearly none the effect has the wrong sign: what
+    is linear is the amount."""
+    time = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0, 12.0, 16.0, 20.0, 24.0])
+    time = time.double()
+    ka, ke, dose = 1.4, 0.1, 10.0
+    c = dose * ka / (ka - ke) * (torch.exp(-ke * time) - torch.exp(-ka * time))
+    c = c + 0.15 * torch.randn(len(time), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    base = tc.ODESimulator(lambda t, s, p, u: {"c": -p["k"] * s["c"]}, {"c": "mg/L"},
+                           [tc.Parameter("k", unit="1/h", low=0.0, high=20.0, initial=0.1)])  # fmt: skip
+    own = [tc.Parameter("ka", unit="1/h", low=0.0, high=10.0, initial=1.0),
+           tc.Parameter("g0", unit="mg/L", low=0.0, high=50.0, initial=8.0)]  # fmt: skip
+    gut = tc.Term(
+        "gut",
+        rates={"c": lambda t, s, p, u: p["ka"] * s["gut"], "gut": lambda t, s, p, u: -p["ka"] * s["gut"]},
+        states={"gut": "mg/L"},
+        initial={"gut": lambda s, p: p["g0"]},
+        parameters=own[::-1] if swapped else own,
+    )
+    recording = tc.Recording(runs=[tc.Run(time, {"c": c})], noise=0.15)
+    problem = Problem.of(base, recording)
+    found = fit(problem, problem.whitening(torch.full_like(recording.y, 0.15), torch.zeros(1).double()),
+                starts(problem, 4, 0), list(range(len(problem.parameters))))  # fmt: skip
+    candidate = prepare(problem, found, [gut], {})
+    assert [candidate.problem.parameters[i].name for i in candidate.amplitudes] == ["gut.g0"]
+    d = quiet(base, recording, [gut])
+    assert d.terms == ["gut"]
+    assert estimate_of(d, "gut.ka").value == pytest.approx(ka, abs=0.3)
+    assert estimate_of(d, "gut.g0").value == pytest.approx(dose, abs=1.0)
 
 
 def test_replicates_of_a_static_recording():

@@ -24,6 +24,8 @@ __all__ = ["Candidate", "base_columns", "prepare", "replaces", "spread_values", 
 A_LITTLE = 0.03
 #: Change of the outputs, relative to their size, that counts as none.
 UNCHANGED = 1e-6
+#: Share of an effect by which it may miss its tangent and be linear.
+LINEAR = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,6 +269,9 @@ def _in_pieces(linear: object, rows: Tensor, amplitudes: list[int]) -> Tensor:
 def _hidden_amplitudes(
     problem: Problem, own: list[int], certain: list[bool], begin: Tensor, linear: object
 ) -> list[int]:
+    """Of parameters that do nothing alone, the one whose effect beside the others, away from neutral, is most linear:
+    what an initial amount of an unseen state does is in proportion to it, and what a rate from there does is not."""
+    found, least = own[0], math.inf
     for place, sure in zip(own, certain, strict=True):
         if not sure:
             continue
@@ -274,7 +279,15 @@ def _hidden_amplitudes(
         for other in own:
             if other != place:
                 row[other] = shape_points(problem.parameters[other], 1)[0]
-        jacobian = linear(row[None], [place])[1]  # type: ignore[operator]
-        if bool((torch.nan_to_num(jacobian).abs() > 0).any()):
-            return [place]
-    return [own[0]]
+        acting = row.clone()
+        acting[place] = shape_points(problem.parameters[place], 1)[0]
+        y, jacobian = linear(torch.stack([row, acting]), [place])  # type: ignore[operator]
+        tangent = torch.nan_to_num(jacobian[0, :, 0])
+        if not bool((tangent.abs() > 0).any()):
+            continue
+        change, size = y[1] - y[0], (tangent * (acting[place] - row[place])).norm()
+        bend = float((change - tangent * (acting[place] - row[place])).norm() / size.clamp_min(1e-300))
+        bend = max(bend, LINEAR) if math.isfinite(bend) else 1 / LINEAR
+        if bend < least:
+            found, least = place, bend
+    return [found]
