@@ -189,7 +189,7 @@ def test_the_evidence_of_a_wave_is_that_of_the_linear_model(size):
     model = tc.Simulator(lambda x, p: p["a"] + 0 * x, [tc.Parameter("a")])
     problem = Problem.of(model, tc.Recording(x=t, y=y, noise=1.0))
     channel = Channel("output", "y", None, {"x": t}, t, torch.ones(len(t), dtype=F64))
-    lines = Lines.of(problem, channel, "x", 4)
+    lines = Lines.of(problem, channel, 4)
     assert lines is not None
     assert len(lines.frequencies) > 50
     found = lines._log(size, lines._seen(y[:, None]))[:, 0]
@@ -228,3 +228,43 @@ def test_no_wave_stands_in_for_a_term_where_samples_come_in_bursts(seed):
     run = tc.Run(time=t, outputs={"x": y}, inputs={"L": inflow}, initial={"x": 4.0})
     d = tc.diagnose(basin, tc.Recording(runs=[run], noise=0.05), [second], seed=0, progress=False)
     assert d.terms == ["second order"]
+
+
+def tide(seed: int, size: float, *, clock: str = "up") -> tuple:
+    """Levels that follow the wind, which has a memory, every hour, and a wave of 2.7 h."""
+    g = torch.Generator().manual_seed(seed)
+    t, wind = torch.arange(200, dtype=F64), torch.zeros(200, dtype=F64)
+    push, noise = torch.randn(2, 200, generator=g, dtype=F64)
+    for i in range(1, 200):
+        wind[i] = 0.95 * wind[i - 1] + 0.3 * push[i]
+    y = 1 + 0.5 * wind + 0.1 * (size * torch.sin(2 * math.pi * t / 2.7) + noise)
+    order = {"up": slice(None), "down": torch.arange(199, -1, -1), "none": torch.randperm(200, generator=g)}[clock]
+    x = {"t": t[order], "wind": wind[order]}
+    base = tc.Simulator(lambda x, p: p["a"] + p["c"] * x["wind"], [tc.Parameter("a"), tc.Parameter("c")])
+    trend = tc.Term("trend", outputs={"y": lambda x, p, y: y + p["r"] * x["t"]}, parameters=[tc.Parameter("r")])
+    return base, x, y[order], [trend]
+
+
+@pytest.mark.parametrize(("noise", "clock"), [(None, "up"), (0.1, "up"), (None, "down")])
+def test_an_oscillation_along_a_clock_is_seen_beside_another_condition(noise, clock):
+    base, x, y, terms = tide(0, 2.0, clock=clock)
+    d = tc.diagnose(base, tc.Recording(x=x, y=y, noise=noise), terms, progress=False)
+    assert d.verdict == "unexplained"
+    assert d.where[0].driver == "t"
+    assert "oscillates with t (period 2.7)" in " ".join(str(d).split())
+
+
+def test_noise_along_a_clock_is_no_oscillation():
+    for seed in range(3):
+        base, x, y, terms = tide(seed, 0.0)
+        assert tc.diagnose(base, tc.Recording(x=x, y=y), terms, progress=False).verdict == "consistent"
+
+
+def test_a_clock_is_what_every_row_follows_the_one_before_in():
+    base, x, y, _ = tide(0, 0.0)
+    assert Problem.of(base, tc.Recording(x=x, y=y)).clock[0] == "t"
+    assert Problem.of(base, tc.Recording(x=x, y=y)).order is None  # the wind does what it likes
+    base, x, y, _ = tide(0, 0.0, clock="none")
+    assert Problem.of(base, tc.Recording(x=x, y=y)).clock is None
+    both = {"t": x["t"].sort().values, "u": x["t"].sort().values ** 2}
+    assert Problem.of(base, tc.Recording(x=both, y=y)).clock is None  # there are two, and nobody says which

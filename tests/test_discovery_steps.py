@@ -78,7 +78,7 @@ def test_what_was_taken_out_counts_for_itself_and_for_no_other():
     each = [sudden.evidence_of(residual, k) for k in range(sum(kind.shape[1] for kind in functions_of(sudden)))]
     assert np.logaddexp.reduce(each) == pytest.approx(evidence, abs=1e-9)
     assert int(np.argmax(each)) == number
-    lines = Lines.of(found.problem, next(c for c in channels(found.problem, found) if c.kind == "output"), "x", 12)
+    lines = Lines.of(found.problem, next(c for c in channels(found.problem, found) if c.kind == "output"), 12)
     every, number = lines.evidence(residual.e[:, None], SIZES)
     each = [lines.evidence_of(residual, torch.tensor(k), SIZES) for k in range(len(lines.frequencies))]
     assert np.logaddexp.reduce(each) == pytest.approx(float(every[0]), abs=1e-9)

@@ -144,6 +144,17 @@ class Problem:
         return x
 
     @cached_property
+    def clock(self) -> tuple[str, Tensor] | None:
+        """Name and values of what the data were recorded along: what they follow each other in, or of several
+        conditions one that rises, or falls, from every row to the next."""
+        x = self.recording.x
+        if self.order is not None:
+            return "t" if self.in_time else next(iter(x)) if isinstance(x, dict) else "x", self.order
+        steps = {name: values.diff() for name, values in x.items()}  # type: ignore[union-attr]
+        along = [name for name, step in steps.items() if bool((step > 0).all()) or bool((step < 0).all())]
+        return (along[0], x[along[0]]) if len(along) == 1 else None  # type: ignore[index]
+
+    @cached_property
     def levels(self) -> tuple[Tensor, Tensor]:
         """Different conditions ``(m, C)``, and which of them every row is at, ``(rows,)``."""
         return self.recording.columns.unique(dim=0, return_inverse=True)  # type: ignore[no-any-return]

@@ -41,7 +41,7 @@ class Lines:
 
     Attributes:
         channel: The output.
-        driver: Along what: time, or the only condition.
+        driver: Along what: time, or the condition that they were recorded along.
         along: That, at every datum, ``(n,)``.
         parts: Places of the data of every run, and their cells on the grid.
         size: Cells, with as many empty ones behind.
@@ -60,20 +60,21 @@ class Lines:
     step: float
 
     @classmethod
-    def of(cls, problem: Problem, channel: Channel, driver: str, functions: int) -> "Lines | None":
+    def of(cls, problem: Problem, channel: Channel, functions: int) -> "Lines | None":
         """Of an output; None where its data follow in nothing, or are too few or too uneven.
 
         Args:
             problem: The used data.
             channel: Of kind ``"output"``.
-            driver: What its data follow in.
-            functions: How many smooth functions are tried along the same.
+            functions: How many smooth functions are tried along what its data follow in.
         """
-        if problem.order is None:
+        if problem.clock is None:
             return None
         number = problem.recording.outputs.index(channel.target)
-        along = problem.order[problem.condition_of]
+        driver, clock = problem.clock
+        along = clock[problem.condition_of]
         runs = [p for p in problem.sequences if int(problem.output_of[p[0]]) == number and len(p) >= LEAST_RUN]
+        runs = [places[along[places].argsort(stable=True)] for places in runs]
         gaps = [along[places].diff() for places in runs]
         moving = torch.cat([gap[gap > 0] for gap in gaps]) if gaps else torch.zeros(0)
         count = sum(len(places) for places in runs)
@@ -202,8 +203,7 @@ def lines_of(
     available: Sequence[Channel],
     step: Mapping[str, float],
     sd: Tensor,
-    driver: str,
-    functions: Callable[[int], int],
+    functions: Callable[[int, str], int],
 ) -> list[Lines]:
     """Of all outputs but those that are recorded in steps as large as their noise.
 
@@ -212,17 +212,18 @@ def lines_of(
         available: All channels, of which outputs are taken.
         step: Of quantised outputs.
         sd: Of the used data, ``(n,)``.
-        driver: What data follow in.
-        functions: How many smooth functions are tried along that, by the number of data.
+        functions: How many smooth functions are tried along what data follow in, by the number of data and its name.
     """
-    found = []
+    found: list[Lines] = []
+    if problem.clock is None:
+        return found
     for channel in available:
         if channel.kind != "output":
             continue
         mine = channel.matrix != 0
         if step.get(channel.target, 0.0) > COARSE * float(sd[mine].median() if bool(mine.any()) else math.inf):
             continue
-        lines = Lines.of(problem, channel, driver, functions(int(mine.sum())))
+        lines = Lines.of(problem, channel, functions(int(mine.sum()), problem.clock[0]))
         if lines is not None:
             found.append(lines)
     return found

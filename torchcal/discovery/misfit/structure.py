@@ -104,11 +104,9 @@ def _counts(problem: Problem, data: int, driver: str) -> list[int]:
 def _lines(residual: Residual, available: Sequence[Channel]) -> list[Lines]:
     """Oscillations of every output."""
     problem = residual.found.problem
-    x = problem.recording.x
-    driver = "t" if problem.in_time else next(iter(x)) if isinstance(x, dict) else "x"
     return lines_of(
-        problem, available, quantisation(problem), residual.found.whitening.sd, driver,
-        lambda data: _counts(problem, data, driver)[-1],
+        problem, available, quantisation(problem), residual.found.whitening.sd,
+        lambda data, driver: _counts(problem, data, driver)[-1],
     )  # fmt: skip
 
 
