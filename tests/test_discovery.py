@@ -1011,8 +1011,8 @@ def test_a_threshold_whose_tangent_vanishes_at_neutral():
 
 @pytest.mark.parametrize("swapped", [False, True])
 def test_an_amount_that_is_absorbed_begins_at_every_rate(swapped):
-    """Neither a rate nor an amount does anything alone, and at a rate of nearly none the effect has the wrong sign: what
-    is linear is the amount."""
+    """Neither a rate nor an amount does anything alone, and at hardly any rate the effect has the wrong sign: what is
+    linear is the amount."""
     time = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0, 12.0, 16.0, 20.0, 24.0])
     time = time.double()
     ka, ke, dose = 1.4, 0.1, 10.0
