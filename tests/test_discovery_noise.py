@@ -870,3 +870,40 @@ def test_a_given_noise_that_is_right_is_kept(monkeypatch):
             d = given_half(1 + x + effect * x**2 + draw(60, 0.1, 300 + seed), 0.1)
             assert d.noise.source == "given"
     assert len(asked) <= most(16, 0.03)
+
+
+def killed(seed: int, lost: float, *, memory: float = 0.0, runs: int = 6, together: bool = True) -> tuple:
+    """Logarithms of what is left of as many cultures by as many doses, all sampled at the same times; something takes
+    the same from each of them between 3 and 4 h."""
+    g = torch.Generator().manual_seed(seed)
+    t = torch.tensor([0.0, 0.3, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.5, 8.0], dtype=F64)
+    each = []
+    for i in range(runs):
+        noise = torch.randn(len(t), generator=g, dtype=F64)
+        for k in range(1, len(t)):
+            noise[k] = memory * noise[k - 1] + math.sqrt(1 - memory**2) * noise[k]
+        taken = lost * (t - (3.0 if together else 1.0 + i)).clamp(0.0, 1.0)
+        y = 6.0 - 0.1 * (i + 1) * t - taken + 0.12 * noise
+        each.append(tc.Run(t, {"L": y}, inputs={"C": torch.full_like(t, float(i + 1))}))
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"L": p["m"] - p["k"] * u["C"]}, {"L": "1"},
+        [tc.Parameter("m", unit="1/h"), tc.Parameter("k", unit="1/h", low=0.0, initial=0.1)],
+    )  # fmt: skip
+    return base, tc.Recording(runs=each, units={"time": "h"})
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_all_runs_do_at_one_time_is_no_noise(seed):
+    """Slow noise of unknown size would explain each run, and not all of them alike."""
+    base, recording = killed(seed, 0.8)
+    d = tc.diagnose(base, recording, [], progress=False)
+    assert d.verdict == "unexplained"
+    assert d.where[0].driver == "t"
+    assert d.noise.sd["L"] == pytest.approx(0.12, rel=0.35)
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.7])
+def test_noise_of_runs_that_share_their_times_is_consistent(memory):
+    for seed in range(3):
+        base, recording = killed(seed, 0.0, memory=memory)
+        assert tc.diagnose(base, recording, [], progress=False).verdict == "consistent"

@@ -7,6 +7,7 @@ judged by the noise that another one needs: each has its own, and the data decid
 import dataclasses
 import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -30,8 +31,10 @@ ROUGH = 4
 #: Shares of the noise sd beyond smooth curves that are tried where there are several conditions: these curves may not
 #: bend as much there as what is unknown.
 SMALLER = (1.0, 0.75, 0.5, 0.35, 0.25)
+#: Times that runs share from which on what they differ by there tells of the noise, and by how much less it must be.
+SHARED, LESS = 6, 0.9
 
-#: Places in `GRID` and in `SMALLER`, by output.
+#: Places in `GRID` and among the shares of the sd that are tried, by output.
 _Places = tuple[tuple[int, ...], tuple[int, ...]]
 
 
@@ -181,7 +184,7 @@ def with_unknown(
 
         def evidence(at: _Places) -> float:
             if at not in found:
-                tried = _at(model, noise, *at)
+                tried = _at(model, noise, *at, shares)
                 w = tried.whitening(problem)
                 residuals = [Residual(weighed(one, w), tried, draws=0) for one in peeled]
                 seen, rough = evidences(residuals[-1], looks, available, sudden)
@@ -192,7 +195,7 @@ def with_unknown(
                 found[at] = tried, like + gain, rough
             return found[at][1]
 
-        factors = range(len(SMALLER) if noise.open and problem.order is None else 1)
+        shares = _shares(problem, noise, peeled[-1].residual)
         places = tuple(int((GRID - rho).abs().argmin()) for rho in noise.correlation)
         best = places, (0,) * len(places)
         evidence(best)
@@ -200,7 +203,7 @@ def with_unknown(
             before = best
             for k, n in enumerate(torch.bincount(problem.output_of, minlength=len(places)).tolist()):
                 rhos = {best[0][k], *TRIED} if n >= LEAST and problem.sweeps is not None else {best[0][k]}
-                wanted = itertools.product(rhos, factors if n else (0,))
+                wanted = itertools.product(rhos, range(len(shares[k])) if n else (0,))
                 best = max((_with(best, k, *one) for one in wanted), key=evidence)
             if best == before:
                 break
@@ -223,8 +226,45 @@ def _with(at: _Places, k: int, rho: int, factor: int) -> _Places:
     return (*at[0][:k], rho, *at[0][k + 1 :]), (*at[1][:k], factor, *at[1][k + 1 :])
 
 
-def _at(model: Fitted, noise: Noise, places: tuple[int, ...], smaller: tuple[int, ...]) -> Noise:
-    """The noise model at other coefficients, by their places in `GRID`, and sizes, by those in `SMALLER`."""
+def _shares(problem: Problem, noise: Noise, residual: Tensor) -> list[Tensor]:
+    """Shares of the sd beyond smooth curves that are tried with each coefficient in `GRID`, by output ``(m, grid)``, the
+    whole first.
+
+    What is unknown may be quicker than these curves. Where runs share their times it may be the same in all of them, and
+    noise is what they differ by.
+    """
+    whole, found = torch.ones(1, len(GRID), dtype=torch.float64), []
+    for k in range(len(noise.correlation)):
+        shares = whole
+        if noise.open and problem.order is None:
+            shares = torch.tensor(SMALLER, dtype=torch.float64)[:, None] * whole
+        elif noise.open and (size := _between_runs(problem, noise, residual, k)) is not None:
+            shares = torch.cat([whole, size / noise.sizes[k].clamp_min(1e-300)[None]])
+        found.append(shares)
+    return found
+
+
+def _between_runs(problem: Problem, noise: Noise, residual: Tensor, output: int) -> float | None:
+    """Noise sd of an output by what its runs differ by at the times that they share, where that is less than its sd."""
+    own = problem.output_of == output
+    if not problem.in_time or len(problem.recorded_of(output)) < 2:
+        return None
+    at = problem.order[problem.condition_of[own]]  # type: ignore[index]
+    times, which, count = at.unique(return_inverse=True, return_counts=True)
+    n = int(own.sum())
+    if len(times) < SHARED or n < 2 * len(times):
+        return None
+    unit = noise.unit[problem.index[own]]
+    size = residual[own] / unit
+    mean = torch.zeros(len(times), dtype=torch.float64).index_add_(0, which, size) / count
+    within = math.sqrt(float((size - mean[which]).square().sum()) / (n - len(times)))
+    return within if 0 < within < LESS * float((noise.sd[problem.index[own]] / unit).median()) else None
+
+
+def _at(
+    model: Fitted, noise: Noise, places: tuple[int, ...], smaller: tuple[int, ...], shares: Sequence[Tensor]
+) -> Noise:
+    """The noise model at other coefficients, by their places in `GRID`, and sizes, by those in ``shares``."""
     correlation = GRID[list(places)]
     sd, posterior = noise.sd.clone(), noise.posterior.clone()
     for output, (place, factor) in enumerate(zip(places, smaller, strict=True)):
@@ -232,7 +272,7 @@ def _at(model: Fitted, noise: Noise, places: tuple[int, ...], smaller: tuple[int
         if other:
             posterior[output] = (torch.arange(len(GRID)) == place).to(posterior)
         if noise.open:
-            sd[here] = SMALLER[factor] * (noise.sizes[output, place] * noise.unit[here] if other else sd[here])
+            sd[here] = shares[output][factor, place] * (noise.sizes[output, place] * noise.unit[here] if other else sd[here])
     if noise.open:
         sd = torch.maximum(sd, least(model.problem, noise.step))
     return dataclasses.replace(noise, sd=sd, correlation=correlation, posterior=posterior)
