@@ -12,7 +12,8 @@ from torchcal.discovery.fits import candidates
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit import outliers
-from torchcal.discovery.verdicts import doubts, instruments
+from torchcal.discovery.verdicts import doubts, instruments, verdict
+from torchcal.discovery.verdicts.decision import Decision
 from torchcal.discovery.verdicts.verdict import _worth_telling
 from torchcal.errors import ConvergenceWarning
 
@@ -520,6 +521,27 @@ def test_what_is_clearly_less_likely_than_the_base_is_no_explanation(weight, pro
     model = SimpleNamespace(weight=weight)
     decision = SimpleNamespace(probability={id(model): probability})
     assert _worth_telling(decision, model) is worth
+
+
+@pytest.mark.parametrize(
+    ("window", "share", "tied"),
+    [
+        ("u > 0.07", 0.22, [["radiation"], ["convection", "radiation"], ["none of these"]]),
+        ("u > 0.07", 0.03, [["radiation"], ["none of these"]]),
+        (None, 0.22, [["radiation"], ["none of these"]]),
+    ],
+)
+def test_a_doubtful_window_is_tied_with_what_has_the_same_everywhere_and_more(monkeypatch, window, share, tied):
+    def model(names, window=None):
+        return SimpleNamespace(names=names, window=window, physical=True, note="", numbers=(0,))
+
+    best, pair = model(("radiation",), window), model(("convection", "radiation"))
+    search, decision = SimpleNamespace(models=[best, pair], plain={}), Decision()
+    decision.probability = {id(best): 0.9 - share, id(pair): share}
+    monkeypatch.setattr(verdict, "doubt", lambda search, model: "Too few values tell where it begins.")
+    verdict._name(search, decision, best, None)
+    assert (decision.verdict, decision.tied) == ("ambiguous", tied)
+    assert [list(m.names) for m in decision.tied_models] == tied[:-1]
 
 
 def test_without_noise_what_is_no_physics_has_no_probability():

@@ -374,5 +374,5 @@ def formulas(model: Model) -> list[str]:
             text += f" (its t counted from the first sample of the {term.elapsed})"
         if model.window is not None:
             text += f" where {model.where}"
-        rows.append(f"{text}, with " + "; ".join(str(e) for e in estimates(model.found, own, model.window)))
+        rows.append(f"{text}, with " + "; ".join(map(str, estimates(model.found, own, model.window, model.intervals))))
     return rows

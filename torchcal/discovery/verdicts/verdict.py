@@ -215,7 +215,11 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
 def _worth_telling(decision: Decision, model: Model) -> bool:
     """Whether a hypothesis is an explanation: it may not be clearly less likely than the base."""
     behind = math.log(PRIOR["base"]) - model.weight
-    return behind <= 0 or (behind <= WORSE and decision.probability[id(model)] >= WORTH)
+    return behind <= 0 or (behind <= WORSE and _is_worth(decision, model))
+
+
+def _is_worth(decision: Decision, model: Model) -> bool:
+    return decision.probability[id(model)] >= WORTH
 
 
 def _perhaps_noise(search: Search, ranked: Sequence[Model], decision: Decision) -> None:
@@ -304,7 +308,11 @@ def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) 
     if sure < SURE or decision.doubt or not shown.physical:
         decision.verdict = "ambiguous"
         if alone:
-            decision.tied, decision.tied_models = [list(best.names)], [best]
+            # What acts in a window may stand in for the same everywhere and something beside it.
+            more = [m for m in holding if best.window is not None and len(m.names) > len(best.names)]
+            more = [m for m in more if m.window is None and _is_worth(decision, m)]
+            decision.tied_models = [best, *sorted(more, key=lambda m: -decision.probability[id(m)])]
+            decision.tied = [list(names) for names in dict.fromkeys(m.names for m in decision.tied_models)]
         decision.tied.append(list(NONE))
         return
     decision.verdict, decision.best = "named", shown
