@@ -569,3 +569,55 @@ def test_steps_are_looked_at_of_what_may_matter_beside_the_best(monkeypatch, num
     found = refitting._sharp_enough(searched, one, fitted, 100.0)
     assert (found == "finer") is sharpened
     assert asked == ([840.0] if sharpened else [])
+
+
+# --- initial states that outputs are functions of ------------------------------------------------------------------
+
+
+def logged(runs=6, *, outputs=("L",), seed=0):
+    """Amounts that decay, of which a logarithm is recorded, or what an instrument of unknown gain shows of them."""
+    t = torch.linspace(0, 4, 12, dtype=F64)
+    each = []
+    for i in range(runs):
+        c = 60.0 * (i + 1) * torch.exp(-0.9 * t)
+        shown = {"L": c.log() + 0.05 * draws(12, seed=seed + i), "A": 0.02 * c + 0.01 * draws(12, seed=90 + seed + i)}
+        each.append(tc.Run(t, {name: shown[name] for name in outputs}))
+    seen = {"L": lambda t, s, p, u: torch.log(s["c"]), "A": lambda t, s, p, u: p["gain"] * s["c"]}
+    parameters = [tc.Parameter("k", low=0.0, initial=1.0)]
+    if "A" in outputs:
+        parameters.append(tc.Parameter("gain", low=0.0, initial=0.01))
+    base = tc.ODESimulator(lambda t, s, p, u: {"c": -p["k"] * s["c"]}, {"c": "mg/L"}, parameters,
+                           observe={name: seen[name] for name in outputs})  # fmt: skip
+    return base, tc.Recording(runs=each)
+
+
+@pytest.mark.parametrize("outputs", [("L",), ("A",), ("L", "A")])
+def test_every_second_start_begins_where_the_outputs_do(outputs):
+    base, recording = logged(outputs=outputs)
+    problem = Problem.of(base, recording)
+    values = starts(problem, 8, 0)
+    bound = problem.simulator
+    shown = bound.readings(values, bound.layout.start(values)).reshape(8, len(outputs), -1)
+    first, spread = (values.reshape(len(outputs), 6, 12)[..., 0] for values in (recording.y, recording.spread))
+    off = (shown.reshape(8, len(outputs), 6, 12)[..., 0] - first) / spread
+    assert float(off[1::2].abs().max()) < (0.05 if len(outputs) == 1 else 2.0)
+    assert not float(off[0::2].nan_to_num(nan=9.0).abs().max()) < 0.05
+
+
+def test_what_is_held_or_read_already_is_not_moved():
+    base, recording = logged()
+    problem = Problem.of(base, recording)
+    place = next(i for i, q in enumerate(problem.parameters) if q.name == "c(0)[2]")
+    assert starts(problem, 8, 0, {place: 3.0})[:, place].tolist() == [3.0] * 8
+    read = tc.ODESimulator(lambda t, s, p, u: {"c": -p["k"] * s["c"]}, {"c": "mg/L"}, [tc.Parameter("k", low=0.0)])
+    t = torch.linspace(0, 4, 12, dtype=F64)
+    problem = Problem.of(read, tc.Recording(runs=[tc.Run(t, {"c": torch.exp(-t)})]))
+    assert starts(problem, 8, 0)[0, -1] == pytest.approx(1.0)
+
+
+def test_a_base_whose_outputs_are_logarithms_of_unknown_amounts_is_consistent():
+    base, recording = logged()
+    d = tc.diagnose(base, recording, [], progress=False)
+    assert d.verdict == "consistent"
+    k = next(e for e in d.base.estimates if e.name == "k")
+    assert abs(k.value - 0.9) < 4 * k.sd < 0.1

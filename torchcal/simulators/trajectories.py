@@ -236,6 +236,11 @@ class Trajectories(Simulator):
         with torch.no_grad():
             return self._observe(values.detach(), states, wanted)[0]
 
+    def readings(self, values: Tensor, start: Tensor) -> Tensor:
+        """Recorded outputs ``(H, n_total)`` at all samples, of states ``(H, R, S)`` that stay as they begin."""
+        p = self.layout.by_name(values, self.grid.run_of)
+        return self._measure(p, start[:, self.grid.run_of], self.recording.outputs)
+
     def along(self, states: Tensor) -> dict[str, Tensor]:
         """Time, states and inputs at the ends of all steps, each ``(R, K + 1)``; of one solution."""
         found = {"t": self.grid.nodes}

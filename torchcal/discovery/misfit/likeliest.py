@@ -227,11 +227,11 @@ def _with(at: _Places, k: int, rho: int, factor: int) -> _Places:
 
 
 def _shares(problem: Problem, noise: Noise, residual: Tensor) -> list[Tensor]:
-    """Shares of the sd beyond smooth curves that are tried with each coefficient in `GRID`, by output ``(m, grid)``, the
-    whole first.
+    """Shares of the sd beyond smooth curves that are tried with each coefficient in `GRID`, by output ``(m, grid)``,
+    the whole first.
 
-    What is unknown may be quicker than these curves. Where runs share their times it may be the same in all of them, and
-    noise is what they differ by.
+    What is unknown may be quicker than these curves. Where runs share their times it may be the same in all of them,
+    and noise is what they differ by.
     """
     whole, found = torch.ones(1, len(GRID), dtype=torch.float64), []
     for k in range(len(noise.correlation)):
@@ -272,7 +272,8 @@ def _at(
         if other:
             posterior[output] = (torch.arange(len(GRID)) == place).to(posterior)
         if noise.open:
-            sd[here] = shares[output][factor, place] * (noise.sizes[output, place] * noise.unit[here] if other else sd[here])
+            size = noise.sizes[output, place] * noise.unit[here] if other else sd[here]
+            sd[here] = shares[output][factor, place] * size
     if noise.open:
         sd = torch.maximum(sd, least(model.problem, noise.step))
     return dataclasses.replace(noise, sd=sd, correlation=correlation, posterior=posterior)
