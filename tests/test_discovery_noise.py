@@ -5,6 +5,7 @@ Every tolerance follows from the number of seeds: five standard errors, or the b
 
 import math
 import re
+import types
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from torchcal.discovery.fits.fitting import fit
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.base import calibrate_base
 from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.judged import _explained_by_place
 from torchcal.discovery.misfit.curves import orthonormal, smooth_columns
 from torchcal.discovery.misfit.noise import Noise, estimate
 from torchcal.discovery.misfit.outliers import lone, spikes
@@ -907,3 +909,21 @@ def test_noise_of_runs_that_share_their_times_is_consistent(memory):
     for seed in range(3):
         base, recording = killed(seed, 0.0, memory=memory)
         assert tc.diagnose(base, recording, [], progress=False).verdict == "consistent"
+
+
+@pytest.mark.parametrize(
+    ("n", "chi2", "evidence", "share", "explained"),
+    [
+        (18, 91.5, 17.6, 0.97, False),  # measured on noise of twice the sd that was given
+        (18, 91.5, 30.0, 0.97, True),
+        (18, 91.5, 30.0, 0.5, False),
+        (60, 230.0, 18.2, 0.94, True),  # measured on a ripple
+    ],
+)
+def test_a_change_of_few_data_is_no_explanation_where_a_larger_noise_is_likelier(n, chi2, evidence, share, explained):
+    places = [types.SimpleNamespace(evidence=one, share=share) for one in (evidence, 3.0, 1.0)]
+    base = types.SimpleNamespace(chi2=chi2, free=[0, 1])
+    search = types.SimpleNamespace(
+        structure=types.SimpleNamespace(places=places), base=base, problem=types.SimpleNamespace(n=n)
+    )
+    assert _explained_by_place(search) is explained

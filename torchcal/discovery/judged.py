@@ -30,6 +30,8 @@ __all__ = ["Judged", "judged"]
 NEAREST, SLOWER = 12, 1.5
 #: Sd by which χ² may exceed its expectation by chance.
 CHANCE = 2.0
+#: Data of which some change in one place leaves hardly anything.
+FEW = 40
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,11 +151,19 @@ def _no_noise_of_each(search: Search) -> bool:
 
 
 def _explained_by_place(search: Search) -> bool:
-    """Whether an unknown change in one place leaves no more than the noise that was given."""
-    freedom = max(search.problem.n - len(search.base.free), 1)
-    share = max((place.share for place in search.structure.places), default=0.0)
-    left = 1 + (1 - share) * (search.base.chi2 / freedom - 1)
-    return left <= 1 + CHANCE * math.sqrt(2 / freedom)
+    """Whether an unknown change in one place leaves no more than the noise that was given; and of few data, of which
+    some change leaves hardly anything, is likelier than a larger noise."""
+    places, n, chi2 = search.structure.places, search.problem.n, search.base.chi2
+    freedom = max(n - len(search.base.free), 1)
+    share = max((place.share for place in places), default=0.0)
+    left = 1 + (1 - share) * (chi2 / freedom - 1)
+    if not places or left > 1 + CHANCE * math.sqrt(2 / freedom):
+        return False
+    if n >= FEW:
+        return True
+    change = max(place.evidence for place in places) - math.log(len(places)) - 0.5 * chi2
+    larger = -0.5 * (n * math.log(chi2 / freedom) + freedom + math.log(n))  # a size that is estimated (BIC)
+    return change > larger
 
 
 def _is_fast(search: Search, found: Fitted) -> bool:
