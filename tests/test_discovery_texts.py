@@ -355,8 +355,8 @@ def test_the_likeliest_rival_is_told(rows, told):
     ("beside", "told"),
     [
         ((), "The next best without it, something that is not in this library, has a probability of 0.03"),
-        (("drag",), "That something which is not in this library acts beside it has a probability of 0.03."),
-        (("drag", "bias"), "That something which is not in this library acts beside it has a probability of 0.03."),
+        (("drag",), "not in this library acts beside it, or in its place, has a probability of 0.03."),
+        (("drag", "bias"), "not in this library acts beside it, or in its place, has a probability of 0.03."),
         (("bias",), "The next best without it, something that is not in this library, has a probability of 0.03"),
     ],
 )

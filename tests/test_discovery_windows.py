@@ -829,3 +829,27 @@ def test_a_constant_of_two_equations_takes_no_nameless_change_of_both(monkeypatc
     diagnose(base, tc.Recording(runs=[run], noise={"A": 0.01, "B": 0.01}), [step])
     (search,) = seen
     assert _Changes.of(search).named == {(("rates", "A"), ("rates", "B")): 0}
+
+
+@pytest.mark.parametrize(
+    ("evidence", "stuck", "begun"), [(80.0, ["dry.w"], True), (60.0, ["dry.w"], False), (80.0, ["dry.to"], False)]
+)
+def test_a_shape_at_an_end_of_its_range_begins_anew_where_it_is_nearly_best(monkeypatch, evidence, stuck, begun):
+    """Ends of a window and a width make up for each other: a local Coulomb friction was told as a Stribeck friction,
+    as its width had stayed at the smallest that was tried, in a window that was too short."""
+    names = ["k", "dry.c", "dry.w"]
+    plain = SimpleNamespace(
+        problem=SimpleNamespace(parameters=[tc.Parameter(name) for name in names]), own=[1, 2], amplitudes=[1],
+        shapes=torch.tensor([[0.0, 0.1], [0.0, 1.0], [0.0, 10.0]], dtype=F64),
+    )  # fmt: skip
+    parameters = [tc.Parameter(name) for name in [*names, "dry.from", "dry.to"]]
+    values = torch.tensor([2.0, 3.0, 0.1, 4.0, 11.0], dtype=F64)
+    found = SimpleNamespace(problem=SimpleNamespace(parameters=parameters), values=values, stuck=stuck)
+    local = SimpleNamespace(window=object(), numbers=(0,), log_evidence=evidence, log_prior=-2.0, found=found,
+                            candidate=SimpleNamespace(own=[1, 2, 3, 4]))  # fmt: skip
+    best = SimpleNamespace(window=None, numbers=(1,), log_evidence=100.0)
+    tried = []
+    monkeypatch.setattr(windows_module, "_keep_all", lambda search, wanted: tried.extend(wanted))
+    assert windows_module._reshape(SimpleNamespace(models=[best, local], candidates=[plain, None])) is begun
+    assert [one.begin[:, 2].tolist() for one in tried] == ([[0.1, 1.0, 10.0]] if begun else [])
+    assert all(row.tolist() == [2.0, 3.0, 4.0, 11.0] for one in tried for row in one.begin[:, [0, 1, 3, 4]])

@@ -41,6 +41,9 @@ ROUNDS = 2
 CLOSE = 10.0
 #: Share of a window within another one along the same driver from which on they are one start.
 ALIKE = 0.7
+#: Share of the largest log evidence from which on a term whose shape stays at an end of its range is begun at others,
+#: and how many at most.
+STUCK, MOST_STUCK = 0.7, 4
 #: Log odds up to which the two sides of an edge are as good, and by which a window that holds no datum must be better.
 AS_GOOD, AS_WELL = 0.5, 3.0
 #: Relative difference of χ² up to which two windows of one term and driver are one.
@@ -89,6 +92,8 @@ def refit_local(search: Search) -> None:
     search.reweigh()
     if _rivals(search, prior):
         search.reweigh()
+    if _reshape(search):
+        search.reweigh()
     before = _drivers_of_leads(search)
     _refine_edges(search, prior)
     if not _drivers_of_leads(search) <= before and _rivals(search, prior, edge=True):  # sharp edges put another first
@@ -117,6 +122,32 @@ def _turn(search: Search, prior: float) -> None:
     if turned is not None and turned.physical and turned.weight > lead.weight - AS_GOOD:
         search.models.remove(lead)
         _keep(search, turned)
+
+
+def _reshape(search: Search) -> bool:
+    """Begin what does nearly as much as the best, in a window and with a shape at an end of its range, at its other
+    shapes: ends of the window and that shape make up for each other, so that there may be a better minimum.
+
+    Returns whether there was any.
+    """
+    highest = max((m.log_evidence for m in search.models), default=0.0)
+    wanted: list[Hypothetical | None] = []
+    seen: set[tuple[int, ...]] = set()
+    for model in sorted(search.models, key=lambda m: -m.log_evidence):
+        if model.window is None or model.numbers in seen or model.log_evidence < STUCK * highest:
+            continue
+        seen.add(model.numbers)
+        parameters, plain = model.found.problem.parameters, search.candidates[model.numbers[0]]
+        own = {plain.problem.parameters[i].name: k for k, i in enumerate(plain.own) if i not in plain.amplitudes}
+        held = set(own) & set(model.found.stuck)
+        stuck = [i for i in model.candidate.own if parameters[i].name in held]
+        if stuck and len(wanted) < MOST_STUCK:
+            begin = model.found.values.repeat(len(plain.shapes), 1)
+            begin[:, stuck] = plain.shapes[:, [own[parameters[i].name] for i in stuck]]
+            begin = begin.unique(dim=0)
+            wanted.append(Hypothetical(model.numbers, model.candidate, begin, model.log_prior, model.window))
+    _keep_all(search, wanted)
+    return bool(wanted)
 
 
 def _leads(search: Search) -> list[Model]:

@@ -70,10 +70,10 @@ def _rival(d: Any, probability: float) -> list[str]:
     rival, share = max(shares.items(), key=lambda item: item[1])
     behind = log_odds_behind(share, probability)
     if rival == NONE and set(d.settings.get("unknown_beside", ())) >= set(d.terms):
-        where = "it" if len(d.terms) == 1 else "them"
+        where, place = ("it", "its") if len(d.terms) == 1 else ("them", "their")
         return [
-            f"That something which is not in this library acts beside {where} has a probability of "
-            f"{chance(share)}."
+            f"That something which is not in this library acts beside {where}, or in {place} place, has a probability "
+            f"of {chance(share)}."
         ]
     without = "without it" if len(d.terms) == 1 else "without all of them"
     return [
