@@ -1009,6 +1009,18 @@ def test_a_threshold_whose_tangent_vanishes_at_neutral():
     assert d.terms == ["product"]
 
 
+def test_a_term_that_raises_where_all_of_it_is_large_is_no_error():
+    simulator, x, y, _ = parabola(0.3)
+
+    def product(x, p, y):
+        if bool(((p["a"] > 0.9) & (p["b"] > 0.9)).any()):
+            raise ValueError("both large")
+        return y + p["a"] * p["b"] * x**2
+
+    term = tc.Term("product", outputs={"y": product}, parameters=[tc.Parameter("a"), tc.Parameter("b")])
+    assert quiet(simulator, tc.Recording(x=x, y=y, noise=0.1), [term]).terms == ["product"]
+
+
 @pytest.mark.parametrize("swapped", [False, True])
 def test_an_amount_that_is_absorbed_begins_at_every_rate(swapped):
     """Neither a rate nor an amount does anything alone, and at hardly any rate the effect has the wrong sign: what is

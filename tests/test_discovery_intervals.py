@@ -1,5 +1,6 @@
 """Intervals of estimates by the profile of χ², against a grid of values that are held one by one."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -85,6 +86,56 @@ def test_an_end_that_the_data_leave_open_is_infinite():
     assert on_a_grid(y, 0.1, [low])[0] - found.chi2 == pytest.approx(SIDES**2, rel=0.05)
 
 
+@pytest.mark.parametrize("seed", [2, 6, 13, 16])
+def test_a_fit_in_a_side_valley_is_no_end(seed):
+    """Held far from the best, a fit may end with K on its bound, and all that begin there do so too."""
+    truth = (1.0, 6.0, 15.0)
+    y = data(seed, 0.3, truth)
+    found = fitted(y, 0.3, truth=truth, low=0.01, high=20.0)
+    low, high = by_profile(found, [1])[1]
+    x, y = X.numpy(), y.numpy()
+    shapes = x / (x + np.linspace(0.01, 20.0, 20001)[:, None])
+
+    def rise(c):
+        left = y - c * shapes
+        return ((left - left.mean(1, keepdims=True)) ** 2).sum(1).min() / 0.09 - found.chi2
+
+    assert rise(low) == pytest.approx(SIDES**2, rel=0.05)
+    assert rise(high) == pytest.approx(SIDES**2, rel=0.05)
+
+
+def test_another_valley_may_leave_an_end_open():
+    """A decay that is hardly seen is a slow one of any size too."""
+    y = 1 + 0.5 * torch.exp(-1.5 * X) + 0.15 * torch.randn(40, generator=torch.Generator().manual_seed(0), dtype=F64)
+    model = tc.Simulator(
+        lambda x, p: p["a"] + p["c"] * torch.exp(-p["k"] * x),
+        [tc.Parameter("a"), tc.Parameter("c"), tc.Parameter("k", low=0.0, initial=1.0)],
+    )
+    problem = Problem.of(model, tc.Recording(x=X, y=y, noise=0.15))
+    whitening = problem.whitening(torch.full_like(y, 0.15), torch.zeros(1, dtype=F64))
+    found = fit(problem, whitening, torch.tensor([[1.0, 0.5, 1.5]], dtype=F64), [0, 1, 2])
+    ends = by_profile(found, [1, 2])
+    assert math.isinf(ends[1][1])  # on a grid of k χ² rises by 1.001 up to c = 10,000
+    assert ends[2][0] == 0.0
+
+
+def test_no_interval_is_told_of_a_fit_that_is_not_the_best_or_of_what_cannot_be_called():
+    found, asked = fitted(data(0, 0.2), 0.2), []
+    assert by_profile(found, [K])
+    assert by_profile(dataclasses.replace(found, chi2=found.chi2 + 5.0), [K]) == {}  # it ends lower beside it
+
+    def raising(x, p):
+        asked.append(1)
+        if len(asked) > 4:
+            raise ValueError("no more")
+        return uptake(x, p)
+
+    model = tc.Simulator(raising, found.problem.parameters)
+    problem = Problem.of(model, found.problem.recording)
+    assert by_profile(dataclasses.replace(found, problem=problem), [1, K]) == {}
+    assert by_profile(fitted(data(0, 0.2), 0.2), [1, K], stopped=lambda: True) == {}
+
+
 def test_what_lies_at_a_bound_or_is_held_is_left_out():
     y = data(0, 0.1)
     found = fitted(y, 0.1, high=2.0)
@@ -129,4 +180,5 @@ def test_in_words():
     assert str(both) == "drag.c = 2.744 ± 0.58 1/m (95 %: 1.963 to 4.574)"
     assert str(Estimate("k", 2.0, 0.5, interval=(1.1, math.inf))) == "k = 2 ± 0.5 (95 %: above 1.1)"
     assert str(Estimate("k", 2.0, 0.5, interval=(-math.inf, 2.5))) == "k = 2 ± 0.5 (95 %: below 2.5)"
+    assert str(Estimate("k", 2.0, math.inf, interval=(1.1, 4.5))) == "k = 2 (95 %: 1.1 to 4.5)"
     assert both.asymmetry == " (95 %: 1.963 to 4.574)"

@@ -97,7 +97,7 @@ def conclude(judged: Judged, asked: Asked, *, interrupted: str = "") -> Diagnosi
     final = base
     if best is not None:
         if not search.exact:
-            best.intervals = by_profile(best.found, best.candidate.own)
+            best.intervals = by_profile(best.found, best.candidate.own, search.stop.is_set)
         final = explain.fit_record(best.found, best.structure, best.names, best.window, best.intervals)
     lost = is_lost(search, decision)
     _warn(search, lost)

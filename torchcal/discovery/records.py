@@ -107,7 +107,7 @@ class Estimate:
     @property
     def amount(self) -> str:
         """Value, sd and unit in words."""
-        spread = f" ± {self.sd:.2g}" if math.isfinite(self.sd) else " (not determined)"
+        spread = f" ± {self.sd:.2g}" if math.isfinite(self.sd) else "" if self.interval else " (not determined)"
         text = f"{placed(self.value, 100 * self.sd)}{spread}"  # to where the sd begins at least
         return with_unit(text, self.unit) + (" (at its bound)" if self.at_bound else "") + self.asymmetry
 

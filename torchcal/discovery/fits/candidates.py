@@ -279,14 +279,18 @@ def _hidden_amplitudes(
         for other in own:
             if other != place:
                 row[other] = shape_points(problem.parameters[other], 1)[0]
-        acting = row.clone()
-        acting[place] = shape_points(problem.parameters[place], 1)[0]
-        y, jacobian = linear(torch.stack([row, acting]), [place])  # type: ignore[operator]
+        y, jacobian = linear(row[None], [place])  # type: ignore[operator]
         tangent = torch.nan_to_num(jacobian[0, :, 0])
         if not bool((tangent.abs() > 0).any()):
             continue
-        change, size = y[1] - y[0], (tangent * (acting[place] - row[place])).norm()
-        bend = float((change - tangent * (acting[place] - row[place])).norm() / size.clamp_min(1e-300))
+        acting = row.clone()
+        acting[place] = shape_points(problem.parameters[place], 1)[0]
+        effect, bend = tangent * (acting[place] - row[place]), math.inf
+        try:
+            off = (linear(acting[None], [])[0] - y)[0] - effect  # type: ignore[operator]
+            bend = float(off.norm() / effect.norm().clamp_min(1e-300))
+        except SimulatorError:  # a function may raise where all of them are large
+            pass
         bend = max(bend, LINEAR) if math.isfinite(bend) else 1 / LINEAR
         if bend < least:
             found, least = place, bend

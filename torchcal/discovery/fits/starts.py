@@ -1,12 +1,10 @@
 """Where a calibration begins: guesses of parameters and of unknown initial states."""
 
-import itertools
-from collections.abc import Set
-
 import torch
 from torch import Tensor
 
 from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.fits.read_back import read_back
 from torchcal.simulators import Trajectories
 from torchcal.simulators.layout import initial_name
 
@@ -20,8 +18,6 @@ LONG = 30.0
 STEPS, NEARER = 3, 0.5
 #: Share of the largest value that noise may take an amount below zero.
 NOISE = 0.1
-#: Sizes of initial states, in powers of ten, that are tried to read them back from the first readings; and steps there.
-MAGNITUDES, READ = range(-3, 5), 8
 
 
 def starts(problem: Problem, count: int, seed: int, fixed: dict[int, float] | None = None) -> Tensor:
@@ -69,84 +65,8 @@ def starts(problem: Problem, count: int, seed: int, fixed: dict[int, float] | No
         columns.append(guess.clamp(low, high))
     begin = torch.stack(columns, dim=-1)
     if problem.in_time and count > 1:
-        begin[1::2] = _read_back(problem, begin[1::2], set(fixed or ()))
+        begin[1::2] = read_back(problem, begin[1::2], set(fixed or ()))
     return begin
-
-
-def _read_back(problem: Problem, begin: Tensor, held: Set[int]) -> Tensor:
-    """Starting values with unknown initial states at which outputs that are functions of them begin as recorded.
-
-    Of several sizes the one that comes nearest is followed by Gauss-Newton steps, run by run; what leaves more than
-    `NEARER` of the squared error stays as it was.
-    """
-    bound, recording = problem.simulator, problem.recording
-    if not isinstance(bound, Trajectories):
-        return begin
-    places = [i for i, q in enumerate(problem.parameters)
-              if q.name in bound.initial_names and q.initial is None and i not in held]  # fmt: skip
-    first: list[int] = []
-    for k, name in enumerate(recording.outputs):
-        if name not in bound.ode.reads:
-            seen = k * recording.n + recording.observed[k * recording.n : (k + 1) * recording.n].nonzero()[:, 0]
-            run = bound.grid.run_of[seen - k * recording.n]
-            first += [int(seen[run == r][0]) for r in run.unique()]
-    if not places or not first:
-        return begin
-    run_of_target = bound.grid.run_of[torch.tensor(first) % recording.n]
-    y, spread = recording.y[first], recording.spread[first]
-    low, high = problem.limits()
-
-    def left(values: Tensor) -> Tensor:
-        return (bound.readings(values, bound.layout.start(values))[:, first] - y) / spread
-
-    def of_runs(off: Tensor) -> Tensor:
-        square = off.detach().square().nan_to_num(nan=torch.inf)
-        return square.new_zeros(len(off), len(bound.runs)).index_add(1, run_of_target, square)
-
-    def slopes(values: Tensor) -> tuple[Tensor, Tensor]:
-        """Of the first readings, ``(H, targets)``, by the initial states, ``(H, targets, places)``."""
-        with torch.enable_grad():
-            leaf = values[:, places].clone().requires_grad_(True)
-            off = left(values.index_copy(1, torch.tensor(places), leaf))
-            rows = [torch.autograd.grad(off[:, k].sum(), leaf, retain_graph=True, allow_unused=True)[0]
-                    if off.requires_grad else None for k in range(off.shape[1])]  # fmt: skip
-        return off.detach(), torch.stack([torch.zeros_like(leaf) if row is None else row for row in rows], dim=1)
-
-    one = begin.clone()
-    one[:, places] = 1.0
-    acts = (slopes(one)[1] != 0).any(1).any(0) | (slopes(begin)[1] != 0).any(1).any(0)
-    places = [i for i, does in zip(places, acts.tolist(), strict=True) if does]
-    if not places:
-        return begin
-    where, run_of = torch.tensor(places), torch.tensor([bound.layout.origins[i][1] for i in places])
-    best = begin
-    with torch.no_grad():
-        own = error = of_runs(left(begin))
-        for size, sign in itertools.product(MAGNITUDES, (1.0, -1.0)):
-            tried = begin.clone()
-            tried[:, places] = sign * 10.0**size
-            tried = tried.clamp(low, high)
-            best, error = _nearer(best, error, tried, of_runs(left(tried)), where, run_of)
-        share = torch.ones_like(error)
-        for _ in range(READ):
-            off, jacobian = slopes(best)
-            sound = torch.isfinite(jacobian).flatten(1).all(-1) & torch.isfinite(off).all(-1)
-            step = torch.zeros_like(best[:, places])
-            step[sound] = (torch.linalg.pinv(jacobian[sound], rtol=1e-6) @ off[sound].unsqueeze(-1))[..., 0]
-            tried = best.index_copy(1, where, best[:, places] - share[:, run_of] * step).clamp(low, high)
-            before = error
-            best, error = _nearer(best, error, tried, of_runs(left(tried)), where, run_of)
-            share = torch.where(error < before, torch.ones_like(share), 0.25 * share)
-    return _nearer(begin, NEARER * own.nan_to_num(posinf=1e300), best, error, where, run_of)[0]
-
-
-def _nearer(
-    values: Tensor, error: Tensor, other: Tensor, its: Tensor, places: Tensor, run_of: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Of two rows of values ``(H, P)`` the one with the smaller error, run by run ``(H, R)``, and that error."""
-    less = its < error
-    moved = torch.where(less[:, run_of], other[:, places], values[:, places])
-    return values.index_copy(1, places, moved), torch.where(less, its, error)
 
 
 def _alike(problem: Problem) -> dict[int, tuple[float, float, bool]]:

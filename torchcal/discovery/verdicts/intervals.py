@@ -1,7 +1,7 @@
 """Intervals of estimates by the profile of χ², where their standard deviations mislead."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -9,17 +9,27 @@ from torch import Tensor
 
 from torchcal.discovery.fits.fitting import Fitted, fit
 from torchcal.discovery.fits.local import is_window
+from torchcal.discovery.fits.starts import starts
+from torchcal.errors import SimulatorError
 
 __all__ = ["by_profile"]
 
 #: Sd on either side of an estimate that hold 95 % where χ² is a parabola, and how near the root of its rise must come.
 SIDES, NEAR = 1.96, 0.03
-#: Part of that by which an end must lie elsewhere than the sd puts it, to be told.
-MISLED = 0.3
+#: Part of the distance of an end by which the sd must put it elsewhere, to be told; and by the first fits, to go on.
+MISLED, PERHAPS = 0.3, 0.15
 #: Fits along a parameter, steps of each, and how many times as far away as the one before the next may lie.
-FITS, STEPS, STRETCH = 8, 30, 4.0
-#: A rise that is none.
-TINY = 1e-6
+FITS, STEPS, STRETCH = 10, 30, 4.0
+#: A rise that is none, and one that is more than any.
+TINY, HUGE = 1e-6, 1e3
+#: Power of the distance that the rise grows with at least, to be followed: else it is as good as flat.
+FLAT = 0.1
+#: Share of the distance of a bound that is none.
+AT_WALL = 1e-3
+#: First guesses that an end is confirmed from.
+GUESSES = 6
+#: By how much lower in χ² another fit may be, for the estimate to be the best one.
+LOWER = 0.1
 
 
 @dataclass
@@ -28,58 +38,77 @@ class _End:
 
     Attributes:
         sign: −1 below the estimate, 1 above.
-        away: Distance from the estimate, in the logarithm of what is fitted in it.
+        away: Distance from the estimate that is looked at next, in the logarithm of what is fitted in it.
         wall: Of the parameter's bound.
-        values: All parameters ``(P,)`` at the last point that was fitted.
-        rise: Root of the rise of χ² there.
-        within: Largest distance known to be within the interval, with its rise.
-        beyond: Smallest one known to be beyond it, with its rise.
+        values: All parameters ``(P,)`` at the farthest point known to be within the interval.
+        last: The same at the last point.
+        rise: Root of the rise of χ² at the last point.
+        within: Distance of the farthest point known to be within the interval, with its rise.
+        beyond: That of the nearest one known to be beyond it, with its rise.
+        ended: Whether the distance is where χ² has risen enough, or that of a bound.
     """
 
     sign: int
     away: float
     wall: float
     values: Tensor
+    last: Tensor
     rise: float = math.nan
     within: tuple[float, float] | None = None
     beyond: tuple[float, float] | None = None
+    ended: bool = False
 
     @property
-    def ended(self) -> bool:
-        """Whether it is where χ² has risen enough, or on a bound."""
-        return abs(self.rise - SIDES) <= NEAR or (self.rise < SIDES and self.away >= self.wall)
-
-    @property
-    def found(self) -> float:
-        """Its distance, or what it will be next; infinite where nothing is known to be beyond it."""
-        return self.away if self.ended or self.beyond is not None else math.inf
+    def distance(self) -> float | None:
+        """Of the end; infinite where no point is known to be beyond it, None where it was not found."""
+        if self.ended:
+            return self.wall if self.away > (1 - AT_WALL) * self.wall else self.away
+        return math.inf if self.beyond is None else None
 
     def see(self, rise: float, values: Tensor) -> None:
-        """Take note of the rise, and go where it should be enough, if it grows as a power of the distance."""
-        before, self.rise, self.values = self.within, max(rise, TINY), values
+        """Take note of the rise at the point that was looked at, and choose the next one."""
+        rise, before = min(max(rise, TINY), HUGE), self.within
+        self.rise, self.last = rise, values
+        self.ended = abs(rise - SIDES) <= NEAR or (rise < SIDES and self.away >= self.wall)
+        here = (self.away, rise)
+        if rise < SIDES:
+            self.within, self.values = here, values
+        else:
+            self.beyond = here
         if self.ended:
             return
-        if self.rise < SIDES:
-            self.within = (self.away, self.rise)
-        else:
-            self.beyond = (self.away, self.rise)
-        others = (self.within if self.rise >= SIDES else self.beyond, before)
-        other = next((pair for pair in others if pair is not None and pair[0] != self.away), None)
-        power = 1.0 if other is None else math.log(self.rise / other[1]) / math.log(self.away / other[0])
-        times = (SIDES / self.rise) ** (1 / power) if power > 1 / FITS else math.copysign(math.inf, SIDES - self.rise)
-        self.away = min(self.away * min(max(times, 1 / STRETCH), STRETCH), self.wall)
+        other = self.beyond if rise < SIDES else self.within
+        other = before if other is None or other == here else other
+        self.away = min(_reached(here, other), self.wall)
 
 
-def by_profile(found: Fitted, places: Sequence[int]) -> dict[int, tuple[float, float]]:
+def _reached(here: tuple[float, float], other: tuple[float, float] | None) -> float:
+    """Distance at which the rise is enough, if it grows as the power of it that two points tell; or in proportion.
+
+    >>> round(_reached((1.0, 0.98), None), 3), round(_reached((1.0, 0.49), (2.0, 1.96 / 2)), 3)
+    (2.0, 4.0)
+    """
+    away, rise = here
+    power = 1.0 if other is None or other[0] == away else math.log(rise / other[1]) / math.log(away / other[0])
+    if power < FLAT:
+        return away * (STRETCH if rise < SIDES else 1 / STRETCH)
+    return away * min(max((SIDES / rise) ** (1 / power), 1 / STRETCH), STRETCH)
+
+
+def by_profile(
+    found: Fitted, places: Sequence[int], stopped: Callable[[], bool] = lambda: False
+) -> dict[int, tuple[float, float]]:
     """95 % intervals of the estimates that their sd mislead about, by their places.
 
-    The ends are where χ², all else fitted again, has risen by 1.96² (the profile likelihood; Venzon & Moolgavkar 1988,
-    Applied Statistics 37, 87), or a bound, or infinite where it does not rise so far. What the data leave open, what
-    lies at a bound, and ends of windows are left out, and so are intervals that ``value ± 1.96 sd`` tells as well.
+    An end is where χ², all else fitted again, has first risen by 1.96² (the profile likelihood; Venzon & Moolgavkar
+    1988, Applied Statistics 37, 87), or a bound before that, or infinite where it does not rise so far. Left out are
+    what lies at a bound, ends of windows, what the data leave wholly open, intervals that ``value ± 1.96 sd`` tells as
+    well, and those of which an end is not found, or of which another fit is better.
 
     Args:
         found: The fit.
         places: Of the parameters that are asked for.
+        stopped: Whether to make no more of them.
     """
     sd = found.sd()
     stuck = {i for i, at in zip(found.free, found.at_bound.tolist(), strict=True) if at}
@@ -88,20 +117,21 @@ def by_profile(found: Fitted, places: Sequence[int]) -> dict[int, tuple[float, f
         q, value = found.problem.parameters[i], float(found.values[i])
         if i not in found.free or i in stuck or is_window(q.name) or not 0 < float(sd[i]) < 1e5 * abs(value):
             continue
-        ends = _ends(found, i, float(sd[i]))
-        if ends is None:
+        try:
+            ends = None if stopped() else _ends(found, i, float(sd[i]))
+        except SimulatorError:  # a function may raise so far from the estimate
             continue
-        if _misleads(found, i, float(sd[i]), ends, MISLED) and any(map(math.isfinite, ends)):
+        if ends is not None and _misleads(found, i, float(sd[i]), ends, MISLED) and any(map(math.isfinite, ends)):
             result[i] = ends
     return result
 
 
 def _misleads(found: Fitted, i: int, sd: float, ends: tuple[float, float], share: float) -> bool:
-    """Whether an end is not where the sd puts it."""
+    """Whether an end is not where the sd puts it, within the bounds."""
     q, value, usual = found.problem.parameters[i], float(found.values[i]), SIDES * sd
     low = max(value - usual, -math.inf if q.low is None else q.low)
     high = min(value + usual, math.inf if q.high is None else q.high)
-    return max(abs(ends[0] - low), abs(ends[1] - high)) > share * usual
+    return any(abs(end - by_sd) > share * abs(by_sd - value) for end, by_sd in zip(ends, (low, high), strict=True))
 
 
 def _ends(found: Fitted, i: int, sd: float) -> tuple[float, float] | None:
@@ -111,26 +141,59 @@ def _ends(found: Fitted, i: int, sd: float) -> tuple[float, float] | None:
     unit = sd / value if log else sd
     below = math.inf if q.low is None or (log and q.low <= 0) else math.log(value / q.low) if log else value - q.low
     above = math.inf if q.high is None else math.log(q.high / value) if log else q.high - value
-    both = [_End(sign, min(SIDES * unit, wall), wall, found.values) for sign, wall in ((-1, below), (1, above))]
-    free = [k for k in found.free if k != i]
+    walls, best = ((-1, below), (1, above)), found.values
+    both = [_End(sign, min(SIDES * unit, wall), wall, best, best) for sign, wall in walls]
     for number in range(FITS):
         todo = [end for end in both if not end.ended]
         if not todo:
             break
-        begun = [_moved(found, end.values, i, _at(value, end.sign * end.away, log)) for end in todo]
-        fitted = _fitted(found, torch.stack(begun), free)
-        if fitted is None:
+        if not _look(found, i, todo, [_at(value, end.sign * end.away, log) for end in todo]):
             return None
-        for end, values, rise in zip(todo, *fitted, strict=True):
-            end.see(rise, values)
-        low, high = (_at(value, end.sign * end.found, log) for end in both)
-        if number == 0 and not _misleads(found, i, sd, (low, high), MISLED / 2):
+        low, high = (_at(value, end.sign * end.away, log) for end in both)
+        if number == 0 and not _misleads(found, i, sd, (low, high), PERHAPS):
             return None
-    return low, high
+    low_at, high_at = (end.distance for end in both)
+    return None if low_at is None or high_at is None else (_at(value, -low_at, log), _at(value, high_at, log))
+
+
+def _confirm(found: Fitted, i: int, end: _End) -> None:
+    """Look once more where χ² seems to have risen enough, from first guesses too, and in as many steps as it takes:
+    there may be another valley, and along a bent one steps are short."""
+    free = [k for k in found.free if k != i]
+    held = {k: float(value) for k, value in enumerate(end.last) if k not in free}
+    rows = torch.cat([end.last[None], starts(found.problem, GUESSES, 0, held)])
+    warm = None if found.warm is None else found.warm.rows(torch.zeros(len(rows), dtype=torch.long))
+    again = fit(found.problem, found.whitening, rows, free, warm=warm)
+    if again is not None and (rise := math.sqrt(max(again.chi2 - found.chi2, 0.0))) < SIDES - NEAR:
+        end.see(rise, again.values)
 
 
 def _at(value: float, away: float, log: bool) -> float:
     return value * math.exp(away) if log else value + away
+
+
+def _look(found: Fitted, i: int, ends: Sequence[_End], points: Sequence[float]) -> bool:
+    """Fit all else at a point of each end, from the best fit and from the farthest point within; whether that is no
+    better fit."""
+    free = [k for k in found.free if k != i]
+    begun = []
+    for end, point in zip(ends, points, strict=True):
+        begun += [_moved(found, found.values, i, point), _moved(found, end.values, i, point)]
+        begun.append(end.values.index_fill(0, torch.tensor(i), point))
+    rows = torch.stack(begun)
+    warm = None if found.warm is None else found.warm.rows(torch.zeros(len(rows), dtype=torch.long))
+    again = fit(found.problem, found.whitening, rows, free, warm=warm, max_steps=STEPS, finish=0)
+    for end, point in zip(ends, points, strict=True):
+        chi2, values = math.inf, end.values
+        if again is not None and again.ends is not None and again.ends_chi2 is not None:
+            here = again.ends_chi2.where(again.ends[:, i] == point, torch.inf)
+            chi2, values = float(here.min()), again.ends[here.argmin()]
+        if chi2 < found.chi2 - LOWER:
+            return False
+        end.see(math.sqrt(max(chi2 - found.chi2, 0.0)), values)
+        if end.ended and end.rise >= SIDES - NEAR:
+            _confirm(found, i, end)
+    return True
 
 
 def _moved(found: Fitted, values: Tensor, i: int, to: float) -> Tensor:
@@ -142,12 +205,3 @@ def _moved(found: Fitted, values: Tensor, i: int, to: float) -> Tensor:
     moved = torch.where(log & (moved <= 0), values, moved)
     moved[i] = to
     return moved
-
-
-def _fitted(found: Fitted, rows: Tensor, free: list[int]) -> tuple[Tensor, list[float]] | None:
-    """Every row fitted in the others, and the roots of the rise of χ²; None where one cannot be."""
-    warm = None if found.warm is None else found.warm.rows(torch.zeros(len(rows), dtype=torch.long))
-    again = fit(found.problem, found.whitening, rows, free, warm=warm, max_steps=STEPS, finish=0)
-    if again is None or again.ends is None or again.ends_chi2 is None or len(again.ends) < len(rows):
-        return None
-    return again.ends, (again.ends_chi2 - found.chi2).clamp_min(0).sqrt().tolist()
