@@ -148,11 +148,14 @@ class Problem:
         """Name and values of what the data were recorded along: what they follow each other in, or of several
         conditions one that rises, or falls, from every row to the next."""
         x = self.recording.x
-        if self.order is not None:
-            return "t" if self.in_time else next(iter(x)) if isinstance(x, dict) else "x", self.order
-        steps = {name: values.diff() for name, values in x.items()}  # type: ignore[union-attr]
+        if not isinstance(x, dict):
+            return "x", x
+        if self.in_time:
+            return "t", x["time"]
+        steps = {name: values.diff() for name, values in x.items()}
         along = [name for name, step in steps.items() if bool((step > 0).all()) or bool((step < 0).all())]
-        return (along[0], x[along[0]]) if len(along) == 1 else None  # type: ignore[index]
+        names = list(x) if len(x) == 1 else along
+        return (names[0], x[names[0]]) if len(names) == 1 else None
 
     @cached_property
     def levels(self) -> tuple[Tensor, Tensor]:
