@@ -11,7 +11,7 @@ from torchcal.discovery.fits.problem import Problem
 from torchcal.errors import SimulatorError
 from torchcal.simulators import Trajectories
 
-__all__ = ["read_back"]
+__all__ = ["read_back", "slopes_by"]
 
 #: Sizes of initial states, in powers of ten, that are tried; Gauss-Newton steps from there, and the part of a step that
 #: is tried after one that led nowhere.
@@ -124,12 +124,7 @@ class _Readings:
             except SimulatorError:
                 shape = len(values), len(self.first)
                 return values.new_zeros(shape), values.new_zeros(*shape, len(places))
-            rows = [
-                torch.autograd.grad(left[:, k].sum(), leaf, retain_graph=True, allow_unused=True)[0]
-                if left.requires_grad else None
-                for k in range(left.shape[1])
-            ]  # fmt: skip
-        jacobian = torch.stack([torch.zeros_like(leaf) if row is None else row for row in rows], dim=1)
+            jacobian = slopes_by(leaf, left)
         sound = torch.isfinite(left.detach()) & torch.isfinite(jacobian).all(-1)
         return left.detach().where(sound, 0.0), jacobian.where(sound[..., None], 0.0)
 
@@ -141,6 +136,17 @@ class _Readings:
     def _step(self, values: Tensor, places: Tensor) -> Tensor:
         left, jacobian = self._slopes(values, places)
         return (torch.linalg.pinv(jacobian, rtol=NONE) @ left.unsqueeze(-1))[..., 0]
+
+
+def slopes_by(leaf: Tensor, left: Tensor) -> Tensor:
+    """Slopes of ``left`` ``(H, T)`` by a leaf ``(H, S)`` of its graph, row by row, ``(H, T, S)``; 0 where it has none.
+    """
+    rows = [
+        torch.autograd.grad(left[:, k].sum(), leaf, retain_graph=True, allow_unused=True)[0]
+        if left.requires_grad else None
+        for k in range(left.shape[1])
+    ]  # fmt: skip
+    return torch.stack([torch.zeros_like(leaf) if row is None else row for row in rows], dim=1)
 
 
 def _nearer(

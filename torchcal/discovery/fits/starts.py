@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from torchcal.discovery.fits.problem import Problem
-from torchcal.discovery.fits.read_back import read_back
+from torchcal.discovery.fits.read_back import read_back, slopes_by
 from torchcal.simulators import Trajectories
 from torchcal.simulators.layout import initial_name
 
@@ -136,9 +136,7 @@ def follow_slopes(problem: Problem, begin: Tensor) -> Tensor:
             full[:, places] = leaf
             rates = bound.slopes(full, bound.layout.start(full))
             left = torch.stack([(rates[:, r, i] - slope) / scale for r, i, slope, scale in targets], dim=-1)
-            rows = [torch.autograd.grad(left[:, k].sum(), leaf, retain_graph=True, allow_unused=True)[0]
-                    if left.requires_grad else None for k in range(left.shape[1])]  # fmt: skip
-        jacobian = torch.stack([torch.zeros_like(leaf) if row is None else row for row in rows], dim=-2)
+            jacobian = slopes_by(leaf, left)
         acts = (jacobian != 0).any(-1).any(0)  # others are no matter of what a run begins with
         now = torch.zeros_like(off).index_add(1, run_of_target, torch.where(acts, left.detach().square(), 0.0))
         nearer = (now <= NEARER * off)[:, run_of_place]  # what a state has no say in leads ever farther away

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchcal.discovery.fits.fitting import Fitted, fit
+from torchcal.discovery.fits.fitting import FINISH, MAX_STEPS, Fitted, fit
 from torchcal.discovery.fits.local import is_window
 from torchcal.discovery.fits.starts import starts
 from torchcal.errors import SimulatorError
@@ -159,11 +159,8 @@ def _ends(found: Fitted, i: int, sd: float) -> tuple[float, float] | None:
 def _confirm(found: Fitted, i: int, end: _End) -> None:
     """Look once more where χ² seems to have risen enough, from first guesses too, and in as many steps as it takes:
     there may be another valley, and along a bent one steps are short."""
-    free = [k for k in found.free if k != i]
-    held = {k: float(value) for k, value in enumerate(end.last) if k not in free}
-    rows = torch.cat([end.last[None], starts(found.problem, GUESSES, 0, held)])
-    warm = None if found.warm is None else found.warm.rows(torch.zeros(len(rows), dtype=torch.long))
-    again = fit(found.problem, found.whitening, rows, free, warm=warm)
+    held = {k: float(value) for k, value in enumerate(end.last) if k == i or k not in found.free}
+    again = _fitted(found, i, torch.cat([end.last[None], starts(found.problem, GUESSES, 0, held)]))
     if again is not None and (rise := math.sqrt(max(again.chi2 - found.chi2, 0.0))) < SIDES - NEAR:
         end.see(rise, again.values)
 
@@ -175,14 +172,11 @@ def _at(value: float, away: float, log: bool) -> float:
 def _look(found: Fitted, i: int, ends: Sequence[_End], points: Sequence[float]) -> bool:
     """Fit all else at a point of each end, from the best fit and from the farthest point within; whether that is no
     better fit."""
-    free = [k for k in found.free if k != i]
     begun = []
     for end, point in zip(ends, points, strict=True):
         begun += [_moved(found, found.values, i, point), _moved(found, end.values, i, point)]
         begun.append(end.values.index_fill(0, torch.tensor(i), point))
-    rows = torch.stack(begun)
-    warm = None if found.warm is None else found.warm.rows(torch.zeros(len(rows), dtype=torch.long))
-    again = fit(found.problem, found.whitening, rows, free, warm=warm, max_steps=STEPS, finish=0)
+    again = _fitted(found, i, torch.stack(begun), max_steps=STEPS, finish=0)
     for end, point in zip(ends, points, strict=True):
         chi2, values = math.inf, end.values
         if again is not None and again.ends is not None and again.ends_chi2 is not None:
@@ -194,6 +188,15 @@ def _look(found: Fitted, i: int, ends: Sequence[_End], points: Sequence[float]) 
         if end.ended and end.rise >= SIDES - NEAR:
             _confirm(found, i, end)
     return True
+
+
+def _fitted(
+    found: Fitted, i: int, rows: Tensor, max_steps: int = MAX_STEPS, finish: int = FINISH
+) -> Fitted | None:
+    """All else than one parameter fitted from rows of values ``(H, P)``."""
+    warm = None if found.warm is None else found.warm.rows(torch.zeros(len(rows), dtype=torch.long))
+    free = [k for k in found.free if k != i]
+    return fit(found.problem, found.whitening, rows, free, warm=warm, max_steps=max_steps, finish=finish)
 
 
 def _moved(found: Fitted, values: Tensor, i: int, to: float) -> Tensor:
