@@ -136,12 +136,8 @@ class Problem:
     @cached_property
     def order(self) -> Tensor | None:
         """What neighbouring data follow each other in: time, or the only condition; None where nothing does."""
-        x = self.recording.x
-        if isinstance(x, dict):
-            if self.in_time:
-                return x["time"]
-            return next(iter(x.values())) if len(x) == 1 else None
-        return x
+        several = len(self.recording.columns.T) > 1 and not self.in_time
+        return None if several or self.clock is None else self.clock[1]
 
     @cached_property
     def clock(self) -> tuple[str, Tensor] | None:

@@ -172,9 +172,9 @@ def _at(value: float, away: float, log: bool) -> float:
 def _look(found: Fitted, i: int, ends: Sequence[_End], points: Sequence[float]) -> bool:
     """Fit all else at a point of each end, from the best fit and from the farthest point within; whether that is no
     better fit."""
-    begun = []
+    begun, slope = [], _slope(found, i)
     for end, point in zip(ends, points, strict=True):
-        begun += [_moved(found, found.values, i, point), _moved(found, end.values, i, point)]
+        begun += [_moved(found, values, slope, i, point) for values in (found.values, end.values)]
         begun.append(end.values.index_fill(0, torch.tensor(i), point))
     again = _fitted(found, i, torch.stack(begun), max_steps=STEPS, finish=0)
     for end, point in zip(ends, points, strict=True):
@@ -199,11 +199,17 @@ def _fitted(
     return fit(found.problem, found.whitening, rows, free, warm=warm, max_steps=max_steps, finish=finish)
 
 
-def _moved(found: Fitted, values: Tensor, i: int, to: float) -> Tensor:
-    """Parameters with one elsewhere, the others moved as they go with it at the best fit, where they can."""
+def _slope(found: Fitted, i: int) -> Tensor:
+    """How all parameters go with one at the best fit, ``(P,)``."""
     covariance, at = found.covariance(), found.free.index(i)
-    moved = values.clone()
-    moved[found.free] += covariance[:, at] / covariance[at, at] * (to - values[i])
+    slope = torch.zeros_like(found.values)
+    slope[found.free] = covariance[:, at] / covariance[at, at]
+    return slope
+
+
+def _moved(found: Fitted, values: Tensor, slope: Tensor, i: int, to: float) -> Tensor:
+    """Parameters with one elsewhere, the others moved as they go with it, where they can."""
+    moved = values + slope * (to - values[i])
     log = torch.tensor([q.transform == "log" for q in found.problem.parameters], dtype=torch.bool)
     moved = torch.where(log & (moved <= 0), values, moved)
     moved[i] = to
