@@ -114,6 +114,33 @@ def test_given_noise_is_taken():
     torch.testing.assert_close(noise.sd, torch.full((60,), 0.1, dtype=F64))
 
 
+@pytest.mark.parametrize("phi", [0.0, 0.6])
+def test_noise_smaller_than_given_is_as_correlated_as_noise_of_unknown_size(phi):
+    x = torch.linspace(0, 1, 60, dtype=F64)
+    for seed in range(8):
+        y = x + draw(60, 0.1, seed, phi)
+        given, unknown = (float(noise_of(x, y, sd).correlation) for sd in (0.2, None))
+        assert given == pytest.approx(unknown, abs=0.1)  # up to 0.7 more where a correlation made up for the size
+
+
+def test_an_estimate_is_as_wide_as_the_noise_that_was_given():
+    x = torch.rand(60, generator=torch.Generator().manual_seed(4), dtype=F64) * 12
+    y = 0.9 - 0.01 * x - 0.03 * torch.relu(x - 7) + draw(60, 0.012, 5)
+    straight = tc.Simulator(lambda x, p: p["a"] + p["b"] * x["x"], [tc.Parameter("a"), tc.Parameter("b")])
+    bend = tc.Term(
+        "bend", outputs={"y": lambda x, p, y: y - p["q"] * torch.relu(x["x"] - p["at"])},
+        parameters=[tc.Parameter("q", low=0.0), tc.Parameter("at", low=0.5, high=12.0)],
+    )  # fmt: skip
+    known, doubled = (
+        tc.diagnose(straight, tc.Recording(x={"x": x, "T": x.flip(0)}, y=y, noise=sd), [bend], progress=False)
+        for sd in (0.012, 0.024)
+    )
+    assert known.terms == doubled.terms == ["bend"]
+    assert doubled.noise.correlation["y"] < 0.2
+    sizes = [next(row for row in d.ranking if list(row.terms) == ["bend"]).estimates[1].sd for d in (known, doubled)]
+    assert sizes[1] == pytest.approx(2 * sizes[0], rel=0.2)
+
+
 def test_given_noise_that_the_data_contradict_is_doubted():
     x = torch.linspace(0, 1, 60, dtype=F64)
     noise = noise_of(x, x + draw(60, 0.1, 1), 0.02)

@@ -17,7 +17,7 @@ from torchcal.discovery.fits.fitting import Fitted, refit, weighed
 from torchcal.discovery.fits.problem import Problem, Whitening
 from torchcal.discovery.misfit.channels import channels
 from torchcal.discovery.misfit.curves import orthonormal
-from torchcal.discovery.misfit.noise import GRID, LEAST, Noise, estimate, least, log_prior, mine
+from torchcal.discovery.misfit.noise import GRID, LEAST, Noise, estimate, least, log_prior, mine, slack
 from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.misfit.steps import sudden_changes
 from torchcal.discovery.misfit.structure import Rough, evidences, responses_of
@@ -76,6 +76,11 @@ def _counts(problem: Problem) -> Tensor:
     return torch.bincount(problem.output_of, minlength=len(problem.recording.outputs)).double()
 
 
+def _freedom(found: Fitted) -> Tensor:
+    """Degrees of freedom of every output, ``(outputs,)``."""
+    return (_counts(found.problem) * (1 - len(found.free) / found.problem.n)).clamp_min(1.0)
+
+
 def _memories(outputs: int) -> Tensor:
     """Those of `GRID`, of every output alike, ``(grid, outputs)``."""
     return GRID[:, None].expand(-1, outputs)
@@ -121,7 +126,7 @@ def alone(found: Fitted, noise: Noise, tangents: Tangents) -> tuple[Noise, float
     unit, outputs = _unit(noise), len(noise.correlation)
     squares = problem.whitening(unit, _memories(outputs)).vector(found.residual).square()
     count = _counts(problem)
-    freedom = (count * (1 - len(found.free) / problem.n)).clamp_min(1.0)
+    freedom = _freedom(found)
     square = torch.stack([squares[:, problem.output_of == k].sum(1) for k in range(outputs)])  # (outputs, grid)
     sizes = (square / freedom[:, None]).clamp_min(1e-300) if noise.open else torch.ones_like(square)
     blocks = tangents.grams / sizes[:, :, None, None]
@@ -136,6 +141,8 @@ def alone(found: Fitted, noise: Noise, tangents: Tangents) -> tuple[Noise, float
         like = log_prior(GRID, count[k]) - tangents.logs[k]
         like = like - 0.5 * count[k] * sizes[k].log() - 0.5 * square[k] / sizes[k]
         like = like - 0.5 * torch.linalg.slogdet(others + blocks[k])[1]
+        if noise.source == "given":
+            like = like + slack(freedom[k], square[k] / freedom[k])
         if count[k] < LEAST or problem.sweeps is None:
             like[1:] = -math.inf
         best[k] = int(like.argmax())
@@ -181,8 +188,12 @@ def with_unknown(
         """Beside what is unknown, and the waves and sudden changes taken out so far, near what is estimated without."""
         noise = estimate(problem, peeled[-1].residual, model.jacobian, given, unit)
         found: dict[_Places, tuple[Noise, float, Rough | None]] = {}
+        smaller = torch.zeros_like(noise.sizes)
+        if noise.source == "given":
+            smaller = slack(_freedom(model)[:, None], noise.sizes.square())
 
         def evidence(at: _Places) -> float:
+            """By which one is chosen: a noise that is given may be smaller."""
             if at not in found:
                 tried = _at(model, noise, *at, shares)
                 w = tried.whitening(problem)
@@ -193,7 +204,7 @@ def with_unknown(
                 gain -= len(taken) * math.log(2 * len(places))  # a wave or a sudden change of any output
                 like = _log_density(w, residuals[0].e, tried, tangents, problem)
                 found[at] = tried, like + gain, rough
-            return found[at][1]
+            return found[at][1] + float(smaller[range(len(places)), list(at[0])].sum())
 
         shares = _shares(problem, noise, peeled[-1].residual)
         places = tuple(int((GRID - rho).abs().argmin()) for rho in noise.correlation)

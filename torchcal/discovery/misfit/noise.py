@@ -18,7 +18,8 @@ from torchcal.discovery.records import NoiseModel
 from torchcal.errors import DomainError
 
 __all__ = [
-    "EXCESS", "GRID", "LEAST", "Noise", "decorrelated", "estimate", "least", "log_prior", "mine", "quantisation"
+    "EXCESS", "GRID", "LEAST", "Noise", "decorrelated", "estimate", "least", "log_prior", "mine", "quantisation",
+    "slack",
 ]  # fmt: skip
 
 #: AR(1) coefficients that are tried.
@@ -103,6 +104,20 @@ def log_prior(rho: Tensor, n: Tensor | float) -> Tensor:
     return -SHRINK * rho + SLOW / rho.clamp_min(1e-9).log() / torch.as_tensor(n).clamp_min(1)
 
 
+def slack(count: Tensor | float, square: Tensor | float) -> Tensor:
+    """What the largest log density of so many data, with noise of a size up to the one that is given, has beyond that
+    of the given one.
+
+    Of noise that is smaller than given a correlation would make up for that: innovations are smaller than the noise.
+
+    Args:
+        count: Data, or degrees of freedom.
+        square: Their mean square, in units of the variance that is given.
+    """
+    square = torch.as_tensor(square, dtype=torch.float64).clamp(1e-300, 1.0)
+    return -0.5 * count * (square.log() + 1 - square)
+
+
 def estimate(
     problem: Problem, residual: Tensor, design: Tensor, given: Tensor | str | None, unit: Tensor | None = None
 ) -> Noise:
@@ -165,7 +180,10 @@ def estimate(
                 log_det += float(upper.diagonal().abs().log().sum())
                 count += len(places) - b.shape[1]
             sizes.append(square / count)
-            size = 0.5 * count * math.log(max(square, 1e-300)) if given is None else 0.5 * square
+            if given is None:
+                size = 0.5 * count * math.log(max(square, 1e-300))
+            else:
+                size = 0.5 * square - float(slack(count, square / count))
             logs.append(-size - log_det + float(log_prior(rho, n)))
         likelihood = torch.tensor(logs, dtype=torch.float64)
         log_density += float(likelihood.max())
