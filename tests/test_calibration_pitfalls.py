@@ -48,6 +48,7 @@ def test_a_kink_takes_the_most_nodes_that_there_are(function, y):
     assert 1.9 < float(found.map.mean[0]) < 2.2
 
 
+@pytest.mark.slow
 def test_a_pole_beside_the_data_does_not_hide_the_best_density():
     simulator = tc.Simulator(lambda x, p: 1 / (p["a"] - 1) + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
     x = np.linspace(0, 5, 11)
@@ -305,7 +306,7 @@ def test_a_table_that_was_read_twice_is_told():
 
 
 @pytest.mark.filterwarnings("ignore::torchcal.errors.TorchcalWarning")
-@pytest.mark.parametrize("calibrate", [tc.calibrate, tc.calibrate_additive])
+@pytest.mark.parametrize("calibrate", [tc.calibrate, pytest.param(tc.calibrate_additive, marks=pytest.mark.slow)])
 def test_a_ridge_without_an_end_is_not_drawn_from(calibrate):
     """A product is known on a hyperbola, the sum of two squares on a circle."""
     parameters = [tc.Parameter(name) for name in "abc"]

@@ -177,7 +177,11 @@ def test_families_are_well_formed(family):
 
 
 @pytest.mark.parametrize(
-    "name", ["pendulum", "solar cell", "spring", "thermistor", "cooling body", *FRESH, *UNSEEN, *BLIND]
+    "name",
+    [
+        "pendulum", "solar cell", "spring", "thermistor", "cooling body", *BLIND,
+        *(pytest.param(name, marks=pytest.mark.slow) for name in (*FRESH, *UNSEEN)),
+    ],
 )
 def test_every_family_has_a_near_tie(name):
     assert np.median([tied_correlation(FAMILIES[name], seed) for seed in range(3)]) > 0.9

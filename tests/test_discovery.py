@@ -421,7 +421,7 @@ def test_a_planted_effect_above_its_limit_is_found():
     assert d.terms == ["bias force"]
 
 
-@pytest.mark.parametrize("noise", [None, "none"])
+@pytest.mark.parametrize("noise", [pytest.param(None, marks=pytest.mark.slow), "none"])
 def test_named_whatever_is_known_of_the_noise(noise):
     body, motion, library = pushed(0.08, noise=0.0001 if noise == "none" else 0.02)
     d = quiet(body, tc.Recording(runs=motion.runs, noise=noise), library[-2:])
@@ -762,6 +762,7 @@ def test_a_name_that_predicts_worse_is_withdrawn(monkeypatch):
     assert quiet(*case).terms == ["curvature"]
 
 
+@pytest.mark.slow
 def test_a_best_explanation_that_is_not_probable_enough_is_no_name(monkeypatch, tmp_path):
     monkeypatch.setattr("torchcal.discovery.verdicts.verdict.SURE", 0.999)
     body, _, x = spring(named(tc.terms.mechanics(), "bias force"), seed=21, **{"bias force__b": 0.3})
@@ -1021,7 +1022,7 @@ def test_a_term_that_raises_where_all_of_it_is_large_is_no_error():
     assert quiet(simulator, tc.Recording(x=x, y=y, noise=0.1), [term]).terms == ["product"]
 
 
-@pytest.mark.parametrize("swapped", [False, True])
+@pytest.mark.parametrize("swapped", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_an_amount_that_is_absorbed_begins_at_every_rate(swapped):
     """Neither a rate nor an amount does anything alone, and at hardly any rate the effect has the wrong sign: what is
     linear is the amount."""

@@ -304,7 +304,8 @@ def test_a_sound_derivative_is_not_refused(name):
     assert diagnose(tc.Simulator(function, parameters), recording).verdict == "consistent"
 
 
-@pytest.mark.parametrize("given", [pytest.param(None, marks=pytest.mark.slow), 8.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("given", [None, 8.0])
 def test_a_shape_may_lie_beyond_the_range_that_was_recorded_unless_a_bound_was_given(given):
     x = torch.linspace(0.05, 10, 80, dtype=F64)
     y = 2 * x / (x + 0.3) + 1.5 * x / (x + 20) + 0.01 * noise(80, 2)
@@ -465,6 +466,7 @@ def test_two_terms_that_bend_to_a_fast_process_are_no_name():
     assert diagnose(tc.Simulator(relaxing, parameters), recording, candidates).verdict in ("unexplained", "ambiguous")
 
 
+@pytest.mark.slow
 def test_a_run_that_was_read_twice_counts_once():
     t = np.linspace(0, 4, 41)
     decay = tc.ODESimulator(
@@ -534,7 +536,7 @@ def test_look_alikes_of_both_terms_of_a_pair_are_tried():
     assert ["leakage", "resistance"] in [sorted(one) for one in found], d.tied
 
 
-@pytest.mark.parametrize("own", [False, True])
+@pytest.mark.parametrize("own", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_positive_scale_stays_positive(own):
     """What would need a negative value of a parameter on a logarithmic scale is no effect of it."""
     x = torch.linspace(0, 10, 40, dtype=F64)

@@ -56,9 +56,10 @@ def recorded(tau: float, *, sd: float = 0.02, seed: int = 0) -> tc.Recording:
     return tc.Recording(runs=[run], noise=sd)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("share", "among"),
-    [*(pytest.param(share, None, marks=pytest.mark.slow) for share in (0.25, 0.6)),
+    [*((share, None) for share in (0.25, 0.6)),
      (0.6, ("heater lag", "heater gain error", "second heat capacity", "radiation"))],
 )  # fmt: skip
 def test_a_lag_shorter_than_the_gaps_between_samples_is_found_and_not_biased(share, among):

@@ -63,7 +63,8 @@ def recording(seed: int, hold: str, friction: float = 0.0) -> tc.Recording:
     return tc.Recording(runs=[tc.Run(time=time, outputs={"w": y}, inputs={"c": c}, hold=hold)], noise=sd)
 
 
-@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), 1])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_wrong_guess_between_samples_is_no_dead_time(seed):
     d = tc.diagnose(motor(), recording(seed, "linear"), candidates(), seed=0, progress=False)
     assert d.verdict == "ambiguous"
@@ -138,7 +139,7 @@ def test_another_hold_for_each_run():
         twin.with_hold(["zero", "zero"])
 
 
-@pytest.mark.parametrize("sd", [1e-7, 1e-9, 1e-160])
+@pytest.mark.parametrize("sd", [1e-7, pytest.param(1e-9, marks=pytest.mark.slow), 1e-160])
 def test_a_noise_too_small_for_the_arithmetic_is_taken_as_large_as_it_must_be(sd: float, tmp_path: Path) -> None:
     # χ² of 1e18 has no digits left for what one explanation is better than another by.
     x = torch.linspace(0, 5, 40, dtype=torch.float64)

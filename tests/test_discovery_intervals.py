@@ -143,6 +143,7 @@ def test_what_lies_at_a_bound_or_is_held_is_left_out():
     assert by_profile(found, [K]) == {}
 
 
+@pytest.mark.slow
 def test_they_hold_the_truth_as_often_as_they_say():
     """Of 120 recordings; the standard deviations, of the same fits, do so less often."""
     truth, trials = (1.0, 3.0, 4.0), 120

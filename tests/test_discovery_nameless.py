@@ -127,7 +127,7 @@ def hot_rod(noise, *, painted=1.0, uneven=0.0):
     return model, tc.Recording(x={"x": x, "hot": hot}, y=y), [term]
 
 
-@pytest.mark.parametrize("noise", [0.5, 0.8])
+@pytest.mark.parametrize("noise", [0.5, pytest.param(0.8, marks=pytest.mark.slow)])
 def test_a_smooth_change_is_no_name_where_a_parameter_may_change_at_one_place(noise):
     d = diagnose(*hot_rod(noise, painted=1.5))
     assert d.verdict in ("ambiguous", "unexplained")
@@ -297,6 +297,7 @@ def test_a_term_in_a_range_is_no_name_where_two_levels_alone_show_its_shape():
     assert "in a range of m would do nearly as well" in true.settings["doubt"]
 
 
+@pytest.mark.slow
 def test_a_term_in_a_range_is_named_where_more_levels_show_its_shape():
     for seed in range(2):
         d = diagnose(*flights(seed, [1.0, 2.0, 4.0, 8.0], walk=0.01))

@@ -453,6 +453,7 @@ def test_three_terms_together_and_windows_make_no_name_of_one(bend):
     assert powers(bend, wave=0.0).verdict == "unexplained"
 
 
+@pytest.mark.slow
 def test_what_no_instrument_does_is_no_rival_of_one():
     # Over 1.5 to 4 a gain error is a saturation too, whose bend lies where there are no data.
     t = np.linspace(0, 3, 80)

@@ -543,7 +543,7 @@ def test_a_blank_at_the_start_is_no_surer_than_what_is_known(seed):
     assert 0.3 < ratio.min() < ratio.max() < 4.0
 
 
-@pytest.mark.parametrize("seeds", [8, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [5, pytest.param(20, marks=pytest.mark.slow)])
 def test_replicates_tell_noise_that_grows(seeds):
     """As many false alarms at 1 % as a binomial allows, where small values looked too well fitted before."""
     x = np.tile(np.geomspace(0.2, 20, 20), 2)
@@ -679,7 +679,8 @@ def swept(seed, depth, sweeps=3, phi=0.0):
     return tc.diagnose(base, recording, [term], seed=0, progress=False)
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_what_acts_in_one_of_several_sweeps_is_no_slow_noise(seed):
     d = swept(seed, 12.0)
     assert d.verdict == "unexplained"
@@ -769,6 +770,7 @@ def test_noise_of_twice_the_sd_that_was_given_is_no_physics():
     assert source.count("estimated") > trials / 2
 
 
+@pytest.mark.slow
 def test_what_is_missing_is_named_beside_noise_of_twice_the_sd_that_was_given():
     x = torch.linspace(0, 2, 60, dtype=F64)
     for seed in range(4):
@@ -889,6 +891,7 @@ def test_a_given_noise_that_varies_keeps_its_pattern_where_it_is_larger():
     assert float(d.noise.sd["y"]) == pytest.approx(float(sizes.median()), rel=5 / math.sqrt(2 * 50))
 
 
+@pytest.mark.slow
 def test_a_given_noise_that_is_right_is_kept(monkeypatch):
     asked = []
     with_noise = tc.Recording.with_noise

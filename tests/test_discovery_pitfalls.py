@@ -316,7 +316,7 @@ def test_a_state_without_a_say_in_the_first_slope_is_left_where_it_was_guessed()
     assert float(follow_slopes(problem, begin).abs().max()) < 1e3
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_the_base_is_found_where_a_state_that_nothing_records_takes_over_late(seed):
     problem = Problem.of(*sugars(seed))
     found, _ = calibrate_base(problem, {}, 12, 0)
@@ -447,7 +447,8 @@ def test_a_base_that_is_stiff_where_it_starts_is_solved_with_shorter_steps():
     assert diagnose(base, recording, []).verdict == "consistent"
 
 
-@pytest.mark.parametrize("noise", [pytest.param({"noise": 0.01}, marks=pytest.mark.slow), {}])
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [{"noise": 0.01}, {}])
 def test_what_one_run_has_and_others_lack_is_said_to_differ_between_runs(noise):
     base, recording = decays(**noise)
     terms = tc.terms.kinetics("A")[:3]
@@ -635,6 +636,7 @@ def test_an_effect_that_is_large_in_noise_that_grows_is_named_and_its_absence_is
     assert found.count(expected) >= 5
 
 
+@pytest.mark.slow
 def test_a_misfit_that_grows_with_the_value_is_not_noise_that_does():
     # A peak's missing asymmetry, coarsely sampled: most where the peak is high. Once it is named, its noise is even.
     x = torch.linspace(-5, 5, 30, dtype=F64)
@@ -688,7 +690,8 @@ def test_runs_of_two_samples_tell_nothing_of_growing_noise():
 # --- windows of few levels, limits within bounds, and noise that takes a misfit up -------------------------
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
 def test_a_window_of_one_row_of_a_grid_is_no_name(seed):
     inverse, rate = (a.ravel() for a in np.meshgrid(1000 / np.linspace(260, 400, 12), np.geomspace(0.1, 100, 6)))
     y = -8.0 + 3.0 * inverse
@@ -937,6 +940,7 @@ def test_a_parameter_on_its_bound_takes_up_what_moves_it_inwards():
     assert limit.smallest == math.inf
 
 
+@pytest.mark.slow
 def test_a_term_may_read_what_differs_from_run_to_run():
     # Two cups in two rooms: the vapour pressure is that of each room.
     library = tc.terms.thermal("T", ambient="Ta", loss="k")

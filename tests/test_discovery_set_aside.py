@@ -46,6 +46,7 @@ def curve(seed, noise, **true):
     return x, clean + sd * rng.standard_normal(30), sd
 
 
+@pytest.mark.slow
 def test_a_bend_that_the_base_lacks_is_no_crowd_of_outliers():
     # Of the knee 4 of 30 data stuck out of the base, and without them nothing was missing.
     x, y, _ = curve(2, 0.01, J=3.66, J0=0.32, n=1.39, Rs=0.12)
@@ -550,6 +551,7 @@ def test_long_sequences_have_no_more_curves_than_can_be_taken_away():
     assert smooth_columns(problem, torch.arange(600)).shape == (600, 100)
 
 
+@pytest.mark.slow
 def test_what_neighbouring_conditions_have_in_common_is_no_outlier():
     """At x near 0.6 all data were off together; the largest of them were set aside, and nothing was left."""
     x, T = (g.ravel() for g in np.meshgrid(np.linspace(0.04, 0.96, 12), [300.0, 320.0, 340.0, 360.0], indexing="ij"))

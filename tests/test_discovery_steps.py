@@ -380,6 +380,7 @@ def cooling(off, place, seed=0):
     return simulator, tc.Recording(runs=runs, noise=0.05, units={"time": "h", "T": "K"})
 
 
+@pytest.mark.slow
 def test_what_happens_in_one_run_alone_is_placed_there():
     """No function of time, of the state or of the run is that."""
     given = cooling(0.4, lambda t, r: (r == 1) & (t > 3) & (t < 5))

@@ -267,6 +267,7 @@ def test_another_place_in_one_run_is_told_with_that_run():
     assert "and one of the equation z of run 1 (counted from 0) with t about as much" in text
 
 
+@pytest.mark.slow
 def test_a_named_instrument_that_remembers_is_told_by_what_it_removes():
     t = np.linspace(0, 30, 121)
     u = np.where((t // 5) % 2 == 0, 1.0, 0.0)

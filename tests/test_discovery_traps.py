@@ -39,7 +39,8 @@ def cleared(seed, store, lag=0.0, noise=0.02):
     return model, tc.Recording(runs=[tc.Run(time=t, outputs={"C": y}, initial={"C": 2.0})], noise=noise)
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_store_that_is_in_no_list_is_no_lag_of_an_instrument(seed):
     # Half of the signal late, and the rest at once, is no instrument.
     terms = [term for term in tc.terms.sensor("C") if term.name.split(" of ")[0] in ("lag", "delay", "offset")]
@@ -589,6 +590,7 @@ def chain(adsorbed: float, seed: int) -> tc.Recording:
     return tc.Recording(runs=runs, noise=0.15)
 
 
+@pytest.mark.slow
 def test_two_errors_of_one_instrument_are_no_name_where_the_other_output_is_as_likely_off():
     # They bend to nearly any curve of A1, which the base's rate constant turns into one of A2.
     decay = tc.ODESimulator(
@@ -606,7 +608,7 @@ def test_two_errors_of_one_instrument_are_no_name_where_the_other_output_is_as_l
     assert "output A2 along" in told
 
 
-@pytest.mark.parametrize(("offset", "bend"), [(0.1, 0.25), (0.05, 0.1)])
+@pytest.mark.parametrize(("offset", "bend"), [(0.1, 0.25), pytest.param(0.05, 0.1, marks=pytest.mark.slow)])
 def test_two_errors_of_one_instrument_that_it_has_are_named(offset, bend):
     rng, times = np.random.default_rng(3), np.linspace(0, 12, 90)
     true = np.exp(-0.1 * times) * np.cos(2 * times)

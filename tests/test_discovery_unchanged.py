@@ -252,7 +252,8 @@ def test_numbers_of_any_type():
 # --- what is told of a range, and of an instrument ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_range_holds_the_data_that_it_is_told_by(seed):
     f, ph = (g.ravel() for g in np.meshgrid(np.linspace(0.2, 0.7, 9), np.arange(2.5, 8), indexing="ij"))
     model = tc.Simulator(lambda x, p: p["k"] - p["S"] * x["f"], [tc.Parameter("k"), tc.Parameter("S", low=0.0)])

@@ -338,6 +338,7 @@ def test_the_sd_of_a_steps_place_says_how_far_it_may_be_off():
     assert max(abs(one) for one in z) < 5
 
 
+@pytest.mark.slow
 def test_an_end_between_two_values_of_a_condition_is_no_better_known_than_these():
     levels = np.array([0.05, 0.1, 0.2, 0.5, 1.0, 1.5, 2.1])
     c, wave = (v.ravel() for v in np.meshgrid(levels, np.arange(475.0, 550, 10), indexing="ij"))
@@ -428,7 +429,8 @@ def test_a_local_term_whose_shape_shows_is_named_all_the_same():
     assert float(d.settings["region"].removeprefix("v > ")) == pytest.approx(0.4, abs=0.1)
 
 
-@pytest.mark.parametrize(("seed", "depth"), [(1, 0.35), pytest.param(3, 0.2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "depth"), [(1, 0.35), (3, 0.2)])
 def test_what_changes_a_factor_of_the_base_in_a_range_is_no_name(seed, depth):
     """A wake that takes a share of a turbine's power in some directions: terms with a power of their own were named
     there, since no constant loss of power is like it at all wind speeds."""

@@ -221,7 +221,8 @@ def test_a_kink_is_passed():
     assert np.abs(y - np.maximum(1.0 - t, 0.0)).max() < 1e-3
 
 
-@pytest.mark.parametrize("stiff", [None, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("stiff", [None, True])
 def test_steps_become_short_where_a_stiff_solution_jumps(stiff):
     """Van der Pol's relaxation oscillation: jumps, each in a fraction of the time between them."""
     mu = 20.0
@@ -391,12 +392,13 @@ def chain(k2, planted=0.0, *, noise=0.02):
     return base, tc.Recording(runs=runs, noise=noise)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("planted", "among", "verdict", "terms"),
     [
         (0.18, ("autocatalysis", "constant source"), "named", ["autocatalysis"]),
-        pytest.param(0.18, None, "named", ["autocatalysis"], marks=pytest.mark.slow),
-        pytest.param(0.0, None, "consistent", [], marks=pytest.mark.slow),
+        (0.18, None, "named", ["autocatalysis"]),
+        (0.0, None, "consistent", []),
     ],
 )
 def test_a_stiff_mechanism_is_diagnosed(planted, among, verdict, terms):
@@ -464,6 +466,7 @@ def test_steps_leave_room_for_what_a_fit_may_find(k):
     assert float((found.at(found.x)(faster) - 1.0).abs().max()) < 1e-6
 
 
+@pytest.mark.slow
 def test_a_fast_neighbour_is_no_bound_of_a_fit():
     """Point kinetics of a reactor with its Doppler feedback: prompt neutrons follow at once, and at the true value of
     what they follow with, explicit steps were unstable."""
@@ -536,6 +539,7 @@ def test_what_fades_within_a_step_is_one(k, wanted):
     assert fading(bound, tensor(k)[None], states.fill_(math.inf))
 
 
+@pytest.mark.slow
 def test_the_base_follows_a_close_passage_with_short_explicit_steps(star, monkeypatch):
     def tried(*arguments, **options):
         raise AssertionError("implicit steps were tried")
