@@ -59,9 +59,8 @@ def recorded(tau: float, *, sd: float = 0.02, seed: int = 0) -> tc.Recording:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("share", "among"),
-    [*((share, None) for share in (0.25, 0.6)),
-     (0.6, ("heater lag", "heater gain error", "second heat capacity", "radiation"))],
-)  # fmt: skip
+    [(0.25, None), (0.6, None), (0.6, ("heater lag", "heater gain error", "second heat capacity", "radiation"))],
+)
 def test_a_lag_shorter_than_the_gaps_between_samples_is_found_and_not_biased(share, among):
     """With the base's steps, one in a gap, its time would be off by several of its sd."""
     tau = share * END / (COUNT - 1)

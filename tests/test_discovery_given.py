@@ -173,7 +173,8 @@ def test_a_recording_with_another_noise_is_the_same_otherwise() -> None:
         data.with_noise(0.0)
 
 
-@pytest.mark.parametrize("in_time", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("in_time", [False, True])
 def test_a_bound_that_is_wrong_is_told(in_time):
     x = torch.linspace(0, 1, 40, dtype=torch.float64)
     sd = 0.01 * torch.randn(40, generator=torch.Generator().manual_seed(0), dtype=torch.float64)

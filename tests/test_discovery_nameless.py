@@ -51,7 +51,8 @@ def rotor(seed, *, dragged=0.0, limit=math.inf, c=0.0, sd=0.28):
     return model, tc.Recording(runs=runs, noise=sd, units={"time": "s"}), terms
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
 def test_an_instrument_that_errs_where_the_physics_may_change_is_no_name(seed):
     d = diagnose(*rotor(seed, dragged=0.25))
     assert d.verdict in ("ambiguous", "unexplained")
@@ -284,6 +285,7 @@ def flights(seed, currents, *, strong=0.0, walk=0.0, sd=0.003):
     return base, tc.Recording(x={"m": mass, "I": current}, y=t, noise=sd), terms
 
 
+@pytest.mark.slow
 def test_a_term_in_a_range_is_no_name_where_two_levels_alone_show_its_shape():
     d = diagnose(*flights(1, [1.0, 4.0], strong=0.02))
     assert d.verdict == "ambiguous"

@@ -755,6 +755,7 @@ def given_half(y, sd=0.05):
     return tc.diagnose(CURVE, tc.Recording(x=x, y=y, noise=sd), [tc.Term("bend", frees=["c"])], progress=False)
 
 
+@pytest.mark.slow
 def test_noise_of_twice_the_sd_that_was_given_is_no_physics():
     x = torch.linspace(0, 2, 60, dtype=F64)
     trials, source = 12, []

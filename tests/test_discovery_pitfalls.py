@@ -316,7 +316,8 @@ def test_a_state_without_a_say_in_the_first_slope_is_left_where_it_was_guessed()
     assert float(follow_slopes(problem, begin).abs().max()) < 1e3
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
 def test_the_base_is_found_where_a_state_that_nothing_records_takes_over_late(seed):
     problem = Problem.of(*sugars(seed))
     found, _ = calibrate_base(problem, {}, 12, 0)
@@ -596,7 +597,8 @@ def flow_curves(seed, *, grid):
     return base, tc.Recording(x={"r": rate, "T": T}, y={"y": y}), terms
 
 
-@pytest.mark.parametrize("grid", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("grid", [True, False])
 def test_a_share_of_a_value_that_spans_decades_is_no_physics_among_several_conditions(grid):
     """What a fit leaves of the largest values hides how little the small ones scatter, until they are weighed so.
 
@@ -835,7 +837,8 @@ def test_a_hopeless_base_is_a_misfit_whatever_is_left_looks_like(monkeypatch):
         assert rounds._refit(search, 0.95) is detected
 
 
-@pytest.mark.parametrize("start", [*(pytest.param(start, marks=pytest.mark.slow) for start in (0.0, 259200.0)), 1.7e9])
+@pytest.mark.slow
+@pytest.mark.parametrize("start", [0.0, 259200.0, 1.7e9])
 def test_the_clock_may_begin_anywhere(start):
     # A sensor's drift, and a rate constant that falls: both count from the first sample.
     t, rng = np.linspace(0, 600, 120), np.random.default_rng(5)
@@ -876,7 +879,8 @@ def emission(n, seed):
     return base, tc.Recording(x=x, y=y), [bend, line]
 
 
-@pytest.mark.parametrize("seeds", [3, pytest.param(6, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seeds", [3, 6])
 def test_what_the_base_takes_for_slow_noise_is_weighed_with_the_noise_that_a_term_leaves(seeds):
     found = [diagnose(*emission(60, seed)) for seed in range(seeds)]
     assert all(d.verdict != "consistent" for d in found)

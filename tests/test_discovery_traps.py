@@ -66,7 +66,8 @@ def rate(seed, offset=0.0, saturates=None, noise=0.01, known=0.0):
     return base, tc.Recording(x={"S": s}, y={"v": y}, noise=noise)
 
 
-@pytest.mark.parametrize("seed", [pytest.param(0, marks=pytest.mark.slow), 1])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
 def test_an_offset_that_is_in_no_list_is_no_saturation_below_all_data(seed):
     terms = [term for term in tc.terms.sensor("v", static=True) if "offset" not in term.name]
     for known in (0.0, 290.0):  # far from 0 it had been looked for bends elsewhere
@@ -135,6 +136,7 @@ def discharged(seed, tau=2.0, until=None, noise=0.01):
     return model, tc.Recording(runs=[tc.Run(time=t, outputs={"v": v})], noise=noise), [shunt]
 
 
+@pytest.mark.slow
 def test_a_loss_that_fades_is_none_that_ends():
     # It was named where t < 3, from a window's better fit than that of no change.
     d = diagnose(*discharged(0, tau=4.0))
@@ -547,10 +549,8 @@ def test_what_is_left_in_the_order_of_rows_may_be_noise_or_physics():
         assert ("the same conditions in another order would tell" in " ".join(str(d).split())) == bool(tied)
 
 
-@pytest.mark.parametrize(
-    ("gain", "rho"),
-    [(0.3, 0.75), pytest.param(0.3, 0.0, marks=pytest.mark.slow), pytest.param(0.0, 0.75, marks=pytest.mark.slow)],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("gain", "rho"), [(0.3, 0.75), (0.3, 0.0), (0.0, 0.75)])
 def test_noise_of_two_colours_may_be_physics_where_the_evidence_comes_from_one_output(gain, rho):
     t, k, m, source = torch.linspace(0, 10, 80, dtype=F64), 0.5, 0.25, 0.0 if gain else 0.05
     decay, fade = torch.exp(-k * t), torch.exp(-m * t)
@@ -608,7 +608,8 @@ def test_two_errors_of_one_instrument_are_no_name_where_the_other_output_is_as_l
     assert "output A2 along" in told
 
 
-@pytest.mark.parametrize(("offset", "bend"), [(0.1, 0.25), pytest.param(0.05, 0.1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("offset", "bend"), [(0.1, 0.25), (0.05, 0.1)])
 def test_two_errors_of_one_instrument_that_it_has_are_named(offset, bend):
     rng, times = np.random.default_rng(3), np.linspace(0, 12, 90)
     true = np.exp(-0.1 * times) * np.cos(2 * times)

@@ -463,7 +463,8 @@ def test_what_changes_a_factor_of_the_base_in_a_range_is_no_name(seed, depth):
     assert 180 < span[0] < 220 < span[1] < 260
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
 def test_a_gain_of_the_list_is_no_nameless_one(seed):
     """The base has moved since the candidates were screened, and its slopes with it: both are taken where it stands."""
     rng = np.random.default_rng(seed)
