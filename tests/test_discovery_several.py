@@ -9,6 +9,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 import torchcal as tc
+from torchcal.discovery import several
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.aliases import merge
 from torchcal.discovery.hypotheses.search import Search
@@ -57,6 +58,36 @@ def test_terms_of_the_best_pairs_are_refitted_alone_where_they_got_stuck():
     assert len({i for pair in pairs[:3] for i in pair.numbers}) > 2
     for i in {i for pair in pairs[:3] if pair.weight > pairs[0].weight - 5 for i in pair.numbers}:
         assert abs(found[i] - right[i]) < 0.1
+
+
+def test_second_terms_are_sought_beside_what_acts_everywhere_too(monkeypatch):
+    # Three that lead in windows bend to what two others do together, of which neither does well in any window.
+    search = searched(["square", "cube", "root", "wave"])
+    plain = sorted(search.plain.values(), key=lambda m: -m.weight)
+    assert len(plain) == 4
+    windows = [
+        dataclasses.replace(model, window=object(), log_evidence=model.log_evidence + 1000 - k)
+        for k, model in enumerate(plain[1:])
+    ]
+    search.models = [*windows, *plain]
+    asked, wanted = [], []
+
+    def next_terms(search, model, most):
+        asked.append((model.numbers[0], model.window is None))
+        return [i for i in range(4) if i != model.numbers[0]]
+
+    def refit_sets(search, sets, prior):
+        wanted.extend(pair for pair, _ in sets)
+        return []
+
+    monkeypatch.setattr(several, "_enough", lambda search: False)
+    monkeypatch.setattr(several, "_linear_pairs", lambda search, most: [])
+    monkeypatch.setattr(several, "_next_terms", next_terms)
+    monkeypatch.setattr(several, "_refit_sets", refit_sets)
+    refit_several(search)
+    order = [model.numbers[0] for model in plain]
+    assert asked == [(i, False) for i in order[1:]] + [(i, True) for i in order[:3]]
+    assert {frozenset(pair) for pair in wanted} == {frozenset((i, j)) for i in range(4) for j in range(i)}
 
 
 def test_candidates_that_are_one_stay_so_where_only_the_first_is_refitted():

@@ -28,6 +28,9 @@ __all__ = ["refit_several", "scores_beside"]
 
 #: Pairs that are refitted at most; where one term leaves noise alone.
 MOST, FEWER = 20, 10
+#: Single terms beside which second ones are sought: of all, and of those that act everywhere; and how many more pairs
+#: are refitted for each of these that is not among the best of all.
+LEADS, MORE = 3, 2
 #: Second terms that are tried beside one of the best, third ones beside the best two, and how many more whose tangents
 #: vanish.
 NEXT, THIRD, UNSEEN = 7, 4, 3
@@ -65,14 +68,17 @@ def refit_several(search: Search) -> None:
     for model in single:
         lead = model.numbers[0]  # in a window merged ones may differ, beside others not
         leads.setdefault(search.twins[lead] if lead in search.gone else lead, model)
+    chosen = list(itertools.islice(leads.items(), 1 if enough else LEADS))
+    if not enough:  # a term in a window bends to what two do together, and these act everywhere
+        everywhere = [(m.numbers[0], m) for m in single if m.window is None][:LEADS]
+        chosen += [one for one in everywhere if one not in chosen]
     beside = [
-        [tuple(sorted((lead, j))) for j in _next_terms(search, model, NEXT) if j != lead]
-        for lead, model in itertools.islice(leads.items(), 1 if enough else 3)
+        [tuple(sorted((lead, j))) for j in _next_terms(search, model, NEXT) if j != lead] for lead, model in chosen
     ]
     for pair in itertools.chain(*itertools.zip_longest(*beside)):  # the best of each lead first
         if pair is not None:
             wanted.setdefault(pair, None)
-    pairs = list(wanted)[: FEWER if enough else MOST]
+    pairs = list(wanted)[: FEWER if enough else MOST + MORE * (len(chosen) - LEADS)]
     prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))
     search.models += (fitted := _refit_sets(search, [(pair, wanted[pair]) for pair in pairs], prior))
     if not enough:
