@@ -366,7 +366,8 @@ def pushed(b, **options):
     return body, tc.Recording(runs=[run_of(x)], noise=0.02), library
 
 
-@pytest.mark.parametrize("among", [("quadratic drag", "bias force"), pytest.param(NAMES, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("among", [("quadratic drag", "bias force"), NAMES])
 def test_a_large_effect_is_named(among):
     body, motion, library = pushed(0.08)
     d = quiet(body, motion, named(library, *among))
@@ -596,6 +597,7 @@ def test_two_causes_with_one_formula_are_tied():
         assert d.experiment is None  # nothing would tell them apart
 
 
+@pytest.mark.slow
 def test_equal_tangents_are_not_equal_models():
     # Stern and Volmer's quenching and Perrin's sphere of action agree to first order, wherever they are measured.
     q = torch.linspace(0, 2, 40, dtype=F64)

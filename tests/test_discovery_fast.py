@@ -134,6 +134,7 @@ def test_tied_hypotheses_count_wherever_they_act():
     assert _shares(decision, models) == pytest.approx([0.8, 0.8])
 
 
+@pytest.mark.slow
 def test_something_unknown_that_is_likelier_than_the_second_is_tied_with_them():
     """A stiffness that follows the drive, in no list: all that is listed acts for it in some window."""
     g = torch.Generator().manual_seed(0)

@@ -478,6 +478,7 @@ def test_a_fit_ends_early_where_its_pace_does_not_lead_to_where_it_is_wanted(lin
     assert (linearised[0] < 30) is early
 
 
+@pytest.mark.slow
 def test_a_fit_that_is_to_be_finished_later_is_not_ended_for_the_steps_that_come_then():
     problem = valley(1000.0)
     begin, free = torch.tensor([[-30.0, 901.0]], dtype=F64), [0, 1]

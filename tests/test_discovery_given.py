@@ -73,6 +73,7 @@ def test_a_wrong_guess_between_samples_is_no_dead_time(seed):
     assert any("with hold='zero' the base leaves no more than noise" in row for row in d.symptoms)
 
 
+@pytest.mark.slow
 def test_no_tie_of_names_alone_for_a_wrong_guess():
     filtered = tc.Term(
         "filter",
@@ -116,6 +117,7 @@ def test_the_right_guess_leaves_nothing():
     assert d.symptoms == []
 
 
+@pytest.mark.slow
 def test_what_no_other_guess_explains_is_named():
     d = tc.diagnose(motor(), recording(0, "zero", friction=0.3), candidates(), seed=0, progress=False)
     assert d.terms == ["friction"]

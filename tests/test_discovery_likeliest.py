@@ -87,7 +87,8 @@ def test_a_known_size_stays_and_replicates_stay():
     assert alone(found, noise, Tangents.of(found, noise))[0] is noise
 
 
-@pytest.mark.parametrize("size", [2, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [2, 8])
 def test_noise_alone_is_not_taken_for_something_unknown(size):
     # A Bayes factor above e^4.6 has a probability of at most 1 % by noise alone: 3 or more of 40, one of 1000. Without
     # the determinant of what is calibrated, eight coefficients would make it a quarter at ρ = 0.9.

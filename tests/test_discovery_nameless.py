@@ -128,7 +128,8 @@ def hot_rod(noise, *, painted=1.0, uneven=0.0):
     return model, tc.Recording(x={"x": x, "hot": hot}, y=y), [term]
 
 
-@pytest.mark.parametrize("noise", [0.5, pytest.param(0.8, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.5, 0.8])
 def test_a_smooth_change_is_no_name_where_a_parameter_may_change_at_one_place(noise):
     d = diagnose(*hot_rod(noise, painted=1.5))
     assert d.verdict in ("ambiguous", "unexplained")
@@ -208,6 +209,7 @@ def up_and_down(seed, gap=0.0, sd=0.02, sorted_rows=False):
     return line, tc.Recording(x=x[order], y=y[order])
 
 
+@pytest.mark.slow
 def test_few_data_that_go_on_in_the_order_of_the_recording_are_told():
     told = "in the order of the recording: a drift, a hysteresis or noise with a memory"
     for seed in range(3):

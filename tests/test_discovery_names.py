@@ -59,6 +59,7 @@ def test_what_leads_in_a_window_is_held_against_all_others_there():
     assert len({row.terms for row in inside}) >= 2
 
 
+@pytest.mark.slow
 def test_edges_are_as_steep_as_the_data_want_before_anything_else_is_likelier():
     x = torch.linspace(0, 10, 120, dtype=F64)
     y = 1 + 0.5 * x + 0.4 * (x < 4.2) + 0.05 * normal(120, 28)
@@ -109,13 +110,14 @@ def test_what_all_the_tied_share_is_said():
     assert "All of them have age." in str(d).replace("\n", " ")
 
 
+@pytest.mark.slow
 def test_pairs_are_weighed_where_one_term_leaves_noise_too():
     d = diagnose(*aged(3, more=0.0))
     assert d.terms == ["age"]
     assert any(len(row.terms) == 2 and row.refitted and row.probability > 0 for row in d.ranking)
 
 
-@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("order", [1, pytest.param(-1, marks=pytest.mark.slow)])
 def test_a_term_that_gives_an_output_anew_loses_nothing_of_others(order):
     x = torch.linspace(0.2, 8, 80, dtype=F64)
     base = tc.Simulator(lambda x, p: p["v"] * x / (p["k"] + x), [tc.Parameter(n, low=0.0, initial=1.0) for n in "vk"])
@@ -235,7 +237,8 @@ def test_only_noise_of_two_sizes_is_uneven(shape):
     assert shape != "spiky" or uneven > 540
 
 
-@pytest.mark.parametrize("seeds", [range(24, 27), pytest.param(range(27, 32), marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seeds", [range(24, 27), range(27, 32)])
 def test_the_size_of_a_product_is_determined_where_its_factors_are_not(seeds):
     x, y = bent(bend=1.0)
     product = tc.Term("product", outputs={"y": lambda x, p, y: y + p["c"] * p["d"] * x**2},
@@ -304,7 +307,7 @@ def there_and_back(bend=0.0, *, seed, phi=0.0, same=True):
     return tc.Recording(x={"field": field, "warm": warm}, y=y + 0.05 * correlated(60, seed, phi))
 
 
-@pytest.mark.parametrize("same", [True, False])
+@pytest.mark.parametrize("same", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_noise_along_a_sweep_that_is_made_at_two_temperatures_is_noise(same):
     base = tc.Simulator(
         lambda x, p: p["M"] * torch.tanh(x["field"] / p["h"]) * (1 - 0.3 * x["warm"]) + p["c"] * x["field"],
@@ -427,6 +430,7 @@ def powers(bend, kind="shifts", wave=0.02):
     return diagnose(straight(), tc.Recording(x=x, y=y), [added(power) for power in (2, 5, 6)])
 
 
+@pytest.mark.slow
 def test_what_all_likelier_hypotheses_hold_is_named_for_its_share():
     d = powers(lambda x: 6 * x**2 + 0.3 * x**5)  # which other power acts beside the square is not told
     assert d.settings["nearly"]
@@ -436,6 +440,7 @@ def test_what_all_likelier_hypotheses_hold_is_named_for_its_share():
     assert "That something which is not in this library acts too has a probability of" in told
 
 
+@pytest.mark.slow
 def test_an_instrument_that_all_likelier_hypotheses_hold_is_no_name():
     assert powers(lambda x: 6 * x**2 + 0.3 * x**5, "outputs").verdict == "unexplained"
 
@@ -477,7 +482,8 @@ def test_what_no_instrument_does_is_no_rival_of_one():
     assert row.probability < 1e-3
 
 
-@pytest.mark.parametrize("seed", [5, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [5, 8])
 def test_a_name_that_has_another_is_none_though_it_may_act_in_a_window(seed):
     # A source of heat in a body that cools is an offset of its thermometer; in a window it is nearly as likely.
     t = np.linspace(0, 105, 90)

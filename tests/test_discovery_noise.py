@@ -543,7 +543,8 @@ def test_a_blank_at_the_start_is_no_surer_than_what_is_known(seed):
     assert 0.3 < ratio.min() < ratio.max() < 4.0
 
 
-@pytest.mark.parametrize("seeds", [5, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seeds", [8, 20])
 def test_replicates_tell_noise_that_grows(seeds):
     """As many false alarms at 1 % as a binomial allows, where small values looked too well fitted before."""
     x = np.tile(np.geomspace(0.2, 20, 20), 2)
@@ -925,7 +926,7 @@ def killed(seed: int, lost: float, *, memory: float = 0.0, runs: int = 6, togeth
     return base, tc.Recording(runs=each, units={"time": "h"})
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_what_all_runs_do_at_one_time_is_no_noise(seed):
     """Slow noise of unknown size would explain each run, and not all of them alike."""
     base, recording = killed(seed, 0.8)
@@ -935,7 +936,7 @@ def test_what_all_runs_do_at_one_time_is_no_noise(seed):
     assert d.noise.sd["L"] == pytest.approx(0.12, rel=0.35)
 
 
-@pytest.mark.parametrize("memory", [0.0, 0.7])
+@pytest.mark.parametrize("memory", [pytest.param(0.0, marks=pytest.mark.slow), 0.7])
 def test_noise_of_runs_that_share_their_times_is_consistent(memory):
     for seed in range(3):
         base, recording = killed(seed, 0.0, memory=memory)

@@ -126,6 +126,7 @@ def test_what_the_base_has_everywhere_may_be_missing_in_a_window():
     assert str(best.estimates[0]) in words
 
 
+@pytest.mark.slow
 def test_an_offset_in_a_part_of_a_range_may_be_anything():
     d = beyond_six(lambda y: -0.4, "offset", lambda x, p, y: y + p["c"])
     assert d.tied == [["offset"], ["none of these"]]
@@ -195,6 +196,7 @@ def test_an_experiment_asks_for_the_initial_states_that_were_not_given(given):
     assert asks == ([] if given else [text for text in texts if text in {*same, *multiples}])
 
 
+@pytest.mark.slow
 def test_no_experiment_is_proposed_that_tells_nothing_apart():
     t, rng = np.linspace(0, 10, 80), np.random.default_rng(3)
     y = solve(lambda t, y: [-0.5 * y[0] + 0.1], [2.0], t)[0] + 0.02 * rng.standard_normal(80)
@@ -229,6 +231,7 @@ def test_errors_of_several_outputs_are_in_their_spreads_and_say_so():
     assert "of each output's spread" not in paragraph(diagnose(one, tc.Recording(x=x, y=y["u"], noise=0.02), []))
 
 
+@pytest.mark.slow
 def test_rates_are_guessed_from_the_length_of_long_runs():
     t, rng = np.linspace(0, 3e7, 80), np.random.default_rng(0)
     y = np.exp(-8e-8 * t) + 0.01 * rng.standard_normal(80)
@@ -423,6 +426,7 @@ def test_what_all_likely_models_share_is_no_name_where_its_own_fit_is_bad():
     assert len(d.tied) >= 2
 
 
+@pytest.mark.slow
 def test_a_few_replicates_do_not_bound_what_a_term_may_leave():
     named = 0
     for seed in range(6):
@@ -613,7 +617,8 @@ def test_a_share_of_a_value_that_spans_decades_is_no_physics_among_several_condi
     assert alarms <= 1
 
 
-@pytest.mark.parametrize("bent", [0.0, pytest.param(0.02, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("bent", [0.0, 0.02])
 def test_an_effect_that_is_large_in_noise_that_grows_is_named_and_its_absence_is_not(bent):
     """A turnover over five decades, read to 3 %: what the base misses of the largest values looked like their noise, so
     that the larger the effect was the less it had a name."""

@@ -145,6 +145,7 @@ def test_a_large_outlier_of_a_small_grid_is_told_from_those_that_the_fit_misses_
     assert d.noise.sd["y"] == pytest.approx(1.8, rel=0.3)
 
 
+@pytest.mark.slow
 def test_another_minimum_that_fits_as_well_is_told():
     x, y, _ = curve(3, 0.0, J=3.68, J0=0.31, n=1.45, J2=2.0)
     rng = np.random.default_rng(3)
@@ -413,12 +414,13 @@ def test_the_sd_of_a_name_rest_on_the_noise_beside_it():
         assert 0.07 < d.noise.sd["y"] < 0.13
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "noise"),
     [
-        pytest.param(0, 0.1, marks=pytest.mark.slow),
-        pytest.param(0, None, marks=pytest.mark.slow),
-        pytest.param(1, 0.1, marks=pytest.mark.slow),
+        (0, 0.1),
+        (0, None),
+        (1, 0.1),
         (1, None),
     ],
 )
@@ -465,7 +467,8 @@ def test_a_dip_in_both_of_two_sweeps_is_no_pair_of_outliers():
     assert lost <= 1  # and not all
 
 
-@pytest.mark.parametrize("place", [0, pytest.param(-1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("place", [0, -1])
 def test_an_outlier_at_the_end_of_an_uneven_run_is_one_beside_the_term_that_explains_the_rest(place):
     # Its neighbours were too unevenly spaced to tell, and beside the term something unknown took its place.
     rng, runs = np.random.default_rng(0), []

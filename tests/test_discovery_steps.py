@@ -205,6 +205,7 @@ def test_in_a_large_grid_bumps_are_sought_all_the_same():
         assert bumps >= 2 * 8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [{"in_one": 0.6}, {"everywhere": 0.3}, {}])
 def test_what_is_off_in_a_part_of_a_grid_is_no_noise(size):
     simulator, recording = gridded(0.05, 1, **size)

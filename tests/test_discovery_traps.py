@@ -173,6 +173,7 @@ def test_an_initial_value_that_is_the_first_sample_is_told(seed):
     assert d.verdict == "consistent"
 
 
+@pytest.mark.slow
 def test_an_initial_value_that_is_wrong_is_told():
     # An offset of the sensor does nearly what it does, and was named.
     t = np.linspace(0.0, 8.0, 80)
@@ -322,7 +323,8 @@ def emptied(seed, begins, noise=0.01):
     return base, tc.Recording(runs=[run], noise=noise)
 
 
-@pytest.mark.parametrize("begins", [pytest.param(0.0, marks=pytest.mark.slow), 2.2])
+@pytest.mark.slow
+@pytest.mark.parametrize("begins", [0.0, 2.2])
 def test_a_threshold_below_all_data_is_none(begins):
     terms = [term for term in tc.terms.hydraulics("h", inflow="q") if term.name in ("overflow", "evaporation")]
     d = diagnose(*emptied(0, begins), terms)
@@ -447,6 +449,7 @@ def test_steps_are_short_enough_for_the_least_noise():
     assert d.base.estimates[0].value == pytest.approx(0.2, rel=0.01)
 
 
+@pytest.mark.slow
 def test_two_outputs_share_what_was_fitted_to_their_replicates():
     """Were every parameter counted against the means of every output, white noise would be a shared preparation."""
     x = torch.linspace(0, 10, 9, dtype=F64).repeat_interleave(4)

@@ -110,7 +110,7 @@ def test_noise_forgets_over_the_same_time_in_all_runs():
     assert problem.uneven
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_runs_of_unlike_rates_are_no_missing_physics(seed):
     model, recording = cooling((0.05, 0.5), (200, 25), (0.05, 0.05), seed, tau=0.3)
     d = diagnose(model, recording, LOSS)

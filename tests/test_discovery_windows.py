@@ -302,7 +302,8 @@ def test_what_begins_somewhere_and_is_in_no_list_is_not_named_by_a_window():
         assert d.verdict == "unexplained" or ["none of these"] in d.tied
 
 
-@pytest.mark.parametrize("side", [1, pytest.param(-1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("side", [1, -1])
 def test_what_the_base_has_everywhere_acts_where_there_are_fewer_data(side):
     """A slope that changes at 0.3 is as well another slope below as above: of the two sides the smaller is told."""
     generator = torch.Generator().manual_seed(1)
@@ -763,6 +764,7 @@ def test_windows_of_many_data_take_no_square_of_their_number():
     assert best.amplitude == pytest.approx(0.1, abs=0.02)
 
 
+@pytest.mark.slow
 def test_a_level_at_the_end_of_a_condition_is_a_window():
     """Its end, anywhere between two levels, came to lie on the last one: no share of the range, and no model."""
     g, t = (torch.as_tensor(v.ravel()) for v in np.meshgrid(np.geomspace(0.1, 500, 22), [10.0, 25.0, 40.0]))
