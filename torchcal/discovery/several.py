@@ -29,7 +29,7 @@ __all__ = ["refit_several", "scores_beside"]
 #: Pairs that are refitted at most; where one term leaves noise alone.
 MOST, FEWER = 20, 10
 #: Single terms beside which second ones are sought: of all, and of those that act everywhere; and how many more pairs
-#: are refitted for each of these that is not among the best of all.
+#: are refitted for each of these that is not among the three best of all.
 LEADS, MORE = 3, 2
 #: Second terms that are tried beside one of the best, third ones beside the best two, and how many more whose tangents
 #: vanish.
@@ -68,19 +68,19 @@ def refit_several(search: Search) -> None:
     for model in single:
         lead = model.numbers[0]  # in a window merged ones may differ, beside others not
         leads.setdefault(search.twins[lead] if lead in search.gone else lead, model)
-    chosen = list(itertools.islice(leads.items(), 1 if enough else LEADS))
-    if not enough:  # a term in a window bends to what two do together, and these act everywhere
-        everywhere = [(m.numbers[0], m) for m in single if m.window is None][:LEADS]
-        chosen += [one for one in everywhere if one not in chosen]
-    beside = [
-        [tuple(sorted((lead, j))) for j in _next_terms(search, model, NEXT) if j != lead] for lead, model in chosen
-    ]
+    ahead = list(itertools.islice(leads.items(), 1 if enough else LEADS))
+    beside = [_pairs_with(search, lead, model) for lead, model in ahead]
     for pair in itertools.chain(*itertools.zip_longest(*beside)):  # the best of each lead first
         if pair is not None:
             wanted.setdefault(pair, None)
-    pairs = list(wanted)[: FEWER if enough else MOST + MORE * (len(chosen) - LEADS)]
+    pairs = list(wanted)[: FEWER if enough else MOST]
+    if not enough:  # a term in a window bends to what two do together, and these act everywhere
+        everywhere = [(m.numbers[0], m) for m in single if m.window is None][:LEADS]
+        for lead, model in everywhere:
+            if (lead, model) not in ahead:
+                pairs += [pair for pair in _pairs_with(search, lead, model) if pair not in pairs][:MORE]
     prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))
-    search.models += (fitted := _refit_sets(search, [(pair, wanted[pair]) for pair in pairs], prior))
+    search.models += (fitted := _refit_sets(search, [(pair, wanted.get(pair)) for pair in pairs], prior))
     if not enough:
         fitted = _either_way(search, fitted)
     best = search.physical_leader
@@ -100,6 +100,11 @@ def refit_several(search: Search) -> None:
         leader = search.physical_leader
         if leader is not None and len(leader.numbers) == 3:
             _one_fewer(search, leader, prior)
+
+
+def _pairs_with(search: Search, lead: int, model: Model) -> list[tuple[int, ...]]:
+    """Pairs of a single term and the best second ones at its fit."""
+    return [tuple(sorted((lead, j))) for j in _next_terms(search, model, NEXT) if j != lead]
 
 
 def _close(search: Search) -> list[Model]:
