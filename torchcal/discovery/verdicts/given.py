@@ -54,7 +54,10 @@ def resolved(recording: Recording) -> Recording:
 def told_apart(base: Fitted) -> Tensor | None:
     """The sd ``(n_total,)`` that a given noise must be taken for where evidences cannot be told apart with it."""
     noise = base.problem.recording.noise
-    return math.sqrt(base.chi2 / DIGITS) * noise if isinstance(noise, Tensor) and base.chi2 > DIGITS else None
+    if not isinstance(noise, Tensor):
+        return None
+    chi2 = max(base.chi2, float((base.residual / noise[base.problem.index]).square().sum()))  # a memory may change
+    return math.sqrt(chi2 / DIGITS) * noise if chi2 > DIGITS else None
 
 
 def unbounded(search: Search) -> list[str]:
