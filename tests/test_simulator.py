@@ -6,6 +6,7 @@ import warnings
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import torchcal as tc
 from torchcal.errors import DomainError, EmbeddingError, ShapeError, SimulatorError
@@ -319,6 +320,36 @@ def test_constants_beside_parameters_change_no_derivative():
     simulator = tc.Simulator(function, [tc.Parameter("a")])
     values = torch.tensor([[0.7], [1.9]], dtype=torch.float64)
     found = simulator.linearise(x, values)
+    torch.testing.assert_close(found.y, simulator.at(x)(values), rtol=0, atol=0)
+    h = 1e-6
+    slope = (simulator.at(x)(values + h) - simulator.at(x)(values - h)) / (2 * h)
+    torch.testing.assert_close(found.jacobian[..., 0], slope, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x, p: p["a"] / x + 1 / x + 2 / p["a"],
+        lambda x, p: torch.where(x > 1, p["a"] * x, 0.5) + torch.where(x > 1, 2.0, x * p["a"]),
+        lambda x, p: torch.maximum(p["a"] * x, torch.ones(7, dtype=torch.float64)),
+        lambda x, p: torch.minimum(torch.tensor(1.2, dtype=torch.float64), p["a"] * x),
+        lambda x, p: (x > 1) * p["a"] + p["a"] * torch.arange(7),
+    ],
+)
+def test_no_operation_beside_parameters_falls_back_to_implicit_tangents(function):
+    # They cost a hundred times what the operation does.
+    class Watch(TorchDispatchMode):
+        implicit = 0
+
+        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+            self.implicit += "_efficientzerotensor" in str(func)
+            return func(*args, **(kwargs or {}))
+
+    x, values = torch.linspace(0.5, 2, 7, dtype=torch.float64), torch.tensor([[0.7]], dtype=torch.float64)
+    simulator = tc.Simulator(function, [tc.Parameter("a")])
+    with Watch() as watch:
+        found = simulator.linearise(x, values)
+    assert watch.implicit == 0
     torch.testing.assert_close(found.y, simulator.at(x)(values), rtol=0, atol=0)
     h = 1e-6
     slope = (simulator.at(x)(values + h) - simulator.at(x)(values - h)) / (2 * h)

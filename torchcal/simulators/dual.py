@@ -15,8 +15,11 @@ from torch.overrides import TorchFunctionMode
 __all__ = ["Still", "still", "transformed"]
 
 _BINARY = {
-    "add", "sub", "mul", "div", "true_divide", "__add__", "__radd__", "__sub__", "__mul__", "__rmul__", "__truediv__"
+    "add", "sub", "mul", "div", "true_divide", "maximum", "minimum",
+    "__add__", "__radd__", "__sub__", "__mul__", "__rmul__", "__truediv__",
 }  # fmt: skip
+#: A constant by a tensor, under the names that releases of PyTorch have for it.
+_REVERSED = {"__rtruediv__", "__rdiv__"}
 
 
 def still(value: Tensor) -> Tensor:
@@ -26,7 +29,7 @@ def still(value: Tensor) -> Tensor:
 
 
 class Still(TorchFunctionMode):
-    """Sums, differences, products and quotients of dual tensors with constants, inside a dual level."""
+    """Sums, differences, products, quotients, extremes and choices of dual tensors and constants, in a dual level."""
 
     def __torch_function__(
         self,
@@ -37,25 +40,36 @@ class Still(TorchFunctionMode):
     ) -> Any:
         """As the function does."""
         name = getattr(func, "__name__", "")
-        if not kwargs and len(args) == 2 and (name in _BINARY or name == "__rtruediv__"):
-            if name == "__rtruediv__":
+        if not kwargs and len(args) == 2 and (name in _BINARY or name in _REVERSED):
+            if name in _REVERSED:
                 func, args = torch.true_divide, args[::-1]
-            one, other = args
-            args = (_beside(one, other), _beside(other, one))
+            args = _together(*args)
+        elif not kwargs and len(args) == 3 and func is torch.where:
+            args = (args[0], *_together(*args[1:]))
         return func(*args, **(kwargs or {}))
 
 
-def _beside(value: Any, other: Any) -> Any:
-    """A constant beside a dual tensor, with a tangent; anything else as it is."""
-    if not isinstance(other, Tensor) or not other.dtype.is_floating_point or transformed(other) or transformed(value):
-        return value
+def _together(one: Any, other: Any) -> tuple[Any, Any]:
+    """Two values, with a tangent for a constant one beside one that moves."""
+    if transformed(one) or transformed(other):
+        return one, other
+    moves = _moves(one), _moves(other)
+    if moves == (True, False):
+        return one, _beside(one, other)
+    if moves == (False, True):
+        return _beside(other, one), other
+    return one, other
+
+
+def _beside(moving: Tensor, value: Any) -> Any:
+    """A constant beside a dual tensor, with a tangent; what is no real number as it is."""
     if isinstance(value, Tensor):
-        if not value.dtype.is_floating_point or _moves(value) or not _moves(other):
+        if value.dtype.is_complex:
             return value
-        return still(value)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not _moves(other):
+        return still(value if value.dtype.is_floating_point else value.to(moving.dtype))  # masks and counts
+    if isinstance(value, bool) or not isinstance(value, int | float):
         return value
-    return still(torch.tensor(value, dtype=other.dtype, device=other.device))
+    return still(torch.tensor(value, dtype=moving.dtype, device=moving.device))
 
 
 def transformed(value: Any) -> bool:
@@ -64,5 +78,5 @@ def transformed(value: Any) -> bool:
     return isinstance(value, Tensor) and torch._C._functorch.is_functorch_wrapped_tensor(value)
 
 
-def _moves(value: Tensor) -> bool:
-    return forward_ad.unpack_dual(value).tangent is not None
+def _moves(value: Any) -> bool:
+    return isinstance(value, Tensor) and forward_ad.unpack_dual(value).tangent is not None
