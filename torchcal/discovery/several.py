@@ -61,31 +61,14 @@ def refit_several(search: Search) -> None:
     enough = _enough(search)
     if enough and search.exact:
         return
-    wanted: dict[tuple[int, ...], tuple[int, int] | None] = {}
-    for columns in _linear_pairs(search, FROM_FAR if is_far(search.base) else FROM_LINEAR):
-        wanted[tuple(int(search.screening.owner[k]) for k in columns)] = columns
-    leads: dict[int, Model] = {}
-    for model in single:
-        lead = model.numbers[0]  # in a window merged ones may differ, beside others not
-        leads.setdefault(search.twins[lead] if lead in search.gone else lead, model)
-    ahead = list(itertools.islice(leads.items(), 1 if enough else LEADS))
-    beside = [_pairs_with(search, lead, model) for lead, model in ahead]
-    for pair in itertools.chain(*itertools.zip_longest(*beside)):  # the best of each lead first
-        if pair is not None:
-            wanted.setdefault(pair, None)
-    pairs = list(wanted)[: FEWER if enough else MOST]
-    if not enough:  # a term in a window bends to what two do together, and these act everywhere
-        everywhere = [(m.numbers[0], m) for m in single if m.window is None][:LEADS]
-        for lead, model in everywhere:
-            if (lead, model) not in ahead:
-                pairs += [pair for pair in _pairs_with(search, lead, model) if pair not in pairs][:MORE]
+    wanted = _pairs_to_try(search, single, enough)
     prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))
-    search.models += (fitted := _refit_sets(search, [(pair, wanted.get(pair)) for pair in pairs], prior))
+    search.models += (fitted := _refit_sets(search, list(wanted.items()), prior))
     if not enough:
         fitted = _either_way(search, fitted)
     best = search.physical_leader
     if best is not None and len(best.numbers) == 2:
-        fitted += _with_look_alikes(search, set(pairs), prior)
+        fitted += _with_look_alikes(search, set(wanted), prior)
         for pair in _close(search):
             _alone_again(search, pair)
     if isinstance(search.problem.recording.noise, Tensor):  # else a smaller noise makes physics of any small misfit
@@ -100,6 +83,37 @@ def refit_several(search: Search) -> None:
         leader = search.physical_leader
         if leader is not None and len(leader.numbers) == 3:
             _one_fewer(search, leader, prior)
+
+
+def _pairs_to_try(
+    search: Search, single: Sequence[Model], enough: bool
+) -> dict[tuple[int, ...], tuple[int, int] | None]:
+    """Pairs, each with the columns of the linear search that suggested it, if that did.
+
+    Args:
+        single: Models of one term, the likeliest first.
+        enough: Whether one term that acts everywhere leaves noise alone.
+    """
+    wanted: dict[tuple[int, ...], tuple[int, int] | None] = {}
+    for columns in _linear_pairs(search, FROM_FAR if is_far(search.base) else FROM_LINEAR):
+        wanted[tuple(int(search.screening.owner[k]) for k in columns)] = columns
+    leads: dict[int, Model] = {}
+    for model in single:
+        lead = model.numbers[0]  # in a window merged ones may differ, beside others not
+        leads.setdefault(search.twins[lead] if lead in search.gone else lead, model)
+    ahead = list(itertools.islice(leads.items(), 1 if enough else LEADS))
+    beside = [_pairs_with(search, lead, model) for lead, model in ahead]
+    for pair in itertools.chain(*itertools.zip_longest(*beside)):  # the best of each lead first
+        if pair is not None:
+            wanted.setdefault(pair, None)
+    wanted = dict(itertools.islice(wanted.items(), FEWER if enough else MOST))
+    if not enough:  # a term in a window bends to what two do together, and these act everywhere
+        everywhere = [(m.numbers[0], m) for m in single if m.window is None][:LEADS]
+        for lead, model in everywhere:
+            if (lead, model) not in ahead:
+                more = [pair for pair in _pairs_with(search, lead, model) if pair not in wanted]
+                wanted.update(dict.fromkeys(more[:MORE]))
+    return wanted
 
 
 def _pairs_with(search: Search, lead: int, model: Model) -> list[tuple[int, ...]]:
