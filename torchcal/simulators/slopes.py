@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchcal.errors import SimulatorError
 from torchcal.simulators.parameter import limits
+from torchcal.simulators.solution import Solution
 from torchcal.simulators.static import Conditions, Simulator
 from torchcal.simulators.trajectories import Trajectories
 
@@ -19,6 +20,8 @@ STEPS, AGREE, OFF = (1e-2, 1e-3, 1e-5), 0.05, 0.1
 #: Combinations of the outputs that are derived.
 DRAWS = 8
 
+Look = tuple[Tensor, Tensor]
+
 
 def check_slopes(
     simulator: Simulator,
@@ -30,6 +33,7 @@ def check_slopes(
     kept: Tensor | None = None,
     whole: bool = False,
     what: str = "the simulator",
+    near: Solution | None = None,
 ) -> None:
     """Raise if outputs change otherwise with some parameters than their derivatives say.
 
@@ -49,34 +53,38 @@ def check_slopes(
         whole: Whether to ask the Jacobian of `Simulator.linearise`, by which a diagnosis goes, in place of backward
             passes, by which a sampler does.
         what: How to call the simulator in the error.
+        near: Of a simulator in time, a trajectory near that at the first of the values.
 
     Raises:
         SimulatorError: If they do.
     """
     if simulator.dear and not isinstance(simulator, Trajectories):
         return
-    evaluate = simulator.at(x, outputs)
-    with torch.no_grad():
-        good = evaluate(values).detach()
-    used = torch.ones(good.shape[-1], dtype=torch.bool) if kept is None else kept
-    rows = len(next(iter(x.values())) if isinstance(x, Mapping) else x)
-    parts = [k * rows + part.nonzero()[:, 0] for k, part in enumerate(used.split(rows)) if bool(part.any())]
-    generator = torch.Generator().manual_seed(0)
-    looks = [(part, torch.randint(2, (DRAWS, len(part)), generator=generator).double() * 2 - 1) for part in parts]
-
-    def derive(values: Tensor, columns: list[int]) -> list[Tensor]:
-        found = None if whole else _pulled_back(evaluate, values, looks)
-        if found is not None:
-            return [each[:, columns] for each in found]
-        jacobian = simulator.linearise(x, values, outputs, columns).jacobian[0]
-        return [signs @ jacobian[part] for part, signs in looks]
-
+    used = kept
+    looks: list[Look] = []
     asked = list(columns)
-    for here in values[torch.isfinite(good[:, used]).all(-1)]:
+    for number, here in enumerate(values):
         reach = _reach(simulator, here)
-        judged = set()
         inside = [column for column in asked if reach[column] > 0]
-        for column, off in _errors(evaluate, derive, here, reach, inside, looks):
+        guess = None if number else near
+        first = simulator.linearise(x, here[None], outputs, inside if whole else [], guess)
+        if used is None:
+            used = torch.ones(first.y.shape[-1], dtype=torch.bool)
+        if not bool(torch.isfinite(first.y[0, used]).all()):
+            continue
+        looks = looks or _looks(used, len(next(iter(x.values())) if isinstance(x, Mapping) else x))
+        told = None if whole else _pulled_back(simulator.at(x, outputs), here[None], looks)
+        if told is None:
+            jacobian = (first if whole else simulator.linearise(x, here[None], outputs, inside)).jacobian[0]
+            told = [signs @ jacobian[part] for part, signs in looks]
+        else:
+            told = [each[:, inside] for each in told]
+
+        def moved(rows: Tensor, warm: Solution | None = first.warm) -> Tensor:
+            return simulator.linearise(x, rows, outputs, [], warm and warm.repeated(len(rows))).y
+
+        judged = set()
+        for column, off in _errors(moved, first.y[0], told, here, reach, inside, looks):
             if off > OFF:
                 raise SimulatorError(
                     f"Expected {what} to depend on {simulator.names[column]!r} through torch operations alone. Got "
@@ -89,6 +97,13 @@ def check_slopes(
             break
 
 
+def _looks(used: Tensor, rows: int) -> list[Look]:
+    """Of each output of which values count, ``rows`` of every one, their places, and signs to sum them with."""
+    generator = torch.Generator().manual_seed(0)
+    parts = [k * rows + part.nonzero()[:, 0] for k, part in enumerate(used.split(rows)) if bool(part.any())]
+    return [(part, torch.randint(2, (DRAWS, len(part)), generator=generator).double() * 2 - 1) for part in parts]
+
+
 def _reach(simulator: Simulator, values: Tensor) -> Tensor:
     """The size of every parameter, and no more than what is left to its bounds, ``(P,)``."""
     low, high = limits(simulator.parameters)
@@ -98,36 +113,39 @@ def _reach(simulator: Simulator, values: Tensor) -> Tensor:
 
 
 def _errors(
-    evaluate: Callable[[Tensor], Tensor],
-    derive: Callable[[Tensor, list[int]], list[Tensor]],
+    moved: Callable[[Tensor], Tensor],
+    y: Tensor,
+    told: list[Tensor],
     values: Tensor,
     reach: Tensor,
     columns: list[int],
-    looks: list[tuple[Tensor, Tensor]],
+    looks: list[Look],
 ) -> Iterator[tuple[int, float]]:
     """By which part of the change derivatives at values ``(P,)`` are off, for each parameter that tells it.
 
-    They may move from there by their ``reach`` times `STEPS`. Of each output, ``looks`` holds the places and the signs
-    ``(DRAWS, m)`` with which its values are summed.
+    Args:
+        moved: Outputs at nearby values.
+        y: Those at the values.
+        told: What derivatives say of the sums that each of ``looks`` takes, ``(DRAWS, len(columns))``.
+        values: Parameter values.
+        reach: They may move by this times `STEPS`.
+        columns: Places of the parameters to ask.
+        looks: Of each output, the places and the signs ``(DRAWS, m)`` with which its values are summed.
     """
     if not columns:
         return
     moves = []
     for factor in STEPS:
-        moved = torch.zeros(len(columns), len(values), dtype=torch.float64)
-        moved[range(len(columns)), columns] = factor * reach[columns]
-        moves += [moved, -moved]
-    with torch.no_grad():
-        y, *tried = evaluate(torch.cat([values[None], values + torch.cat(moves)])).detach().split(
-            [1, *[len(columns)] * len(moves)]
-        )
-    told = derive(values[None], columns)
+        move = torch.zeros(len(columns), len(values), dtype=torch.float64)
+        move[range(len(columns)), columns] = factor * reach[columns]
+        moves += [move, -move]
+    tried = moved(values + torch.cat(moves)).split(len(columns))
     for k, column in enumerate(columns):
         steps = [(factor, tried[2 * i][k], tried[2 * i + 1][k]) for i, factor in enumerate(STEPS)]
         for (part, signs), slopes in zip(looks, told, strict=True):
             far, seen, close = ((forth[part] - back[part]) / (2 * factor) for factor, forth, back in steps)
             _, forth, back = steps[1]
-            bent = max(float((far - seen).norm()), float((forth + back - 2 * y[0])[part].norm()) / STEPS[1])
+            bent = max(float((far - seen).norm()), float((forth + back - 2 * y)[part].norm()) / STEPS[1])
             change = float(seen.norm())
             if change > 0 and bent < AGREE * change:  # neither a kink, nor where a slope is infinite
                 slope = reach[column] * slopes[:, k]
@@ -136,7 +154,7 @@ def _errors(
 
 
 def _pulled_back(
-    evaluate: Callable[[Tensor], Tensor], values: Tensor, looks: list[tuple[Tensor, Tensor]]
+    evaluate: Callable[[Tensor], Tensor], values: Tensor, looks: list[Look]
 ) -> list[Tensor] | None:
     """Derivatives of the sums of each output's values with signs, ``(DRAWS, P)``, at values ``(1, P)``.
 

@@ -273,15 +273,20 @@ class Problem:
             )
         return found.y[:, self.index], found.jacobian[:, self.index], found.warm
 
-    def check_slopes(self, values: Tensor, columns: Sequence[int], what: str = "the simulator") -> None:
+    def check_slopes(
+        self, values: Tensor, columns: Sequence[int], what: str = "the simulator", near: Solution | None = None
+    ) -> None:
         """Raise if the outputs at the used data change otherwise with some parameters, at values ``(P,)``, than their
-        derivatives say.
+        derivatives say; ``near`` is another problem's only solution, near there.
 
         Raises:
             SimulatorError: If they do.
         """
         x, outputs = self.recording.x, self.recording.outputs
-        check_slopes(self.simulator, x, values[None], columns, outputs, kept=self.keep, whole=True, what=what)
+        near = self.guess(near, values[None])
+        check_slopes(
+            self.simulator, x, values[None], columns, outputs, kept=self.keep, whole=True, what=what, near=near
+        )
 
     def guess(self, found: Solution | None, values: Tensor) -> Solution | None:
         """Another problem's only solution as a warm start at ``values`` (H, P); None where it is none.

@@ -121,7 +121,8 @@ class Search:
             self.tick(f"screen {term.name}")
             self.candidates.append(prepare(self.base.problem, self.base, [term], self.fixed, scale))
         for candidate in self.candidates if not self.clean else ():  # later searches: these have been asked
-            candidate.problem.check_slopes(candidate.acting, candidate.own, f"the simulator with {candidate.name!r}")
+            what = f"the simulator with {candidate.name!r}"
+            candidate.problem.check_slopes(candidate.acting, candidate.own, what, self.base.warm)
         self.screening = screen(self.residual, self.candidates)
         within = within_bounds(self.base, self.fixed, self.seed)
         for i, candidate in enumerate(self.candidates):
