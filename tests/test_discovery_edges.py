@@ -579,3 +579,67 @@ def test_what_the_base_calibrates_is_no_effect_of_a_term_that_frees_it_too():
         assert "neutral" not in rows[-1].note
     assert rows[0].note == rows[1].note
     assert rows[0].log_evidence == pytest.approx(rows[1].log_evidence, abs=1e-3)
+
+
+BODY = tc.ODESimulator(
+    lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"]},
+    states={"x": "m", "v": "m/s"},
+    parameters=[tc.Parameter("k", low=0.0, initial=1.0)],
+    observe={"x": lambda t, s, p, u: s["x"], "sum": lambda t, s, p, u: s["x"] + s["v"]},
+)
+
+
+@pytest.mark.parametrize(
+    ("term", "told"),
+    [
+        ({"equation": "v", "rate": lambda t, s, p, u: p["g"] * s["w"]}, "KeyError: 'w'"),
+        ({"equation": "v", "rate": lambda t, s, p: p["g"] * s["v"]}, "takes 3 positional arguments"),
+        ({"equation": "v", "rate": lambda t, s, p, u: p["g"] * s["v"].sine()}, "no attribute 'sine'"),
+        ({"outputs": {"x": lambda t, s, p, u, y: y + p["g"] * s["w"]}}, "KeyError: 'w'"),
+        ({"shifts": {"k": lambda t, s, p, u: p["g"] * u["f"]}}, "KeyError: 'f'"),
+        ({"states": {"h": ""}, "initial": {"h": lambda s, p: p["g"] * s["w"]},
+          "rates": {"h": lambda t, s, p, u: -s["h"], "v": lambda t, s, p, u: s["h"]}}, "KeyError: 'w'"),
+    ],
+)  # fmt: skip
+def test_a_term_that_asks_for_what_there_is_not_is_told_before_anything_is_calibrated(monkeypatch, term, told):
+    monkeypatch.setattr("torchcal.discovery.hypotheses.search.calibrate_base", None)
+    t = torch.linspace(0, 4, 40, dtype=F64)
+    run = tc.Run(time=t, outputs={"x": t.cos(), "sum": t.cos() - t.sin()}, initial={"x": 1.0, "v": 0.0})
+    with pytest.raises(SimulatorError, match=told):
+        diagnose(BODY, tc.Recording(runs=[run]), [tc.Term("wrong", parameters=[tc.Parameter("g")], **term)])
+
+
+def test_an_instrument_of_an_output_that_is_no_state_is_told_before_anything_is_calibrated(monkeypatch):
+    monkeypatch.setattr("torchcal.discovery.hypotheses.search.calibrate_base", None)
+    t = torch.linspace(0, 4, 40, dtype=F64)
+    run = tc.Run(time=t, outputs={"x": t.cos(), "sum": t.cos() - t.sin()}, initial={"x": 1.0, "v": 0.0})
+    with pytest.raises(DomainError, match="Expected 'sum' to be a state"):
+        diagnose(BODY, tc.Recording(runs=[run]), tc.terms.sensor(outputs=("sum",)))
+
+
+def test_a_static_term_that_asks_for_what_there_is_not_is_told_before_anything_is_calibrated(monkeypatch):
+    monkeypatch.setattr("torchcal.discovery.hypotheses.search.calibrate_base", None)
+    x = torch.linspace(0, 1, 20, dtype=F64)
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x["x"], [tc.Parameter("a"), tc.Parameter("b")])
+    term = tc.Term("wrong", shifts={"a": lambda x, p: p["g"] * x["X"]}, parameters=[tc.Parameter("g")])
+    with pytest.raises(SimulatorError, match="KeyError: 'X'"):
+        diagnose(line, tc.Recording(x={"x": x}, y=x + 0.01 * noise(20, 0)), [term])
+
+
+@pytest.mark.parametrize("trouble", [ValueError("not here"), RuntimeError("not here")])
+def test_what_a_term_raises_at_one_value_alone_does_not_stop_a_diagnosis_before_it_begins(monkeypatch, trouble):
+    """Where the base has not been calibrated its values may be any."""
+
+    def begun(*given, **options):
+        raise ArithmeticError("begun")
+
+    monkeypatch.setattr("torchcal.discovery.hypotheses.search.calibrate_base", begun)
+
+    def picky(x, p, y):
+        raise trouble
+
+    x = torch.linspace(0, 1, 20, dtype=F64)
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    term = tc.Term("picky", outputs={"y": picky}, parameters=[tc.Parameter("g")])
+    with pytest.raises(ArithmeticError, match="begun"):
+        diagnose(line, tc.Recording(x=x, y=x + 0.01 * noise(20, 0)), [term])

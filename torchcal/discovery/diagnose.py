@@ -15,7 +15,7 @@ from torchcal.data import Recording, same_unit
 from torchcal.discovery.conclude import Asked, conclude
 from torchcal.discovery.findings.feasible import Feasible
 from torchcal.discovery.findings.result import Diagnosis
-from torchcal.discovery.fits.candidates import base_columns
+from torchcal.discovery.fits.candidates import base_columns, call_once
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.ranges import check_measured
 from torchcal.discovery.fits.starts import starts
@@ -135,6 +135,8 @@ def diagnose(
         if number == 0:  # the first call may take longer, for what it imports or begins
             warn_if_long(problem, values)
         problem.check_slopes(values, free)
+    for term in terms:
+        call_once(problem, term, values)
     bar = tqdm(disable=not progress, desc="diagnose", unit="step", leave=False)
 
     def tick(text: str) -> None:

@@ -10,15 +10,15 @@ from torch import Tensor
 
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.problem import Problem
-from torchcal.discovery.fits.ranges import NOTHING, Scale, sized, with_room
+from torchcal.discovery.fits.ranges import NOTHING, Anything, Scale, sized, with_room
 from torchcal.discovery.fits.shapes import driver_values, grid_of_shapes, lies_anywhere, shape_points
 from torchcal.discovery.fits.trial import check_repeats, place_of
 from torchcal.errors import SimulatorError
-from torchcal.simulators import free_parameters, is_value_of
+from torchcal.simulators import Trajectories, free_parameters, is_value_of
 from torchcal.terms import Term, extend
 from torchcal.terms.term import neutral_of
 
-__all__ = ["Candidate", "base_columns", "prepare", "replaces", "spread_values", "widened"]
+__all__ = ["Candidate", "base_columns", "call_once", "prepare", "replaces", "spread_values", "widened"]
 
 #: Share of the data's spread that a candidate adds when it is tried.
 A_LITTLE = 0.03
@@ -26,6 +26,8 @@ A_LITTLE = 0.03
 UNCHANGED = 1e-6
 #: Share of an effect by which it may miss its tangent and be linear.
 LINEAR = 1e-3
+#: What a function raises that asks for what there is not, whatever its numbers are.
+WRONG = (AttributeError, KeyError, NameError, TypeError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +181,44 @@ def spread_values(target: Problem, names: Sequence[str], values: Tensor) -> Tens
     return torch.stack([
         values[place[q.name]] if q.name in place else values.new_tensor(math.nan) for q in target.parameters
     ])  # fmt: skip
+
+
+def call_once(base: Problem, term: Term, values: Tensor) -> None:
+    """Call all that a term changes once, where runs begin, before any long work; nothing that is dear to call.
+
+    Args:
+        base: With the base simulator, which works.
+        term: The term.
+        values: Parameter values of the base, ``(P,)``.
+
+    Raises:
+        DomainError: If a function asks for what there is not.
+        SimulatorError: The same; or if it changes what it is given, or gives no real numbers.
+    """
+    in_steps = isinstance(base.simulator, Trajectories)
+    if base.simulator.dear and not in_steps:
+        return
+    term = sized(term, Anything(), base.recording)
+    bound = extend(base.simulator, [term])
+    own = {term.full(q.name): q for q in term.parameters}
+    row = spread_values(base.with_simulator(bound), [q.name for q in base.parameters], values)
+    for i, q in enumerate(bound.parameters):
+        if q.name in own:
+            neutral = neutral_of(own[q.name])
+            row[i] = shape_points(q, 1)[0] if neutral is None else neutral
+    try:
+        with torch.no_grad():
+            if not isinstance(bound, Trajectories):
+                bound.at(base.recording.x, base.recording.outputs)(row[None])
+                return
+            start = bound.layout.start(row[None])
+            grid = bound.grid
+            u = {name: table[0, :, 0] for name, table in grid.u.items()}
+            bound.steps.rates(grid.t[:, 0], start, bound.layout.by_name(row[None]), u)
+            bound.readings(row[None], start)
+    except SimulatorError as error:  # another one may be one of these values alone
+        if error.__cause__ is None or isinstance(error.__cause__, WRONG):
+            raise
 
 
 def prepare(

@@ -13,7 +13,7 @@ from torchcal.errors import DomainError
 from torchcal.simulators import Parameter, Trajectories
 from torchcal.terms import Term
 
-__all__ = ["NOTHING", "Scale", "check_measured", "drivers_scale", "sized", "with_room"]
+__all__ = ["NOTHING", "Anything", "Scale", "check_measured", "drivers_scale", "sized", "with_room"]
 
 #: Range of a shape parameter measured on a driver's scale; on that of time it begins at a share of the usual gap
 #: between samples where that is less: lags and delays may be as fast as these show, however long the recording.
@@ -40,6 +40,20 @@ class Scale(dict[str, float]):
             return self[names[0]]
         values = torch.broadcast_tensors(*(self.drivers[name] for name in names))
         return float(torch.stack(values).square().sum(0).sqrt().max())
+
+
+class Anything(Scale):
+    """A scale of 1 for everything, before anything is calibrated."""
+
+    def __init__(self) -> None:
+        super().__init__({}, {})
+
+    def __missing__(self, name: str) -> float:
+        return 1.0
+
+    def together(self, names: Sequence[str]) -> float:
+        """1."""
+        return 1.0
 
 
 #: For terms that measure nothing, or have been measured.
