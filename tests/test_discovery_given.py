@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -203,3 +204,21 @@ def test_a_bound_that_is_wrong_is_told(in_time):
     assert rows[0].startswith(("without its bound a is 3.0", "without its bound a is 2.9"))
     assert rows[0].endswith(" V, and the base leaves no more than noise: a bound that is wrong looks like this")
     assert not any(row.startswith("without its bound") for row in told(0.1)[1])  # something else is missing
+
+
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.slow)])
+def test_a_fast_misfit_is_no_slow_noise_beside_a_base_that_misses_the_data(seed):
+    """Of counts, whose sd falls with them: a memory of slow noise frees the base to leave ten times what it must."""
+    t = np.arange(0.1, 12, 0.2)
+    base = tc.Simulator(
+        lambda x, p: p["N"] * torch.exp(-x["t"] / p["tau"]),
+        [tc.Parameter("N", low=0.0, initial=900.0), tc.Parameter("tau", low=0.1, high=10.0, initial=2.0)],
+    )
+    flat = tc.Term("flat background", outputs={"y": lambda x, p, y: y + p["b"]}, parameters=[tc.Parameter("b", low=0)])
+    counts = np.random.default_rng(seed).poisson(
+        1500 * np.exp(-t / 2.197) * (1 + 0.12 * np.cos(2 * np.pi * t / 1.5))
+    ).astype(float)  # fmt: skip
+    recording = tc.Recording(x={"t": t}, y=counts, noise=np.sqrt(np.maximum(counts, 1)))
+    found = tc.diagnose(base, recording, [flat], seed=0, progress=False)
+    assert found.verdict == "unexplained"
+    assert {e.name: e.value for e in found.base.estimates}["tau"] == pytest.approx(2.15, abs=0.1)

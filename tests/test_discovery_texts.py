@@ -539,9 +539,25 @@ def test_an_estimate_on_its_bound_says_so():
     found = SimpleNamespace(
         values=torch.tensor([0.0, 1.0, 0.0], dtype=F64), free=[0, 1], at_bound=torch.tensor([False, False]),
         sd=lambda: torch.tensor([0.1, 0.1, 0.0], dtype=F64),
+        jacobian=torch.eye(2, dtype=F64), whitening=lambda values: values,
         problem=SimpleNamespace(parameters=parameters, recording=SimpleNamespace(noise=None), in_time=True),
     )  # fmt: skip
     assert [e.at_bound for e in explain.estimates(found, range(3))] == [True, False, False]
+
+
+def test_what_only_a_combination_tells_has_no_sd_of_its_own():
+    """Its sd is what rounding makes of that of an unseen direction."""
+    column = torch.linspace(1, 2, 5, dtype=F64)
+    found = SimpleNamespace(
+        values=torch.tensor([2.0, 3.0, 1.0], dtype=F64), free=[0, 1, 2], at_bound=torch.zeros(3, dtype=torch.bool),
+        sd=lambda: torch.tensor([800.0, 700.0, 0.1], dtype=F64),
+        jacobian=torch.stack([column, -2 * column, column**2], dim=-1), whitening=lambda values: values,
+        problem=SimpleNamespace(
+            parameters=[tc.Parameter(name) for name in "abc"], recording=SimpleNamespace(noise=None), in_time=True
+        ),
+    )  # fmt: skip
+    told = [str(e) for e in explain.estimates(found, range(3))]
+    assert told == ["a = 2 (not determined)", "b = 3 (not determined)", "c = 1 ± 0.1"]
 
 
 def test_the_fastest_part_is_that_of_the_best_model(monkeypatch):

@@ -91,7 +91,7 @@ def judged(search: Search, problem: Problem, mask: Tensor | None, confidence: fl
     after = other.decision.verdict
     if after == "unexplained" or (before == "consistent" and after != before):
         return found
-    if after == "consistent" and _no_noise_of_each(other.search):
+    if after == "consistent" and (_no_noise_of_each(other.search) or not _is_fast(found.search, other.search.base)):
         return found
     times = _times(found.search.noise.sd, other.search)
     if not times or any(_grown(other.search, name, size) for name, size in times.items() if name not in larger):
@@ -167,8 +167,9 @@ def _explained_by_place(search: Search) -> bool:
 
 
 def _is_fast(search: Search, found: Fitted) -> bool:
+    """Whether a fit leaves hardly more than its fastest part, in units of a search's noise."""
     problem = found.problem
-    fastest = estimate(problem, found.residual, found.jacobian, problem.recording.noise).sizes[:, 0]
+    fastest = estimate(problem, found.residual, found.jacobian, search.noise.sd).sizes[:, 0]
     size = found.residual / search.noise.sd[problem.index]
     each = (size[problem.output_of == number] for number in range(len(fastest)))
     pairs = zip(each, fastest.tolist(), strict=True)

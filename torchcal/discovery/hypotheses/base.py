@@ -18,7 +18,7 @@ from torchcal.discovery.misfit.outliers import spikes
 from torchcal.errors import ConvergenceError, DomainError, SimulatorError
 from torchcal.simulators import Trajectories, focused, may_change, step_errors, workable
 
-__all__ = ["calibrate_base", "growing"]
+__all__ = ["calibrate_base", "growing", "runs_away"]
 
 #: How often steps are chosen anew at most.
 HALVED = 7
@@ -38,6 +38,9 @@ MOST, ROUNDS = 0.2, 5
 GROWTHS = 4
 #: Log odds from which on noise forgets with every sample and not with time.
 BY_SAMPLE = 1.0
+#: How many times the square of the noise that was given, and of what a fit without a memory leaves, one with a memory
+#: may leave: noise that lasts for a third of a recording comes out so large by chance in hardly any.
+AWAY = 4.0
 
 
 def calibrate_base(
@@ -97,7 +100,11 @@ def calibrate_base(
     if not exact:
         base, units = _grown(base, unit, units)
         base, noise = _with_memory(base, units)
-        base = _sharpen(refit(base, noise.whitening(base.problem)), noise.sd)
+        remembering = refit(base, noise.whitening(base.problem))
+        if runs_away(remembering, found):
+            noise = _without_memory(noise)
+            remembering = refit(base, noise.whitening(base.problem))
+        base = _sharpen(remembering, noise.sd)
     return base, noise
 
 
@@ -137,6 +144,25 @@ def _with_memory(found: Fitted, units: Tensor) -> tuple[Fitted, Noise]:
         if other.log_density > noise.log_density + BY_SAMPLE:
             return dataclasses.replace(found, problem=by_sample), other
     return dataclasses.replace(found, problem=with_time), noise
+
+
+def runs_away(found: Fitted, before: Fitted) -> bool:
+    """Whether a fit that weighs the data with a memory leaves much more than the noise that was given, and than one
+    before, with less of it.
+
+    Slow noise of any size is likelier than a fast misfit that is known to be none, and frees the fit to miss the data.
+    """
+    noise = found.problem.recording.noise
+    if not isinstance(noise, Tensor):
+        return False
+    left, least = (float((one.residual / noise[one.problem.index]).square().sum()) for one in (found, before))
+    return left > AWAY * max(least, found.problem.n)
+
+
+def _without_memory(noise: Noise) -> Noise:
+    posterior = torch.zeros_like(noise.posterior)
+    posterior[:, 0] = 1.0
+    return dataclasses.replace(noise, correlation=torch.zeros_like(noise.correlation), posterior=posterior)
 
 
 def growing(found: Fitted, before: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from torchcal.discovery.fits.local import Span
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.ranges import drivers_scale
 from torchcal.discovery.fits.stop import Stop
-from torchcal.discovery.hypotheses.base import calibrate_base
+from torchcal.discovery.hypotheses.base import calibrate_base, runs_away
 from torchcal.discovery.hypotheses.beginnings import larger_effects, within_bounds
 from torchcal.discovery.hypotheses.judge import judge
 from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
@@ -233,7 +233,7 @@ class Search:
         fresh = suited(self, hopeful)
         old = self.noise
         change = float((fresh.sd / old.sd).log().abs().max()) + float((fresh.correlation - old.correlation).abs().max())
-        if change < 0.05:
+        if change < 0.05 or runs_away(refit(self.base, fresh.whitening(self.base.problem)), self.base):
             return
         self.take(fresh, hopeful)
         for model in (*self.models, *self.merged.values()):

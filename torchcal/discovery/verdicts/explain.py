@@ -65,10 +65,13 @@ def estimates(
 ) -> tuple[Estimate, ...]:
     """Estimates of some parameters, with their intervals where there are any. Without noise the misfit takes its place.
 
-    An sd beyond what the bounds allow, or far beyond the estimate, says that the data do not determine it. Where the
-    edge of a static window is a step, its end is known by the gaps between data that it may lie in.
+    An sd beyond what the bounds allow, or far beyond the estimate, says that the data do not determine it, as does a
+    combination with others that moves no datum, whose sd is rounding. Where the edge of a static window is a step, its
+    end is known by the gaps between data that it may lie in.
     """
     sd = stated_sd(found)
+    loose = _loose(found)
+    combined = {name for group in _untold(found)[1] for name in group}
     bound = {i for i, at in zip(found.free, found.at_bound.tolist(), strict=True) if at}
     result = []
     for i in places:
@@ -80,7 +83,7 @@ def estimates(
         if window is not None and not found.problem.in_time and q.name.endswith(tuple(ENDS.values())):
             spread = _stepped_sd(found, i, window, spread)
         allowed = math.inf if q.low is None or q.high is None else q.high - q.low
-        if spread > min(1e5 * abs(value) or math.inf, allowed):
+        if spread > min(1e5 * abs(value) or math.inf, allowed) or (q.name in combined and bool(loose[i])):
             spread = math.inf
         at_bound = i in bound or (i in found.free and value in (q.low, q.high) and not is_window(q.name))
         result.append(Estimate(q.name, value, spread, unit, at_bound, (intervals or {}).get(i)))
@@ -259,7 +262,7 @@ def _untold(found: Fitted) -> tuple[list[str], list[list[str]]]:
     kept = [k for k in mine if float(size[k]) > 0]
     if len(kept) < 2:
         return unseen, []
-    loose = (~(stated_sd(found) <= LOOSE * found.values.abs()))[found.free]  # an sd of infinity, or none, is loose too
+    loose = _loose(found)[found.free]
     unit = jacobian[:, kept] / size[kept]
     values, vectors = torch.linalg.eigh(unit.T @ unit)
     groups = []
@@ -269,6 +272,11 @@ def _untold(found: Fitted) -> tuple[list[str], list[list[str]]]:
         if sum(bool(loose[j]) for j in members) > 1:
             groups.append([names[j] for j in members])
     return unseen, groups
+
+
+def _loose(found: Fitted) -> Tensor:
+    """Which parameters are not known well, bool ``(P,)``: an sd of infinity, or none, is loose too."""
+    return ~(stated_sd(found) <= LOOSE * found.values.abs())
 
 
 def _hardly_apart(found: Fitted, told: Collection[str]) -> list[str]:
