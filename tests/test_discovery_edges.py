@@ -643,3 +643,37 @@ def test_what_a_term_raises_at_one_value_alone_does_not_stop_a_diagnosis_before_
     term = tc.Term("picky", outputs={"y": picky}, parameters=[tc.Parameter("g")])
     with pytest.raises(ArithmeticError, match="begun"):
         diagnose(line, tc.Recording(x=x, y=x + 0.01 * noise(20, 0)), [term])
+
+
+@pytest.mark.parametrize(
+    "rate",
+    [
+        lambda s, p: np.exp(s["T"]) * -p["k"],
+        lambda s, p: -p["k"] * s["T"] if s["T"] > 0.5 else 0 * s["T"],
+    ],
+)
+def test_rates_that_are_no_torch_code_are_told_what_to_use(rate):
+    t = torch.linspace(0, 4, 60, dtype=F64)
+    cooling = tc.ODESimulator(
+        lambda t, s, p, u: {"T": rate(s, p)}, {"T": "K"}, [tc.Parameter("k", low=0.0, initial=1.0)]
+    )
+    run = tc.Run(time=t, outputs={"T": (-t).exp()}, initial={"T": 1.0})
+    with pytest.raises(SimulatorError, match=r"Use torch functions on t, s, p and u, and torch\.where for if"):
+        diagnose(cooling, tc.Recording(runs=[run]))
+
+
+@pytest.mark.parametrize(
+    ("terms", "told"),
+    [
+        (lambda: tc.terms.sensor(("T",), static=True), "for a static one with static=True alone"),
+        (lambda: tc.terms.thermal("T", ambient="Tamb"), "^Expected the ambient temperature among the inputs"),
+    ],
+)
+def test_a_library_that_does_not_fit_is_told_as_such(terms, told):
+    t = torch.linspace(0, 4, 60, dtype=F64)
+    cooling = tc.ODESimulator(
+        lambda t, s, p, u: {"T": -p["k"] * s["T"]}, {"T": "K"}, [tc.Parameter("k", low=0.0, initial=1.0)]
+    )
+    run = tc.Run(time=t, outputs={"T": (-t).exp()}, initial={"T": 1.0})
+    with pytest.raises((SimulatorError, DomainError), match=told):
+        diagnose(cooling, tc.Recording(runs=[run]), terms())

@@ -307,3 +307,27 @@ def test_a_term_in_a_range_is_named_where_more_levels_show_its_shape():
         d = diagnose(*flights(seed, [1.0, 2.0, 4.0, 8.0], walk=0.01))
         assert (d.verdict, d.terms) == ("named", ["walk"])
         assert diagnose(*flights(seed, [1.0, 2.0, 4.0, 8.0], strong=0.02)).verdict == "unexplained"
+
+
+@pytest.mark.slow
+def test_a_missing_rate_is_not_told_as_large_as_what_the_parameters_of_the_base_make_up_for():
+    """Of a capacitor that leaks into a second one: a rate in proportion to the voltage is the base's own."""
+    t = np.concatenate([[0.0], np.geomspace(20, 2e5, 50)])
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"v": -s["v"] / p["tau"]},
+        {"v": "V"},
+        [tc.Parameter("tau", unit="s", low=1.0, high=1e11, initial=5e5, transform="log")],
+    )
+
+    def rates(_, y):
+        return [-y[0] / 250000 - 2e-6 - 2.5e-5 * (y[0] - y[1]), (y[0] - y[1]) / 8000]
+
+    generator, runs = np.random.default_rng(262), []
+    for begin in (2.7, 1.8, 1.0):
+        v = solve_ivp(rates, (0, 2e5), [begin, 0.0], t_eval=t, method="LSODA", rtol=1e-9, atol=1e-12, max_step=2000).y
+        runs.append(tc.Run(time=t, outputs={"v": v[0] + 0.006 * generator.normal(size=51)}))
+    constant = tc.Term("leak", equation="v", rate=lambda t, s, p, u: -p["i"], parameters=[tc.Parameter("i", low=0.0)])
+    found = tc.diagnose(base, tc.Recording(runs=runs), [constant], seed=0, progress=False)
+    assert found.verdict == "unexplained"
+    assert (found.missing.kind, found.missing.driver) == ("equation", "v")
+    assert float(found.missing.rate.max() - found.missing.rate.min()) < 3e-4  # it is 7e-5, and was told as 1.3e-3

@@ -368,8 +368,8 @@ def _describe(x: Conditions) -> str:
 
 
 def asks_for_numbers(error: Exception) -> bool:
-    """Whether torch has refused to make plain numbers of tensors, as NumPy and float() want them."""
-    return "numpy()" in str(error) or "converted to Python scalars" in str(error)
+    """Whether torch has refused to make plain numbers of tensors, as NumPy, float() and ``if`` want them."""
+    return any(part in str(error) for part in ("numpy()", "converted to Python scalars", "Boolean value of Tensor"))
 
 
 def nameless_advice(error: Exception, x: Any) -> str:
@@ -397,8 +397,8 @@ def _advice(error: Exception, x: Conditions, parameters: Sequence[str]) -> str:
         )
     if asks_for_numbers(error):
         return (
-            " Use torch functions on p and x: values of many parameters come at once, with gradients. A function that "
-            "cannot be written so goes into torchcal.ExternalSimulator."
+            " Use torch functions on p and x, and torch.where for if: values of many parameters come at once, with "
+            "gradients. A function that cannot be written so goes into torchcal.ExternalSimulator."
         )
     if "same device" in str(error) or "expected device" in str(error):
         return " Tensors that the function holds or makes must be on the device of x and p: tensor.to(x.device)."

@@ -13,13 +13,14 @@ import torch
 from torch import Tensor
 
 from torchcal.display import raised
-from torchcal.errors import SimulatorError
+from torchcal.errors import SimulatorError, TorchcalError
 from torchcal.simulators.careful import careful, real
 from torchcal.simulators.grid import Grid
 from torchcal.simulators.layout import Layout, Values
 from torchcal.simulators.parameter import spans
 from torchcal.simulators.recurrence import recur
 from torchcal.simulators.shooting import begun, close_gaps
+from torchcal.simulators.static import asks_for_numbers
 
 if TYPE_CHECKING:
     from torchcal.simulators.ode import ODESimulator
@@ -60,13 +61,13 @@ class Steps:
         named = {name: s[..., i] for i, name in enumerate(names)}
         try:
             rates = careful(self.ode.seen, "rates(t, s, p, u)", self.ode.rates, t=t, s=named, p=p.copy(), u=u)
-        except SimulatorError:
+        except TorchcalError:  # a term's, which says what to do
             raise
         except Exception as error:
             raise SimulatorError(
                 f"Expected rates(t, s, p, u) to return the rates by state. It raised {raised(error)}. "
                 f"It was called with states of shape {tuple(s.shape[:-1])} ({spans(named)}) and parameters "
-                f"of shape {tuple(next(iter(p.values())).shape)} ({spans(p)}).{_unknown(error, named, p, u)}"
+                f"of shape {tuple(next(iter(p.values())).shape)} ({spans(p)}).{_advice(error, named, p, u)}"
             ) from error
         if not isinstance(rates, Mapping) or set(rates) != set(names):
             got = list(rates) if isinstance(rates, Mapping) else type(rates).__name__
@@ -236,8 +237,14 @@ class Steps:
         return torch.stack(found, dim=-2)
 
 
-def _unknown(error: Exception, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> str:
-    """What a name that a model asks for in vain is none of, in a sentence; empty for other errors."""
+def _advice(error: Exception, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> str:
+    """What a name that a model asks for in vain is none of, or what to use on tensors, in a sentence; empty for other
+    errors."""
+    if asks_for_numbers(error):
+        return (
+            " Use torch functions on t, s, p and u, and torch.where for if: values of many points come at once, with "
+            "gradients."
+        )
     if not isinstance(error, KeyError) or not error.args or any(error.args[0] in given for given in (s, p, u)):
         return ""
     return (

@@ -299,6 +299,11 @@ class Term:
             advice = nameless_advice(error, given[0]) if letters[0] == "x" else ""
             if asks_for_numbers(error):
                 advice = " Use torch functions on them, without .detach(): derivatives are needed."
+            if isinstance(error, TypeError) and "positional argument" in str(error):
+                advice = (
+                    " Functions of a term take (t, s, p, u) in time and (x, p) in a static simulator, those of "
+                    "outputs= y behind them; the library's instruments are for a static one with static=True alone."
+                )
             known = "; ".join(", ".join(part) for part in given if isinstance(part, Mapping) and part)
             raise SimulatorError(
                 f"Expected a tensor from every function of the term {self.name!r}. One of them raised "

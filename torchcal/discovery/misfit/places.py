@@ -15,6 +15,10 @@ __all__ = ["SIZES", "SMALL", "Change", "Place", "evidence_of", "is_unseen"]
 SMALL = 1e-6
 #: Share of a change that is the same everywhere up to which the base's parameters make up for it.
 SAME = 1e-3
+#: The same of a smooth change of any shape, which its functions follow that well.
+MADE_UP = 0.03
+#: Share of an estimate that is left without such changes, below which it is told without them.
+HARDLY = 1 / 3
 #: Sizes of an unknown change that are tried, in noise sd.
 SIZES = torch.logspace(-0.3, 3.0, 14, dtype=torch.float64)
 
@@ -66,6 +70,8 @@ class Change:
         v: Right singular vectors, ``(m, m)``.
         along: The residual along the left ones, ``(m,)``.
         null: The simulated residuals along them, ``(m, draws)``.
+        whole: The responses with what the base's parameters make up for, whitened, ``(n, m)``; None where nothing is
+            told of that.
     """
 
     features: Tensor
@@ -74,10 +80,13 @@ class Change:
     v: Tensor
     along: Tensor
     null: Tensor
+    whole: Tensor | None = None
 
     @classmethod
-    def of(cls, features: Tensor, columns: Tensor, least: float, residuals: Tensor) -> "Change | None":
-        """From the responses, projected; None where there are none beyond rounding, ``least``."""
+    def of(
+        cls, features: Tensor, columns: Tensor, least: float, residuals: Tensor, whole: Tensor | None = None
+    ) -> "Change | None":
+        """From the responses, projected, and as they are; None where there are none beyond rounding, ``least``."""
         scale = float(columns.norm()) / math.sqrt(columns.shape[1])
         if scale <= least:
             return None
@@ -86,7 +95,7 @@ class Change:
         s = values.clamp_min(0.0).sqrt()
         there = s > SMALL * s[-1]
         along = (v[:, there].T @ (columns.T @ residuals)) / s[there, None]
-        return cls(features, scale, s[there], v[:, there], along[:, 0], along[:, 1:])
+        return cls(features, scale, s[there], v[:, there], along[:, 0], along[:, 1:], whole)
 
     def place(self, channel: Channel, driver: str, residual: Residual) -> Place:
         """The estimate."""
@@ -97,6 +106,10 @@ class Change:
         removed = float(((1 - (1 - shrink).square()) * self.along.square()).sum())
         share = residual.share(removed, float(shrink.sum()))
         features, profile = self.features, self.features @ weights
+        made_up = torch.linalg.qr(features @ self._made_up()).Q
+        rest = profile - made_up @ (made_up.T @ profile)
+        if float(rest.norm()) < HARDLY * float(profile.norm()):
+            features, profile = features - made_up @ (made_up.T @ features), rest
         if is_unseen(channel, residual):
             features, profile = features - features.mean(0), profile - profile.median()
         within = (features @ self.v) / (1 + gain).sqrt()
@@ -104,6 +117,21 @@ class Change:
         beyond = (features.square().sum(1) - (features @ self.v).square().sum(1)).clamp_min(0.0)
         sd = (within.square().sum(1) + beyond).sqrt() * float(size[0]) / self.scale
         return Place(channel, driver, float(evidence[0]), share, profile, sd)
+
+    def _made_up(self) -> Tensor:
+        """Weights of changes that the base's parameters make up for, ``(m, k)``.
+
+        What is left of their responses is how far the functions miss the change that the parameters make. A large
+        misfit may go with that, and the change would be told many times as large as all that is missing.
+        """
+        if self.whole is None:
+            return self.v.new_zeros(len(self.v), 0)
+        values, v = torch.linalg.eigh(self.whole.T @ self.whole)
+        seen = values > SMALL**2 * values[-1].clamp_min(1e-300)
+        unit = v[:, seen] / values[seen].sqrt()
+        left = (self.scale * self.s[:, None]) * (self.v.T @ unit)
+        shares, turn = torch.linalg.eigh(left.T @ left)
+        return unit @ turn[:, shares < MADE_UP**2]
 
 
 def is_unseen(channel: Channel, residual: Residual) -> bool:

@@ -158,7 +158,7 @@ def _changes(residual: Residual, looks: Sequence[_Look], residuals: Tensor) -> I
         sizes = [part.shape[1] for part in look.features]
         pieces = zip(look.features, columns.split(sizes, 1), responses.split(sizes, 1), strict=True)
         for features, block, whole in pieces:
-            change = Change.of(features, block, 1e-9 * float(whole.norm()), residuals)
+            change = Change.of(features, block, 1e-9 * float(whole.norm()), residuals, whole)
             if change is not None:
                 yield number, look, change
 
