@@ -677,3 +677,20 @@ def test_a_library_that_does_not_fit_is_told_as_such(terms, told):
     run = tc.Run(time=t, outputs={"T": (-t).exp()}, initial={"T": 1.0})
     with pytest.raises((SimulatorError, DomainError), match=told):
         diagnose(cooling, tc.Recording(runs=[run]), terms())
+
+
+def test_a_key_that_is_no_name_may_be_missing_where_nothing_is_calibrated_yet(monkeypatch):
+    def begun(*given, **options):
+        raise ArithmeticError("begun")
+
+    monkeypatch.setattr("torchcal.discovery.hypotheses.search.calibrate_base", begun)
+    table = {0: 0.0, 1: 1.0}
+    term = tc.Term(
+        "table", equation="v", rate=lambda t, s, p, u: p["g"] * table[int(p["k"].mean())] * s["x"],
+        parameters=[tc.Parameter("g")],
+    )  # fmt: skip
+    t = torch.linspace(0, 4, 40, dtype=F64)
+    fast = tc.ODESimulator(BODY.rates, states=BODY.states, parameters=[tc.Parameter("k", low=5.0, high=9.0)])
+    run = tc.Run(time=t, outputs={"x": t.cos(), "v": -t.sin()}, initial={"x": 1.0, "v": 0.0})
+    with pytest.raises(ArithmeticError, match="begun"):
+        diagnose(fast, tc.Recording(runs=[run]), [term])

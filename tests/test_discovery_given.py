@@ -2,12 +2,14 @@
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 import torchcal as tc
+from torchcal.discovery.hypotheses.base import runs_away
 from torchcal.discovery.verdicts import given
 from torchcal.errors import DomainError
 
@@ -222,3 +224,15 @@ def test_a_fast_misfit_is_no_slow_noise_beside_a_base_that_misses_the_data(seed)
     found = tc.diagnose(base, recording, [flat], seed=0, progress=False)
     assert found.verdict == "unexplained"
     assert {e.name: e.value for e in found.base.estimates}["tau"] == pytest.approx(2.15, abs=0.1)
+
+
+def test_an_output_of_few_data_runs_away_beside_one_of_many():
+    noise = torch.ones(1050, dtype=torch.float64)
+    output_of = (torch.arange(1050) < 50).long()
+    problem = SimpleNamespace(
+        recording=SimpleNamespace(noise=noise, outputs=("many", "few")), index=torch.arange(1050), output_of=output_of
+    )
+    before = SimpleNamespace(problem=problem, residual=noise)
+    after = SimpleNamespace(problem=problem, residual=torch.where(output_of == 1, 7.9, 1.0).double())
+    assert runs_away(after, before).tolist() == [False, True]
+    assert not runs_away(before, before).any()

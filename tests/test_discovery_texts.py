@@ -560,6 +560,16 @@ def test_what_only_a_combination_tells_has_no_sd_of_its_own():
     assert told == ["a = 2 (not determined)", "b = 3 (not determined)", "c = 1 ± 0.1"]
 
 
+def test_what_is_hardly_told_apart_keeps_its_sd():
+    """As a slope far from where its line begins."""
+    x = torch.linspace(1000, 1001, 60, dtype=F64)
+    y = -2100 + 2.1 * x + 0.5 * torch.as_tensor(np.random.default_rng(0).standard_normal(60))
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    found = {e.name: e for e in tc.diagnose(line, tc.Recording(x=x, y=y), [], seed=0, progress=False).base.estimates}
+    assert 0.1 < found["b"].sd < 0.5
+    assert 100 < found["a"].sd < 500
+
+
 def test_the_fastest_part_is_that_of_the_best_model(monkeypatch):
     search, best = captured(monkeypatch, *parabola(noise=0.002))
     x = torch.linspace(-1, 1, 30, dtype=F64)

@@ -130,13 +130,14 @@ def diagnose(
     _compare_times(recording, terms)
     mask = verify.choose(recording, holdout, len(free))
     warn_if_coarse(problem)
-    for number, values in enumerate(starts(problem, 2, seed, held)):  # at zero nothing may move
+    rows = starts(problem, 2, seed, held)
+    for number, values in enumerate(rows):  # at zero nothing may move
         check_repeats(problem, values)
         if number == 0:  # the first call may take longer, for what it imports or begins
             warn_if_long(problem, values)
         problem.check_slopes(values, free)
     for term in terms:
-        call_once(problem, term, values)
+        call_once(problem, term, rows)
     bar = tqdm(disable=not progress, desc="diagnose", unit="step", leave=False)
 
     def tick(text: str) -> None:

@@ -19,6 +19,9 @@ __all__ = ["check_slopes"]
 STEPS, AGREE, OFF = (1e-2, 1e-3, 1e-5), 0.05, 0.1
 #: Combinations of the outputs that are derived.
 DRAWS = 8
+#: Parameters from which on so many trajectories are found sooner together from their beginnings than each from a near
+#: one.
+MANY = 16
 
 Look = tuple[Tensor, Tensor]
 
@@ -80,7 +83,10 @@ def check_slopes(
         else:
             told = [each[:, inside] for each in told]
 
-        def moved(rows: Tensor, warm: Solution | None = first.warm) -> Tensor:
+        def moved(rows: Tensor, warm: Solution | None = first.warm, many: bool = len(inside) > MANY) -> Tensor:
+            if many:
+                with torch.no_grad():
+                    return simulator.at(x, outputs)(rows)
             return simulator.linearise(x, rows, outputs, [], warm and warm.repeated(len(rows))).y
 
         judged = set()

@@ -13,7 +13,7 @@ from torch.autograd import forward_ad
 from torchcal.checks import whole
 from torchcal.data import Recording
 from torchcal.display import raised
-from torchcal.errors import DomainError, ShapeError, SimulatorError
+from torchcal.errors import DomainError, ShapeError, SimulatorError, TorchcalError
 from torchcal.simulators.careful import careful
 from torchcal.simulators.dual import Still, still
 from torchcal.simulators.parameter import Parameter, spans
@@ -166,7 +166,7 @@ class Simulator:
             p = {name: values[..., i : i + 1] for i, name in enumerate(self.names)}
             try:
                 result = careful(self.seen, "the simulator", self.function, x=x, p=p)
-            except SimulatorError:
+            except TorchcalError:  # a term's, which says what to do
                 raise
             except Exception as error:
                 raise SimulatorError(

@@ -298,8 +298,10 @@ class Term:
         except Exception as error:
             advice = nameless_advice(error, given[0]) if letters[0] == "x" else ""
             if asks_for_numbers(error):
-                advice = " Use torch functions on them, without .detach(): derivatives are needed."
-            if isinstance(error, TypeError) and "positional argument" in str(error):
+                advice = (
+                    " Use torch functions on them, without .detach(), and torch.where for if: derivatives are needed."
+                )
+            if _takes_others(error):
                 advice = (
                     " Functions of a term take (t, s, p, u) in time and (x, p) in a static simulator, those of "
                     "outputs= y behind them; the library's instruments are for a static one with static=True alone."
@@ -322,6 +324,15 @@ class Term:
     def is_sensor(self) -> bool:
         """Whether it changes what is seen and nothing else."""
         return bool(self.outputs) and not (self.rates or self.shifts or self.frees)
+
+
+def _takes_others(error: Exception) -> bool:
+    """Whether a function takes other arguments than it was called with, and none that it calls."""
+    last = error.__traceback__
+    while last is not None and last.tb_next is not None:
+        last = last.tb_next
+    at_call = last is not None and last.tb_frame.f_code is careful.__code__
+    return at_call and isinstance(error, TypeError) and "argument" in str(error)
 
 
 def neutral_of(parameter: Parameter) -> float | None:

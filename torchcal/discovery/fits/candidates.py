@@ -13,8 +13,9 @@ from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.ranges import NOTHING, Anything, Scale, sized, with_room
 from torchcal.discovery.fits.shapes import driver_values, grid_of_shapes, lies_anywhere, shape_points
 from torchcal.discovery.fits.trial import check_repeats, place_of
-from torchcal.errors import SimulatorError
+from torchcal.errors import SimulatorError, TorchcalError
 from torchcal.simulators import Trajectories, free_parameters, is_value_of
+from torchcal.simulators.static import asks_for_numbers
 from torchcal.terms import Term, extend
 from torchcal.terms.term import neutral_of
 
@@ -27,7 +28,7 @@ UNCHANGED = 1e-6
 #: Share of an effect by which it may miss its tangent and be linear.
 LINEAR = 1e-3
 #: What a function raises that asks for what there is not, whatever its numbers are.
-WRONG = (AttributeError, KeyError, NameError, TypeError)
+WRONG = (AttributeError, ImportError, NameError, TypeError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,21 +184,28 @@ def spread_values(target: Problem, names: Sequence[str], values: Tensor) -> Tens
     ])  # fmt: skip
 
 
-def call_once(base: Problem, term: Term, values: Tensor) -> None:
+def call_once(base: Problem, term: Term, rows: Tensor) -> None:
     """Call all that a term changes once, where runs begin, before any long work; nothing that is dear to call.
 
     Args:
         base: With the base simulator, which works.
         term: The term.
-        values: Parameter values of the base, ``(P,)``.
+        rows: Parameter values of the base, ``(m, P)``: what is wrong is wrong at all of them.
 
     Raises:
         DomainError: If a function asks for what there is not.
         SimulatorError: The same; or if it changes what it is given, or gives no real numbers.
     """
+    errors = [error for values in rows if (error := _refused(base, term, values)) is not None]
+    if errors and len(errors) == len(rows):
+        raise errors[0]
+
+
+def _refused(base: Problem, term: Term, values: Tensor) -> TorchcalError | None:
+    """What is raised at parameter values of the base ``(P,)`` that may be raised at any."""
     in_steps = isinstance(base.simulator, Trajectories)
     if base.simulator.dear and not in_steps:
-        return
+        return None
     term = sized(term, Anything(), base.recording)
     bound = extend(base.simulator, [term])
     own = {term.full(q.name): q for q in term.parameters}
@@ -210,15 +218,18 @@ def call_once(base: Problem, term: Term, values: Tensor) -> None:
         with torch.no_grad():
             if not isinstance(bound, Trajectories):
                 bound.at(base.recording.x, base.recording.outputs)(row[None])
-                return
+                return None
             start = bound.layout.start(row[None])
             grid = bound.grid
             u = {name: table[0, :, 0] for name, table in grid.u.items()}
             bound.steps.rates(grid.t[:, 0], start, bound.layout.by_name(row[None]), u)
             bound.readings(row[None], start)
-    except SimulatorError as error:  # another one may be one of these values alone
-        if error.__cause__ is None or isinstance(error.__cause__, WRONG):
-            raise
+    except TorchcalError as error:
+        cause = error.__cause__
+        misspelt = isinstance(cause, KeyError) and bool(cause.args) and isinstance(cause.args[0], str)
+        wrong = misspelt or isinstance(cause, WRONG) or (isinstance(cause, Exception) and asks_for_numbers(cause))
+        return error if cause is None or wrong else None  # another one may be one of these values alone
+    return None
 
 
 def prepare(

@@ -101,8 +101,9 @@ def calibrate_base(
         base, units = _grown(base, unit, units)
         base, noise = _with_memory(base, units)
         remembering = refit(base, noise.whitening(base.problem))
-        if runs_away(remembering, found):
-            noise = _without_memory(noise)
+        away = runs_away(remembering, found)
+        if bool(away.any()):
+            noise = _without_memory(noise, away)
             remembering = refit(base, noise.whitening(base.problem))
         base = _sharpen(remembering, noise.sd)
     return base, noise
@@ -146,23 +147,34 @@ def _with_memory(found: Fitted, units: Tensor) -> tuple[Fitted, Noise]:
     return dataclasses.replace(found, problem=with_time), noise
 
 
-def runs_away(found: Fitted, before: Fitted) -> bool:
-    """Whether a fit that weighs the data with a memory leaves much more than the noise that was given, and than one
-    before, with less of it.
+def runs_away(found: Fitted, before: Fitted) -> Tensor:
+    """Of which outputs a fit that weighs the data with a memory leaves much more than the noise that was given, and
+    than one before, with less of it; bool ``(outputs,)``.
 
     Slow noise of any size is likelier than a fast misfit that is known to be none, and frees the fit to miss the data.
     """
-    noise = found.problem.recording.noise
+    problem = found.problem
+    noise, outputs = problem.recording.noise, len(problem.recording.outputs)
     if not isinstance(noise, Tensor):
-        return False
-    left, least = (float((one.residual / noise[one.problem.index]).square().sum()) for one in (found, before))
-    return left > AWAY * max(least, found.problem.n)
+        return torch.zeros(outputs, dtype=torch.bool)
+
+    def by_output(values: Tensor) -> Tensor:
+        return torch.zeros(outputs, dtype=torch.float64).index_add_(0, problem.output_of, values)
+
+    sd = noise[problem.index]
+    left, least = (by_output((one.residual / sd).square()) for one in (found, before))
+    return left > AWAY * torch.maximum(least, by_output(torch.ones_like(sd)))
 
 
-def _without_memory(noise: Noise) -> Noise:
+def _without_memory(noise: Noise, which: Tensor) -> Noise:
+    """With white noise of some outputs, bool ``(outputs,)``."""
     posterior = torch.zeros_like(noise.posterior)
     posterior[:, 0] = 1.0
-    return dataclasses.replace(noise, correlation=torch.zeros_like(noise.correlation), posterior=posterior)
+    return dataclasses.replace(
+        noise,
+        correlation=noise.correlation.masked_fill(which, 0.0),
+        posterior=torch.where(which[:, None], posterior, noise.posterior),
+    )
 
 
 def growing(found: Fitted, before: Tensor) -> Tensor:

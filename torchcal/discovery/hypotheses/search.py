@@ -233,17 +233,21 @@ class Search:
         fresh = suited(self, hopeful)
         old = self.noise
         change = float((fresh.sd / old.sd).log().abs().max()) + float((fresh.correlation - old.correlation).abs().max())
-        if change < 0.05 or runs_away(refit(self.base, fresh.whitening(self.base.problem)), self.base):
+        if change < 0.05:
             return
-        self.take(fresh, hopeful)
+        base = refit(self.base, fresh.whitening(self.base.problem))
+        if bool(runs_away(base, self.base).any()):
+            return
+        self.take(fresh, hopeful, base)
         for model in (*self.models, *self.merged.values()):
             self.judge(model)
         self.local, _ = windows(self.residual, self.candidates, self.screening)
 
-    def take(self, noise: Noise, again: Sequence[Model]) -> None:
-        """Go on with another noise: the base and some models are fitted again, the others weighed."""
+    def take(self, noise: Noise, again: Sequence[Model], base: Fitted | None = None) -> None:
+        """Go on with another noise: the base, if it has not been, and some models are fitted again, the others weighed.
+        """
         self.noise = noise
-        self.base = refit(self.base, noise.whitening(self.base.problem))
+        self.base = refit(self.base, noise.whitening(self.base.problem)) if base is None else base
         done: list[Model] = []
         every = (*self.models, *self.merged.values(), *self.nameless)
         for model in sorted(every, key=lambda model: -model.log_evidence):

@@ -17,8 +17,9 @@ SMALL = 1e-6
 SAME = 1e-3
 #: The same of a smooth change of any shape, which its functions follow that well.
 MADE_UP = 0.03
-#: Share of an estimate that is left without such changes, below which it is told without them.
-HARDLY = 1 / 3
+#: Share of an estimate that is left without such changes, below which it is told without them, and above which there is
+#: more left than rounding.
+HARDLY, RESOLVED = 1 / 3, 1e-6
 #: Sizes of an unknown change that are tried, in noise sd.
 SIZES = torch.logspace(-0.3, 3.0, 14, dtype=torch.float64)
 
@@ -108,7 +109,7 @@ class Change:
         features, profile = self.features, self.features @ weights
         made_up = torch.linalg.qr(features @ self._made_up()).Q
         rest = profile - made_up @ (made_up.T @ profile)
-        if float(rest.norm()) < HARDLY * float(profile.norm()):
+        if RESOLVED < float(rest.norm()) / max(float(profile.norm()), 1e-300) < HARDLY:
             features, profile = features - made_up @ (made_up.T @ features), rest
         if is_unseen(channel, residual):
             features, profile = features - features.mean(0), profile - profile.median()

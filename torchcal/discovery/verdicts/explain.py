@@ -37,6 +37,8 @@ GAPS = 200
 MIXED = 0.02
 #: Smallest squared effect of a direction of unit size, each parameter's effect being 1, that is one.
 UNSEEN = 1e-6
+#: The same of one that only rounding, of the data's derivatives too, lets have an effect.
+ROUNDED = 1e-12
 #: Share of an estimate from which on its sd is so large that it may be told in a combination only.
 LOOSE = 0.1
 #: Correlation of what two candidates do from which on they are nearly the same, and log evidence by which refits tell
@@ -71,7 +73,7 @@ def estimates(
     """
     sd = stated_sd(found)
     loose = _loose(found)
-    combined = {name for group in _untold(found)[1] for name in group}
+    combined = {name for group in _untold(found, ROUNDED)[1] for name in group}
     bound = {i for i, at in zip(found.free, found.at_bound.tolist(), strict=True) if at}
     result = []
     for i in places:
@@ -251,8 +253,9 @@ def one_law(model: Model) -> list[str]:
     return rows
 
 
-def _untold(found: Fitted) -> tuple[list[str], list[list[str]]]:
-    """Parameters of a fit that move no datum, and combinations of others that do not and leave two of them open."""
+def _untold(found: Fitted, unseen_up_to: float = UNSEEN) -> tuple[list[str], list[list[str]]]:
+    """Parameters of a fit that move no datum, and combinations of others that do not, or hardly, and leave two of them
+    open."""
     names = [found.problem.parameters[i].name for i in found.free]
     jacobian = found.whitening(found.jacobian)
     size = jacobian.norm(dim=0)
@@ -266,7 +269,7 @@ def _untold(found: Fitted) -> tuple[list[str], list[list[str]]]:
     unit = jacobian[:, kept] / size[kept]
     values, vectors = torch.linalg.eigh(unit.T @ unit)
     groups = []
-    for k in (values < UNSEEN).nonzero()[:, 0].tolist():
+    for k in (values < unseen_up_to).nonzero()[:, 0].tolist():
         parts = vectors[:, k].abs()
         members = [kept[j] for j in range(len(kept)) if float(parts[j]) > MIXED * float(parts.max())]
         if sum(bool(loose[j]) for j in members) > 1:
