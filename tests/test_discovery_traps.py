@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 import torchcal as tc
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.verdicts import verdict
-from torchcal.discovery.verdicts.doubts import _shared
+from torchcal.discovery.verdicts.doubts import between_outputs
 from torchcal.display import NONE
 
 F64 = torch.float64
@@ -516,12 +516,12 @@ def test_outputs_with_noise_of_their_own_share_nothing():
         slopes = torch.as_tensor(rng.standard_normal((60, 4)))
         slopes[30:] += slopes[:30]  # what is fitted acts on both
         left = e - slopes @ torch.linalg.lstsq(slopes, e[:, None]).solution[:, 0]
-        p.append(_shared(problem, left * torch.tensor([3.0, 0.5]).repeat_interleave(30), slopes))
+        p.append(between_outputs(problem, left * torch.tensor([3.0, 0.5]).repeat_interleave(30), slopes)[0])
     # Uniform: the number below a tenth is within four of its sd.
     assert abs(sum(one < 0.1 for one in p) - 20) < 4 * math.sqrt(18)
     common = left + 2 * torch.as_tensor(rng.standard_normal(30)).repeat(2)
-    assert _shared(problem, common, slopes) < 1e-4
-    assert _shared(problem, common[:30].repeat(2), slopes[:, :0]) < 1e-4
+    assert between_outputs(problem, common, slopes)[0] < 1e-4
+    assert between_outputs(problem, common[:30].repeat(2), slopes[:, :0])[0] < 1e-4
 
 
 def remembering(n, rho, seed):
@@ -628,3 +628,19 @@ def test_two_errors_of_one_instrument_that_it_has_are_named(offset, bend):
     d = tc.diagnose(spring, recording, wrong, seed=0, progress=False)
     assert d.verdict == "named", str(d)
     assert sorted(d.terms) == ["non-linearity of x", "offset of x"]
+
+
+@pytest.mark.parametrize("size", [0.0, 0.1])
+def test_what_two_outputs_share_is_told_where_nothing_is_missing(size):
+    """Too fast for anything that is looked for, and no noise of each output."""
+    x = torch.linspace(0, 1, 60, dtype=torch.float64)
+    rng = np.random.default_rng(0)
+    common, *own = (torch.as_tensor(rng.standard_normal(60)) for _ in range(3))
+    base = tc.Simulator(
+        lambda x, p: {"i": p["a"] * x, "w": p["b"] + p["c"] * x}, [tc.Parameter(name) for name in "abc"]
+    )
+    y = {"i": 2 * x + size * common + 0.05 * own[0], "w": 5 - 3 * x - 3 * size * common + 0.15 * own[1]}
+    d = diagnose(base, tc.Recording(x=x, y=y), [])
+    assert d.verdict == "consistent"
+    told = "what is left of i goes with what is left of w" in " ".join(str(d).split())
+    assert told == (size > 0)

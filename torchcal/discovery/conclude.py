@@ -21,6 +21,7 @@ from torchcal.discovery.findings.symptoms import (
     more_than_replicates,
     shared,
     symptoms,
+    together,
     unlike,
 )
 from torchcal.discovery.findings.where import locate, missing_rate, needed_shifts, sharpened
@@ -106,7 +107,8 @@ def conclude(judged: Judged, asked: Asked, *, interrupted: str = "") -> Diagnosi
     improved = asked.simulator if best is None else _improved(asked.simulator, best)
     left = search.base if best is None else best.found
     apart = [*unlike(search, left), *shared(search, left)] if decision.verdict in ("consistent", "named") else []
-    apart += [*in_rows(search, left), *along(search, left)] if decision.verdict == "consistent" else []
+    if decision.verdict == "consistent":
+        apart += [*in_rows(search, left), *along(search, left), *together(search, left)]
     aside = asked.recording.observed_once & ~search.problem.keep
     apart += side_by_side(search.problem, final.residual / search.noise.sd, aside)
     any_unlike = bool(apart)

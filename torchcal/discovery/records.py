@@ -346,7 +346,7 @@ class MissingRate:
         driver: What it is drawn against.
         values: Driver values, ascending, ``(m,)``.
         rate: Estimate there, ``(m,)``, in ``unit``; relative to its median where the base's own parameters make up for
-            what is the same everywhere.
+            what is the same everywhere, and without what else they make up for where that is most of it.
         sd: Its standard deviation, ``(m,)``.
         unit: Unit of the rate.
         time: Times of the grid along the calibrated trajectory, ``(T,)``; the conditions' rows in the

@@ -12,11 +12,14 @@ from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.noise import GRID, LEAST, decorrelated, estimate
 from torchcal.discovery.misfit.replicates import goes_on_along, in_common_at
-from torchcal.discovery.verdicts.doubts import ALONG, along_rows, goes_on
+from torchcal.discovery.verdicts.doubts import ALONG, along_rows, between_outputs, goes_on
 from torchcal.discovery.verdicts.explain import estimates, stated_sd
 from torchcal.display import up_to, with_unit
 
-__all__ = ["along", "in_rows", "in_times", "larger_than_given", "more_than_replicates", "shared", "symptoms", "unlike"]
+__all__ = [
+    "along", "in_rows", "in_times", "larger_than_given", "more_than_replicates", "shared", "symptoms", "together",
+    "unlike",
+]  # fmt: skip
 
 #: A base parameter that moves by this many sd when a term is added was bent by it.
 BENT = 3.0
@@ -32,6 +35,8 @@ COMPARED, UNLIKE, RATIO = 12, 0.01, 2.0
 #: Times what replicates tell of the noise that means of conditions scatter by, from which on that is told where these
 #: are in no order; levels of a condition that it takes; and how rarely chance may scatter them so.
 SCATTER, MEANS, RARELY = 1.5, 8, 0.005
+#: How rarely noise of each output may go together by chance as much as what is left of two.
+SELDOM = 0.001
 
 
 def symptoms(search: Search, best: Model | None, larger: str) -> list[str]:
@@ -235,6 +240,20 @@ def along(search: Search, found: Fitted) -> list[str]:
         f"what is left{f' of {name}' if several else ''} goes on along {condition}, from one value to the next: that "
         "is no noise of each datum, but something that changes faster than what was looked for"
         for name, condition in goes_on_along(problem, search.noise.whitening(problem).vector(found.residual))
+    ]
+
+
+def together(search: Search, found: Fitted) -> list[str]:
+    """Two outputs of which what a fit leaves goes together, in words."""
+    if search.exact:
+        return []
+    white = search.noise.whitening(found.problem)
+    by_chance, pair = between_outputs(found.problem, white.vector(found.residual), white(found.jacobian))
+    if by_chance >= SELDOM:
+        return []
+    return [
+        f"what is left of {pair[0]} goes with what is left of {pair[1]}: that is no noise of each, but something that "
+        "acts on both, or noise that they share"
     ]
 
 

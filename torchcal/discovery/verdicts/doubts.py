@@ -24,8 +24,8 @@ from torchcal.errors import TorchcalError
 from torchcal.simulators import Trajectories
 from torchcal.terms import Term
 
-__all__ = ["ALONG", "along_rows", "by_hold", "distinct", "doubt", "goes_on", "in_common", "in_order", "left_open",
-           "unfit"]  # fmt: skip
+__all__ = ["ALONG", "along_rows", "between_outputs", "by_hold", "distinct", "doubt", "goes_on", "in_common", "in_order",
+           "left_open", "unfit"]  # fmt: skip
 
 #: Correlation from sample to sample from which on noise of unknown size may be physics that a term has left.
 SLOWEST = 0.85
@@ -326,7 +326,9 @@ def in_common(search: Search, model: Model) -> str:
     """Whether what a model leaves of one output goes with what it leaves of another, in a sentence; empty if not."""
     noise, problem = beside(search, model), model.found.problem
     white = noise.whitening(problem)
-    if not noise.open or _shared(problem, white.vector(model.found.residual), white(model.found.jacobian)) >= IN_COMMON:
+    if not noise.open:
+        return ""
+    if between_outputs(problem, white.vector(model.found.residual), white(model.found.jacobian))[0] >= IN_COMMON:
         return ""
     return (
         "What it leaves of one output goes with what it leaves of another, as physics that acts on both would, or "
@@ -334,9 +336,14 @@ def in_common(search: Search, model: Model) -> str:
     )
 
 
-def _shared(problem: Problem, e: Tensor, jacobian: Tensor) -> float:
-    """Probability by chance of the largest correlation of two outputs' residuals at the same conditions; 1 of one
-    output.
+def between_outputs(problem: Problem, e: Tensor, jacobian: Tensor) -> tuple[float, tuple[str, ...]]:
+    """Probability by chance of the largest correlation of two outputs' residuals at the same conditions, and these
+    outputs; 1 and none of one output.
+
+    Args:
+        problem: The data.
+        e: Whitened residuals, ``(n,)``.
+        jacobian: Whitened slopes of the fit that left them, ``(n, k)``.
 
     Residuals of a fit are e = (I − H) ε, whose products have the mean tr(M (I − H)) and the variance
     2 tr((M (I − H))²), M picking pairs of data (half of each twice).
@@ -348,7 +355,7 @@ def _shared(problem: Problem, e: Tensor, jacobian: Tensor) -> float:
     for k, output in enumerate(outputs):
         mine = (problem.output_of == output).nonzero()[:, 0]
         place[problem.condition_of[mine], k] = mine
-    worst, pairs = 1.0, math.comb(len(outputs), 2)
+    worst, pairs, which = 1.0, math.comb(len(outputs), 2), tuple[str, ...]()
     for a, b in itertools.combinations(range(len(outputs)), 2):
         both = place[(place[:, a] >= 0) & (place[:, b] >= 0)][:, [a, b]]
         one, other = both.unbind(1)
@@ -364,8 +371,10 @@ def _shared(problem: Problem, e: Tensor, jacobian: Tensor) -> float:
         twice = 0.5 * (cross + cross.T)
         spread = len(both) - float(q[one].square().sum() + q[other].square().sum()) + 2.0 * float(twice.square().sum())
         z = abs(product - mean) / math.sqrt(max(spread, 1.0))
-        worst = min(worst, pairs * math.erfc(z / math.sqrt(2.0)))
-    return worst
+        by_chance = pairs * math.erfc(z / math.sqrt(2.0))
+        if by_chance < worst:
+            worst, which = by_chance, tuple(problem.recording.outputs[outputs[k]] for k in (a, b))
+    return worst, which
 
 
 def _of_two_colours(search: Search, model: Model) -> str:
