@@ -958,3 +958,37 @@ def test_a_change_of_few_data_is_no_explanation_where_a_larger_noise_is_likelier
         structure=types.SimpleNamespace(places=places), base=base, problem=types.SimpleNamespace(n=n)
     )
     assert _explained_by_place(search) is explained
+
+
+def two_outputs_in_slow_noise(seed, rho):
+    x = torch.linspace(0, 1, 60, dtype=torch.float64)
+    base = tc.Simulator(
+        lambda x, p: {"i": p["a"] * x, "w": p["b"] + p["c"] * x}, [tc.Parameter(name) for name in "abc"]
+    )
+    generator = np.random.default_rng(seed)
+
+    def noise():
+        e = generator.standard_normal(60)
+        for k in range(1, 60):
+            e[k] = rho * e[k - 1] + math.sqrt(1 - rho**2) * e[k]
+        return torch.as_tensor(e)
+
+    y = {"i": 2 * x + 0.05 * noise(), "w": 5 - 3 * x + 0.15 * noise()}
+    return tc.diagnose(base, tc.Recording(x=x, y=y), seed=0, progress=False)
+
+
+def test_nothing_is_called_missing_where_the_base_keeps_much_of_the_probability():
+    d = two_outputs_in_slow_noise(1022, 0.6)
+    assert d.verdict == "consistent"
+    assert d.p_detect < 0.01
+    base = sum(row.probability for row in d.ranking if not row.terms)
+    assert 0.2 < base < 0.5
+    assert f"the base alone keeps a probability of {base:.2f}" in " ".join(str(d).split())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rho", [0.0, 0.6, 0.85])
+def test_few_data_in_slow_noise_of_unknown_size_raise_few_alarms(rho):
+    seeds = 60
+    alarms = sum(two_outputs_in_slow_noise(seed, rho).verdict != "consistent" for seed in range(seeds))
+    assert alarms <= most(seeds, 0.02, tail=3e-3)

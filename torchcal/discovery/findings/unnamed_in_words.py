@@ -35,6 +35,8 @@ LIMITS = 6
 NEARLY_ALL = 0.999
 #: Probability by noise alone below which what is taken for noise is told to be no common one.
 SELDOM = 0.05
+#: Probability of the base alone from which on it is likelier than all else.
+EVEN = 0.5
 
 
 def consistent(d: Any) -> list[str]:
@@ -54,6 +56,12 @@ def consistent(d: Any) -> list[str]:
             nothing = (
                 "Slow noise explains that structure at least as well as anything in the library, so that no physics is "
                 "called missing; a known noise sd, replicates or a repeated run would tell."
+            )
+        base = sum(row.probability for row in d.ranking if not row.terms)
+        if d.noise.source == "estimated" and base < EVEN:
+            nothing = (
+                f"Yet the base alone keeps a probability of {chance(base)}, as noise of unknown size and memory may "
+                "have done that: a known noise sd, replicates or a repeated run would tell."
             )
     if d.settings.get("larger_noise"):
         nothing += " But data beside each other differ by more than the noise that was given: it is larger, or "
