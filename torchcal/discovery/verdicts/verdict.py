@@ -144,8 +144,8 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         elif leading is not None and leading.period is not None:
             decision.none_note = "an unknown oscillation"
     weigh(search, decision)
-    likely = search.noise.open and decision.base > STILL
-    if not detected or likely or decision.base >= max(decision.none, *decision.probability.values(), 0.0):
+    by_noise = search.noise.open and decision.base > STILL
+    if not detected or by_noise or decision.base >= max(decision.none, *decision.probability.values(), 0.0):
         decision.verdict = "consistent"
         return decision
     groups = groups_of(ranked)
