@@ -38,7 +38,9 @@ def mode(simulator, y, x=X, **options):
     ("function", "y"),
     [
         (lambda x, p: torch.relu(x - p["c"]), np.maximum(X - 2.0, 0) + 0.3 * np.sin(X)),
-        (lambda x, p: (x - p["c"]).abs(), np.abs(X - 2) + 0.2 * np.sin(3 * X)),
+        pytest.param(
+            lambda x, p: (x - p["c"]).abs(), np.abs(X - 2) + 0.2 * np.sin(3 * X), marks=pytest.mark.slow
+        ),
     ],
 )
 def test_a_kink_takes_the_most_nodes_that_there_are(function, y):
@@ -305,19 +307,29 @@ def test_a_table_that_was_read_twice_is_told():
         check_inputs(line(), twice.subset(~twice.copies), None)
 
 
+FEW = {"num_samples": 2, "num_warmup": 2, "num_chains": 2, "seed": 0}
+
+
 @pytest.mark.filterwarnings("ignore::torchcal.errors.TorchcalWarning")
-@pytest.mark.parametrize("calibrate", [tc.calibrate, pytest.param(tc.calibrate_additive, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("calibrate", [tc.calibrate, tc.calibrate_additive])
 def test_a_ridge_without_an_end_is_not_drawn_from(calibrate):
-    """A product is known on a hyperbola, the sum of two squares on a circle."""
+    """A product is known on a hyperbola."""
     parameters = [tc.Parameter(name) for name in "abc"]
     recording = tc.Recording(x=X, y=1 + 0.5 * X + 0.1 * X**2)
-    few = {"num_samples": 2, "num_warmup": 2, "num_chains": 2, "seed": 0}
     with pytest.raises(ImproperPosteriorError, match="does not change along a, c"):
-        calibrate(tc.Simulator(lambda x, p: p["a"] * p["c"] + p["b"] * x, parameters), recording, **few)
-    circle = tc.Simulator(lambda x, p: p["a"] ** 2 + p["c"] ** 2 + p["b"] * x, parameters)
-    for square in (1, 100):
-        found = calibrate(circle, tc.Recording(x=X, y=square + 0.5 * X + 0.1 * X**2), **few)
-        assert found.samples is not None
+        calibrate(tc.Simulator(lambda x, p: p["a"] * p["c"] + p["b"] * x, parameters), recording, **FEW)
+
+
+@pytest.mark.filterwarnings("ignore::torchcal.errors.TorchcalWarning")
+@pytest.mark.parametrize("square", [1, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("calibrate", [tc.calibrate, pytest.param(tc.calibrate_additive, marks=pytest.mark.slow)])
+def test_a_ridge_that_closes_is_drawn_from(calibrate, square):
+    """The sum of two squares is known on a circle."""
+    circle = tc.Simulator(
+        lambda x, p: p["a"] ** 2 + p["c"] ** 2 + p["b"] * x, [tc.Parameter(name) for name in "abc"]
+    )
+    found = calibrate(circle, tc.Recording(x=X, y=square + 0.5 * X + 0.1 * X**2), **FEW)
+    assert found.samples is not None
 
 
 @pytest.mark.filterwarnings("ignore::torchcal.errors.ConvergenceWarning", "ignore::torchcal.errors.PropagationWarning")

@@ -245,7 +245,9 @@ def tide(seed: int, size: float, *, clock: str = "up") -> tuple:
     return base, x, y[order], [trend]
 
 
-@pytest.mark.parametrize(("noise", "clock"), [(None, "up"), (0.1, "up"), (None, "down")])
+@pytest.mark.parametrize(
+    ("noise", "clock"), [pytest.param(None, "up", marks=pytest.mark.slow), (0.1, "up"), (None, "down")]
+)
 def test_an_oscillation_along_a_clock_is_seen_beside_another_condition(noise, clock):
     base, x, y, terms = tide(0, 2.0, clock=clock)
     d = tc.diagnose(base, tc.Recording(x=x, y=y, noise=noise), terms, progress=False)

@@ -457,12 +457,12 @@ def test_an_effect_at_a_limit_from_wavering_noise_is_seen_as_often_as_is_said(fr
     assert _distance(wanted, 1.645, 0.0) == pytest.approx(wanted + 1.645)
 
 
-def test_the_stated_limit_is_where_detection_begins():
+@pytest.mark.parametrize("seeds", [3, pytest.param(12, marks=pytest.mark.slow)])
+def test_the_stated_limit_is_where_detection_begins(seeds):
     # Twice the limit lies three and a half sd beyond the critical value, a quarter of it two and a half before.
     limit = diagnosed(decay(60, 1, known=True)).detection_limit[0]
     assert limit.term == "offset"
     assert limit.power == 0.95
-    seeds = 6
     seen = {
         factor: sum(
             diagnosed(decay(60, 4000 + s, known=True, offset=factor * limit.smallest), max_terms=1).verdict

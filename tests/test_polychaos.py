@@ -231,6 +231,18 @@ def test_long_gauss_rules_neither_overflow_nor_underflow(basis, n):
 
 
 @pytest.mark.parametrize("basis", BASES)
+def test_a_gauss_rule_is_worked_out_once_and_belongs_to_who_asks(basis, monkeypatch):
+    nodes, weights = (column.clone() for column in basis.gauss(7))
+    for column in basis.gauss(7):
+        column.zero_()
+    monkeypatch.setattr(np.linalg, "eigvalsh", None)
+    again = basis.gauss(7)
+    assert torch.equal(again[0], nodes)
+    assert torch.equal(again[1], weights)
+    assert pickle.loads(pickle.dumps(basis)).gauss(7)[0].tolist() == nodes.tolist()
+
+
+@pytest.mark.parametrize("basis", BASES)
 def test_tensor_rule_with_a_number_for_each_germ(basis):
     rule = tensor_rule(basis, 2, (2, 4))
     assert (rule.num, rule.dim, rule.positive) == (8, 2, True)

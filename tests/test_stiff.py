@@ -245,8 +245,15 @@ def test_steps_become_short_where_a_stiff_solution_jumps(stiff):
     assert float(lengths.max() / lengths.min()) > 10
 
 
-@pytest.mark.parametrize("stiff", [None, True])
-@pytest.mark.parametrize("k", [300.0, 1e4])
+@pytest.mark.parametrize(
+    ("k", "stiff"),
+    [
+        (300.0, True),
+        (1e4, None),
+        pytest.param(300.0, None, marks=pytest.mark.slow),
+        pytest.param(1e4, True, marks=pytest.mark.slow),
+    ],
+)
 def test_what_grows_fast_is_not_damped(k, stiff):
     """From near an equilibrium that is unstable: longer implicit steps than it grows in stay there, at any length."""
     model = tc.ODESimulator(
@@ -263,7 +270,7 @@ def test_what_grows_fast_is_not_damped(k, stiff):
         assert np.abs(found.at(found.x)(tensor(k)).numpy() - exact).max() < 1e-4
 
 
-@pytest.mark.parametrize("stiff", [None, True])
+@pytest.mark.parametrize("stiff", [None, pytest.param(True, marks=pytest.mark.slow)])
 def test_an_enzyme_by_its_full_mechanism_uses_up_its_substrate(stiff):
     def rates(t, s, p, u):
         bind, back, on = p["kf"] * s["E"] * s["S"], 1e3 * s["C"], 1e2 * s["C"]
