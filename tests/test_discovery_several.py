@@ -336,3 +336,53 @@ def test_what_a_base_that_is_off_nearly_makes_up_for_is_tried_in_place_of_the_ot
     assert (search.base.chi2 > 5 * 60) == off
     swapped = _swapped(search, SimpleNamespace(numbers=(1, 2)))
     assert {(0, 1), (0, 2)} <= set(swapped) if off else not {(0, 1), (0, 2)} & set(swapped)
+
+
+# --- terms that free the same ------------------------------------------------------------------------------
+
+
+INHIBITED = [
+    tc.Term("competitive inhibition", frees=("Ic",)),
+    tc.Term("uncompetitive inhibition", frees=("Iu",)),
+    tc.Term("mixed inhibition", frees=("Ic", "Iu")),
+]
+
+
+def inhibited(competitive: float, uncompetitive: float, seed: int) -> tuple[tc.Simulator, tc.Recording]:
+    """Rates of an enzyme whose inhibitor binds it, or what it makes of the substrate, of which the base knows nothing.
+    """
+    def rate(x, p):
+        free, bound = 1 + p["Ic"] * x["I"], 1 + p["Iu"] * x["I"]
+        return {"v": p["Vm"] * x["S"] / (p["Km"] * free + x["S"] * bound)}
+
+    s, i = (each.ravel() for each in np.meshgrid([0.2, 0.4, 0.8, 1.5, 3, 6], [0, 0.2, 0.5, 1, 2], indexing="ij"))
+    x = {"S": np.tile(s, 2), "I": np.tile(i, 2)}
+    truth = {"Vm": 100.0, "Km": 1.2, "Ic": competitive, "Iu": uncompetitive}
+    y = rate(x, truth)["v"] + np.random.default_rng(seed).standard_normal(60)
+    parameters = [
+        tc.Parameter("Vm", low=0.1, high=1000.0, initial=80.0),
+        tc.Parameter("Km", low=1e-3, high=50.0, initial=1.0),
+        *(tc.Parameter(name, low=0.0, high=50.0, neutral=0.0) for name in ("Ic", "Iu")),
+    ]
+    return tc.Simulator(rate, parameters), tc.Recording(x=x, y={"v": y}, noise=1.0)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_terms_that_free_what_a_third_one_frees_are_no_more_models(seed):
+    d = tc.diagnose(*inhibited(1.0, 0.15, seed), INHIBITED, progress=False)
+    assert (d.verdict, d.terms) == ("named", ["mixed inhibition"])
+    assert all(len(row.terms) < 2 for row in d.ranking)
+    both = tc.diagnose(*inhibited(1.0, 0.15, seed), INHIBITED[:2], progress=False)
+    assert set(both.terms) == {"competitive inhibition", "uncompetitive inhibition"}
+
+
+@pytest.mark.parametrize(("seed", "verdict"), [(0, "ambiguous"), (1, "named")])
+def test_a_term_that_frees_more_is_the_same_and_more(seed, verdict):
+    d = tc.diagnose(*inhibited(0.8, 0.0, seed), INHIBITED, progress=False)
+    assert d.verdict == verdict
+    if verdict == "named":
+        assert d.terms == ["competitive inhibition"]
+        assert "The next best without it, mixed inhibition, has a probability" in " ".join(str(d).split())
+    else:
+        assert d.tied == [["competitive inhibition"], ["mixed inhibition"]]
+        assert d.experiment is None  # what one has beside the other is at its neutral value

@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
@@ -78,7 +78,7 @@ def refit_several(search: Search) -> None:
     best = max(fitted, key=lambda m: m.weight)
     if search.examine(best).p_value < 0.01 or search.exact:
         third = math.log(0.2 * PRIOR["several"] / (count * (count - 1) * max(count - 2, 1) / 6))
-        more = [j for j in _next_terms(search, best, THIRD) if j not in best.numbers]
+        more = [j for j in _next_terms(search, best, THIRD) if _distinct(search, [(*best.numbers, j)])]
         search.models += _refitted(search, [_with_third(search, best, j, third) for j in more])
         leader = search.physical_leader
         if leader is not None and len(leader.numbers) == 3:
@@ -106,14 +106,29 @@ def _pairs_to_try(
     for pair in itertools.chain(*itertools.zip_longest(*beside)):  # the best of each lead first
         if pair is not None:
             wanted.setdefault(pair, None)
+    wanted = {pair: wanted[pair] for pair in _distinct(search, wanted)}
     wanted = dict(itertools.islice(wanted.items(), FEWER if enough else MOST))
     if not enough:  # a term in a window bends to what two do together, and these act everywhere
         everywhere = [(m.numbers[0], m) for m in single if m.window is None][:LEADS]
         for lead, model in everywhere:
             if (lead, model) not in ahead:
-                more = [pair for pair in _pairs_with(search, lead, model) if pair not in wanted]
+                more = _distinct(search, [*wanted, *_pairs_with(search, lead, model)])[len(wanted) :]
                 wanted.update(dict.fromkeys(more[:MORE]))
     return wanted
+
+
+def _distinct(search: Search, sets: Iterable[tuple[int, ...]]) -> list[tuple[int, ...]]:
+    """Of some sets of candidates those that add what no single one, no model and no set before them adds: two terms
+    that free one parameter each are a third one that frees both."""
+    seen = {candidate.content for i, candidate in enumerate(search.candidates) if i not in search.failed}
+    seen |= {model.content for model in search.models if model.window is None}
+    found = []
+    for numbers in dict.fromkeys(sets):
+        content = frozenset().union(*(search.candidates[i].content for i in numbers))
+        if content not in seen:
+            seen.add(content)
+            found.append(numbers)
+    return found
 
 
 def _pairs_with(search: Search, lead: int, model: Model) -> list[tuple[int, ...]]:
@@ -137,7 +152,7 @@ def _with_look_alikes(search: Search, tried: set[tuple[int, ...]], prior: float)
     while leading and len(fitted) < MOST:
         done |= {m.numbers for m in leading}
         wanted = dict.fromkeys(pair for lead in leading for pair in _swapped(search, lead) if pair not in tried)
-        pairs = list(wanted)[: MOST - len(fitted)]
+        pairs = _distinct(search, wanted)[: MOST - len(fitted)]
         tried.update(pairs)
         search.models += (twins := _refit_sets(search, [(pair, None) for pair in pairs], prior))
         fitted += _either_way(search, twins)

@@ -165,7 +165,7 @@ def _bearable(models: Sequence[Model], recording: Recording, noise: Noise) -> bo
 
 def _holds(model: Model, other: Model) -> bool:
     """Whether a model has all that another one has, and more."""
-    return set(other.names) < set(model.names) and other.window is None and model.window is None
+    return other.content < model.content and other.window is None and model.window is None
 
 
 def _best(tried: Sequence[Tried], told: Sequence[bool]) -> Tried | None:

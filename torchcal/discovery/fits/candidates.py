@@ -64,6 +64,11 @@ class Candidate:
         """Names of its terms."""
         return " + ".join(term.name for term in self.terms)
 
+    @property
+    def content(self) -> frozenset[str]:
+        """Names of what it adds to the base's parameters: candidates with the same, however they are called, are one."""
+        return frozenset(self.problem.parameters[i].name for i in self.own)
+
     def neutral_at(self, place: int) -> float:
         """The neutral value of one of its own parameters, by its place among all."""
         return float(self.neutral[self.own.index(place)])

@@ -56,6 +56,11 @@ class Model:
         return tuple(term.name for term in self.candidate.terms)
 
     @property
+    def content(self) -> frozenset[str]:
+        """Names of the parameters that it adds, by which one model holds another, however their terms are called."""
+        return self.candidate.content
+
+    @property
     def prior(self) -> float:
         """Log prior with the price of its parameters."""
         return self.log_prior + self.price

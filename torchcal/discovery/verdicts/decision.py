@@ -7,7 +7,7 @@ from torchcal.discovery.hypotheses.aliases import duplicate
 from torchcal.discovery.hypotheses.model import PRIOR, Model
 from torchcal.discovery.hypotheses.search import Search
 
-__all__ = ["Decision", "certain", "groups_of", "other_names", "tie_other_names", "weigh"]
+__all__ = ["Decision", "certain", "other_names", "shares_of", "tie_other_names", "weigh"]
 
 #: A hypothesis is named when it has at least this probability among those of no more terms that the library offers.
 NAMED = 0.97
@@ -64,28 +64,28 @@ def weigh(search: Search, decision: Decision, models: Sequence[Model] | None = N
     decision.none = math.exp(decision.none_evidence - top) / total
 
 
-def groups_of(models: Sequence[Model]) -> dict[frozenset[str], float]:
-    """Probability of each set of terms among all physical ones, wherever they act."""
-    if not models:
-        return {}
-    top = max(m.weight for m in models)
+def shares_of(models: Sequence[Model]) -> list[float]:
+    """Probability of each model among them."""
+    top = max((m.weight for m in models), default=0.0)
     total = sum(math.exp(m.weight - top) for m in models)
-    found: dict[frozenset[str], float] = {}
-    for m in models:
-        names = frozenset(m.names)
-        found[names] = found.get(names, 0.0) + math.exp(m.weight - top) / total
-    return found
+    return [math.exp(m.weight - top) / total for m in models]
 
 
-def certain(groups: dict[frozenset[str], float], model: Model) -> bool:
-    """Whether all of a model's terms are there, whatever else is.
+def certain(ranked: Sequence[Model], model: Model) -> bool:
+    """Whether all of a model's terms are there, whatever else is, among the physical models.
 
     Several others together can copy almost anything, and are the rarer the more they are: against them less will do.
+    So it will against a term under another name that frees what these do, and more: it holds them, but is not they.
     """
-    own = frozenset(model.names)
-    holding = sum(share for names, share in groups.items() if names >= own)
-    others = sum(share for names, share in groups.items() if not names >= own and len(names) <= len(own))
-    return holding >= NAMED * (holding + others) and holding >= NAMED_AMONG_LARGER
+    holding = more = others = 0.0
+    for other, share in zip(ranked, shares_of(ranked), strict=True):
+        if set(other.names) >= set(model.names):
+            holding += share
+        elif other.content > model.content:
+            more += share
+        elif len(other.names) <= len(model.names):
+            others += share
+    return holding + more >= NAMED * (holding + more + others) and holding >= NAMED_AMONG_LARGER
 
 
 def other_names(search: Search, model: Model) -> list[tuple[int, str, str]]:

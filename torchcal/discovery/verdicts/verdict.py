@@ -14,7 +14,7 @@ from torchcal.discovery.misfit.places import Place
 from torchcal.discovery.misfit.replicates import in_common_at
 from torchcal.discovery.misfit.structure import Structure
 from torchcal.discovery.verdicts.by_share import decide_exact, nearly
-from torchcal.discovery.verdicts.decision import Decision, certain, groups_of, other_names, tie_other_names, weigh
+from torchcal.discovery.verdicts.decision import Decision, certain, other_names, shares_of, tie_other_names, weigh
 from torchcal.discovery.verdicts.doubts import by_hold, doubt, in_common, in_order, unfit
 from torchcal.discovery.verdicts.explain import removed
 from torchcal.discovery.verdicts.instruments import bends_to_physics, no_instrument, only_instruments, reads_otherwise
@@ -148,7 +148,6 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     if not detected or by_noise or decision.base >= max(decision.none, *decision.probability.values(), 0.0):
         decision.verdict = "consistent"
         return decision
-    groups = groups_of(ranked)
     white = [m for m in ranked[:6] if search.examine(m).p_value >= WHITE and _small(search, m)]
     if not white or decision.none > (UNKNOWN if search.unnamed is None else UNNAMED):
         decision.verdict = "unexplained"
@@ -162,7 +161,7 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
         if (
             best.weight > white[0].weight - BEHIND  # what all likely models share is a name, but not of a bad fit
             and set(best.names) <= set(white[0].names)
-            and certain(groups, best)
+            and certain(ranked, best)
             and not otherwise & set(best.names)
         ):
             _name(search, decision, best, mask)
@@ -175,6 +174,9 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     decision.verdict = "ambiguous"
     covered = 0.0
     seen: set[frozenset[str]] = set()
+    groups: dict[frozenset[str], float] = {}
+    for model, share in zip(ranked, shares_of(ranked), strict=True):
+        groups[frozenset(model.names)] = groups.get(frozenset(model.names), 0.0) + share
     for model in ranked:
         names = frozenset(model.names)
         if names in seen or model.note:
@@ -313,9 +315,11 @@ def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) 
     if sure < SURE or decision.doubt or not shown.physical:
         decision.verdict = "ambiguous"
         if alone:
-            # What acts in a window may stand in for the same everywhere and something beside it.
+            # What acts in a window may stand in for the same everywhere and something beside it, and a term for one
+            # that frees more.
             more = [m for m in holding if best.window is not None and len(m.names) > len(best.names)]
-            more = [m for m in more if m.window is None and _is_worth(decision, m)]
+            more += [m for m in search.models if m.physical and m not in holding and m.content > best.content]
+            more = [m for m in more if m.window is None and not m.note and _is_worth(decision, m)]
             decision.tied_models = [best, *sorted(more, key=lambda m: -decision.probability[id(m)])]
             decision.tied = [list(names) for names in dict.fromkeys(m.names for m in decision.tied_models)]
         decision.tied.append(list(NONE))
