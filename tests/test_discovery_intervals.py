@@ -11,7 +11,7 @@ import torchcal as tc
 from torchcal.discovery.fits.fitting import fit
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.records import Estimate
-from torchcal.discovery.verdicts.intervals import SIDES, by_profile
+from torchcal.discovery.verdicts.intervals import FITS, JUMP, NEAR, SIDES, _End, by_profile
 
 F64 = torch.float64
 X = torch.linspace(0.1, 6, 40, dtype=F64)
@@ -102,6 +102,43 @@ def test_a_fit_in_a_side_valley_is_no_end(seed):
 
     assert rise(low) == pytest.approx(SIDES**2, rel=0.05)
     assert rise(high) == pytest.approx(SIDES**2, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("rise", "where"),
+    [
+        (lambda away: 1.1 if away < 3.9 else 97.0, 3.9),
+        (lambda away: 0.3 * away**0.5 if away < 11.0 else 5.0, 11.0),
+        (lambda away: 2.5 * away**0.5, (SIDES / 2.5) ** 2),
+        (lambda away: 0.2 * away**3, (SIDES / 0.2) ** (1 / 3)),
+    ],
+)
+def test_an_end_is_found_where_the_rise_jumps_and_where_it_does_not(rise, where):
+    none = torch.zeros(1)
+    end = _End(1, 0.1, math.inf, none, none)
+    count = 0
+    while not end.ended and count < FITS:
+        end.see(rise(end.away), none)
+        count += 1
+    assert end.ended
+    assert end.distance == pytest.approx(where, rel=max(2 * JUMP, 2 * NEAR / SIDES))
+
+
+def test_a_threshold_between_two_levels_lies_anywhere_between_them():
+    """Only what it gives at the highest of four levels is seen: a later beginning and a steeper rise do the same."""
+    levels = torch.tensor([2.0, 5.0, 8.0, 12.0], dtype=F64).repeat(10)
+    noise = 0.002 * torch.randn(40, generator=torch.Generator().manual_seed(3), dtype=F64)
+    y = 0.02 * (levels - 9).clamp_min(0) + noise
+    model = tc.Simulator(
+        lambda x, p: p["c"] * (x - p["s"]).clamp_min(0), [tc.Parameter("c", low=0.0), tc.Parameter("s", low=0.0)]
+    )
+    problem = Problem.of(model, tc.Recording(x=levels, y=y, noise=0.002))
+    whitening = problem.whitening(torch.full_like(y, 0.002), torch.zeros(1, dtype=F64))
+    found = fit(problem, whitening, torch.tensor([[0.015, 7.9]], dtype=F64), [0, 1])
+    ends = by_profile(found, [0, 1])
+    assert ends[1][0] < 8.0
+    assert ends[1][1] > 11.5
+    assert ends[0][1] > 0.1
 
 
 def test_another_valley_may_leave_an_end_open():

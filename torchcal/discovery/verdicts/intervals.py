@@ -19,7 +19,12 @@ SIDES, NEAR = 1.96, 0.03
 #: Part of the distance of an end by which the sd must put it elsewhere, to be told; and by the first fits, to go on.
 MISLED, PERHAPS = 0.3, 0.15
 #: Fits along a parameter, steps of each, and how many times as far away as the one before the next may lie.
-FITS, STEPS, STRETCH = 10, 30, 4.0
+FITS, STEPS, STRETCH = 14, 30, 4.0
+#: How near the points within and beyond an end lie where the rise jumps between them, as a share of its distance; and
+#: points in a row on one side of it, after which the next is the middle.
+JUMP, IN_A_ROW = 0.02, 2
+#: How many times as far as the farthest point known to be within may that beyond be which stands for an end in the end.
+ROUGH = 1.3
 #: A rise that is none, and one that is more than any.
 TINY, HUGE = 1e-6, 1e3
 #: Power of the distance that the rise grows with at least, to be followed: else it is as good as flat.
@@ -45,6 +50,7 @@ class _End:
         rise: Root of the rise of χ² at the last point.
         within: Distance of the farthest point known to be within the interval, with its rise.
         beyond: That of the nearest one known to be beyond it, with its rise.
+        in_a_row: How many points on end have been on the side of the last one.
         ended: Whether the distance is where χ² has risen enough, or that of a bound.
     """
 
@@ -56,18 +62,24 @@ class _End:
     rise: float = math.nan
     within: tuple[float, float] | None = None
     beyond: tuple[float, float] | None = None
+    in_a_row: int = 0
     ended: bool = False
 
     @property
     def distance(self) -> float | None:
-        """Of the end; infinite where no point is known to be beyond it, None where it was not found."""
+        """Of the end, or somewhat more; infinite where no point is known to be beyond it, None where it was not found.
+        """
         if self.ended:
             return self.wall if self.away > (1 - AT_WALL) * self.wall else self.away
-        return math.inf if self.beyond is None else None
+        if self.beyond is None:
+            return math.inf
+        near = self.within is not None and self.beyond[0] <= ROUGH * self.within[0]
+        return self.beyond[0] if near else None
 
     def see(self, rise: float, values: Tensor) -> None:
         """Take note of the rise at the point that was looked at, and choose the next one."""
         rise, before = min(max(rise, TINY), HUGE), self.within
+        self.in_a_row = self.in_a_row + 1 if (rise < SIDES) == (self.rise < SIDES) else 1
         self.rise, self.last = rise, values
         self.ended = abs(rise - SIDES) <= NEAR or (rise < SIDES and self.away >= self.wall)
         here = (self.away, rise)
@@ -75,6 +87,13 @@ class _End:
             self.within, self.values = here, values
         else:
             self.beyond = here
+        if self.within is not None and self.beyond is not None:
+            low, high = self.within[0], self.beyond[0]
+            if high - low <= JUMP * high:
+                self.ended, self.away = True, high if high >= (1 - AT_WALL) * self.wall else self.away
+            if not self.ended and self.in_a_row >= IN_A_ROW:  # a power does not describe how it rises
+                self.away = 0.5 * (low + high)
+                return
         if self.ended:
             return
         other = self.beyond if rise < SIDES else self.within
