@@ -66,7 +66,7 @@ class Candidate:
 
     @property
     def content(self) -> frozenset[str]:
-        """Names of what it adds to the base's parameters: candidates with the same, however they are called, are one."""
+        """Names of the parameters that it adds to the base: candidates with the same are one, by whatever name."""
         return frozenset(self.problem.parameters[i].name for i in self.own)
 
     def neutral_at(self, place: int) -> float:

@@ -27,10 +27,10 @@ MOST_CELLS = 16
 #: Waves that smooth functions follow, for each function, in one run; in several, where phases differ and they follow
 #: none, the fewest of the longest run; and the share of the fastest that data can show.
 FOLLOWED, FEWEST, FASTEST = 0.25, 1.5, 0.98
+#: Frequencies to each side of the likeliest of the grid that are tried within half a step of it.
+NEAR = 16
 #: Quantisation step, in noise sd, from which on rounding makes lines of its own.
 COARSE = 1.7
-#: Squared norm of a wave that no datum shows.
-SMALL = 1e-9
 #: Simulated residuals that are transformed at a time, times cells.
 NUMBERS = 2**22
 
@@ -120,13 +120,13 @@ class Lines:
         return torch.cat(found) - math.log(len(sizes) * (self.last - self.first)), best
 
     def evidence_of(self, residual: Residual, number: Tensor, sizes: Tensor) -> float:
-        """Log evidence of a wave of one frequency, out of all that are as likely."""
-        seen = [(norms[:, number], squares[:, number]) for norms, squares in self._seen(residual.e[:, None])]
-        logs = torch.stack([self._log(size, seen) for size in sizes.tolist()])
-        return float(logs.logsumexp(0)) - math.log(len(sizes) * (self.last - self.first))
+        """Log evidence of a wave of about one frequency, out of all that are as likely."""
+        logs = self._near(number, residual.e[:, None], sizes)[0]
+        return float(logs.logsumexp((0, 1))) - math.log(logs.numel() * (self.last - self.first))
 
-    def wave(self, values: Tensor, whitened: Tensor, number: Tensor, sizes: Tensor) -> tuple[Tensor, float]:
-        """The likeliest wave of one frequency in the residual ``(n,)``, and the χ² that it removes.
+    def wave(self, values: Tensor, whitened: Tensor, number: Tensor, sizes: Tensor) -> tuple[Tensor, float, float]:
+        """The likeliest wave of about one frequency in the residual ``(n,)``, the χ² that it removes, and its
+        frequency: many waves tell that better than the grid has it.
 
         Args:
             values: The residual.
@@ -134,20 +134,42 @@ class Lines:
             number: Of the frequency.
             sizes: That are tried.
         """
-        frequency = self.frequencies[number]
-        seen = [(norms[:, number], squares[:, number]) for norms, squares in self._seen(whitened[:, None])]
-        logs = torch.stack([self._log(size, seen) for size in sizes.tolist()])
-        size = float(sizes[logs.argmax()])
+        both = torch.stack([whitened, values], dim=-1)
+        logs, found = self._near(number, both, sizes)
+        size, best = divmod(int(logs.argmax()), logs.shape[1])
         profile, removed = torch.zeros_like(values), 0.0
-        for (places, _), (norms, squares) in zip(self.parts, seen, strict=True):
-            prior = self._variance(size)
-            angle = 2 * math.pi * frequency * self.along[places]
+        prior = self._variance(float(sizes[size]))
+        for (places, _), (design, gram, products) in zip(self.parts, found, strict=True):
+            inner = gram[best] + torch.eye(2, dtype=torch.float64) / prior
+            fitted, profile[places] = (design[best] @ torch.linalg.solve(inner, products[best])).unbind(-1)
+            removed += float(2 * whitened[places] @ fitted - fitted @ fitted)
+        return profile, removed, float(self._around(number)[best])
+
+    def _around(self, number: Tensor) -> Tensor:
+        """Frequencies within half a step of one of the grid, ``(m,)``."""
+        return self.frequencies[number] + torch.linspace(-0.5, 0.5, 2 * NEAR + 1, dtype=torch.float64) / (
+            self.size * self.step
+        )
+
+    def _near(
+        self, number: Tensor, residuals: Tensor, sizes: Tensor
+    ) -> tuple[Tensor, list[tuple[Tensor, Tensor, Tensor]]]:
+        """Log evidence of waves around one frequency of the grid against none, in the first column of residuals
+        ``(n, B)``, ``(sizes, m)``; and of every run the waves ``(m, data, 2)`` and their products with themselves and
+        with the residuals, ``(m, 2, 2)`` and ``(m, 2, B)``."""
+        near, one = self._around(number), torch.eye(2, dtype=torch.float64)
+        logs, found = torch.zeros(len(sizes), len(near), dtype=torch.float64), []
+        for places, _ in self.parts:
+            angle = 2 * math.pi * near[:, None] * self.along[places]
             design = torch.stack([angle.cos(), angle.sin()], dim=-1)
-            inverse = torch.linalg.inv(design.T @ design + torch.eye(2, dtype=torch.float64) / prior)
-            profile[places] = design @ (inverse @ (design.T @ values[places]))
-            left = 1 / (1 + prior * norms)
-            removed += float(((1 - left.square()) * squares / norms.clamp_min(SMALL)).sum())
-        return profile, removed
+            gram, products = design.mT @ design, design.mT @ residuals[places]
+            for k, size in enumerate(sizes.tolist()):
+                prior = self._variance(size)
+                amplitudes = torch.linalg.solve(gram + one / prior, products[..., :1])
+                gain = (products[..., :1] * amplitudes).sum((1, 2))
+                logs[k] += 0.5 * (gain - torch.logdet(one + prior * gram))
+            found.append((design, gram, products))
+        return logs, found
 
     def sd(self, sd: Tensor) -> Tensor:
         """Of a wave at every datum ``(n,)``, r.m.s. over its run, for noise of some sd ``(n,)``.

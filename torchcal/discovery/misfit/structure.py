@@ -114,11 +114,11 @@ def _line_place(lines: Lines, residual: Residual) -> Place:
     """The likeliest oscillation of an output."""
     found = residual.found
     evidence, number = lines.evidence(residual.e[:, None], SIZES)
-    profile, removed = lines.wave(found.residual, residual.e, number, SIZES)
+    profile, removed, frequency = lines.wave(found.residual, residual.e, number, SIZES)
     taken = 2.0 * len(lines.parts) + 1.0  # two amplitudes in every run, and the frequency
     return Place(
         lines.channel, lines.driver, float(evidence[0]), residual.share(removed, taken), profile,
-        lines.sd(found.whitening.sd), 1.0 / float(lines.frequencies[number]),
+        lines.sd(found.whitening.sd), 1.0 / frequency,
     )  # fmt: skip
 
 
