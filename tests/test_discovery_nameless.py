@@ -265,6 +265,23 @@ def test_what_data_at_one_value_share_is_no_larger_noise():
     assert not any("share what is left" in row for row in larger.symptoms)
 
 
+@pytest.mark.parametrize(("period", "told"), [(120.0, True), (600.0, False)])
+def test_what_is_located_along_a_condition_is_not_told_once_more_as_shared(period, told):
+    """Beside 17 values of T: a wave of 12 of them is a smooth change along T, one of two and a half is none."""
+    at, pressure = (c.ravel() for c in np.meshgrid(np.linspace(200, 1000, 17), [0.2, 1, 5, 20], indexing="ij"))
+    wave = 1 + 0.03 * np.sin(2 * np.pi * at / period)
+    y = 18 * (at / 300) ** 0.7 * wave + 0.1 * np.random.default_rng(7).standard_normal(len(at))
+    base = tc.Simulator(
+        lambda x, p: {"mu": p["mu"] * (x["T"] / 300) ** p["n"] + 0 * x["P"]},
+        [tc.Parameter("mu", low=1, high=100), tc.Parameter("n", low=0.3, high=1.5)],
+    )
+    offset = [term for term in tc.terms.sensor(outputs=("mu",), static=True) if term.name == "offset of mu"]
+    d = diagnose(base, tc.Recording(x={"T": at, "P": pressure}, y={"mu": y}, noise=0.1), offset)
+    assert d.verdict == "unexplained"
+    assert d.where[0].driver == "T"
+    assert any("data at one T share what is left" in row for row in d.symptoms) is told
+
+
 # --- terms in a range that another condition of few levels takes the shape from --------------------------------------
 
 

@@ -33,7 +33,7 @@ from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.judged import Judged
 from torchcal.discovery.misfit.embedded import embed_each, model_error_sd
 from torchcal.discovery.misfit.noise import Noise
-from torchcal.discovery.records import Scores, Table
+from torchcal.discovery.records import Location, Scores, Table
 from torchcal.discovery.verdicts import explain
 from torchcal.discovery.verdicts.decision import Decision
 from torchcal.discovery.verdicts.given import begun_elsewhere, held_otherwise, unbounded
@@ -48,6 +48,8 @@ __all__ = ["Asked", "conclude"]
 
 #: Probability of what is tied from which on its noise is told.
 HALF = 0.5
+#: Share of the misfit that a place removes, from which on what is left along its driver is told there alone.
+LOCATED = 0.9
 #: Power of the stated detection limits.
 POWER = 0.95
 
@@ -118,9 +120,15 @@ def conclude(judged: Judged, asked: Asked, *, interrupted: str = "") -> Diagnosi
         every = () if best is not None else (model.found for model in (*search.models, *search.nameless))
         least = min(every, key=lambda found: found.chi2, default=left)
         apart = [*unbounded(search), *begun_elsewhere(search), *more_than_replicates(search, least), *apart]
-        apart += in_rows(search, least) + (shared(search, least) if decision.verdict != "named" else [])
+        apart += in_rows(search, least)
+    places = [] if decision.verdict == "consistent" else sharpened(search)
+    where: Table[Location] = Table([], ("kind", "target"))
+    if decision.verdict != "consistent":
+        where = locate(search, places, shown, named=best is not None)
     if decision.verdict in ("ambiguous", "unexplained"):
-        apart = [*held_otherwise(search), *apart]
+        # What no candidate does is left of the best of them, and is told where it is located.
+        located = [place.driver for place in where[:1] if place.share >= LOCATED]
+        apart = [*held_otherwise(search), *apart, *shared(search, least, located)]
     remaining, depends = 0.0 if decision.verdict == "consistent" else 1.0, ""
     if best is not None:
         white = best.structure is not None and best.structure.p_value >= PLAINLY_WHITE and not search.exact
@@ -132,14 +140,11 @@ def conclude(judged: Judged, asked: Asked, *, interrupted: str = "") -> Diagnosi
                 more = [name for name in larger.names if name not in best.names]
                 other = explain.estimates(larger.found, larger.found.free)
                 depends = explain.depends(final.estimates, other, more)
-    places = [] if decision.verdict == "consistent" else sharpened(search)
     return Diagnosis(
         verdict=decision.verdict,
         terms=_in_order(search, best) if best else [],
         tied=decision.tied,
-        where=Table([], ("kind", "target"))
-        if decision.verdict == "consistent"
-        else locate(search, places, shown, named=best is not None),
+        where=where,
         ranking=ranking(search, decision, mask),
         detection_limit=limits(search, 1.0 - asked.confidence, POWER, contained),
         remaining=remaining,

@@ -215,8 +215,9 @@ def in_rows(search: Search, found: Fitted) -> list[str]:
     ]
 
 
-def shared(search: Search, found: Fitted) -> list[str]:
-    """Outputs of which data at one value of a condition share what a fit leaves, in words."""
+def shared(search: Search, found: Fitted, located: Sequence[str] = ()) -> list[str]:
+    """Outputs of which data at one value of a condition share what a fit leaves, in words; but for conditions along
+    which the misfit is located."""
     if search.exact:
         return []
     several = len(search.problem.recording.outputs) > 1
@@ -227,6 +228,7 @@ def shared(search: Search, found: Fitted) -> list[str]:
         for name, condition, size in in_common_at(
             found.problem, search.noise.whitening(found.problem).vector(found.residual)
         )
+        if condition not in located
     ]
 
 
