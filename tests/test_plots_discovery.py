@@ -30,7 +30,7 @@ from torchcal.discovery.records import (
 )
 from torchcal.errors import DomainError, ShapeError
 from torchcal.plots import discovery
-from torchcal.plots.discovery import residuals
+from torchcal.plots.discovery import pieces, residuals
 
 F64 = torch.float64
 NASTY = 'a <b>bold</b> & "quoted" $\\foo$ term of a user who writes very long names indeed'
@@ -778,6 +778,30 @@ def test_runs_that_differ_by_less_than_an_sd_are_one_curve(sd, drawn):
     lines = [line for line in ax.lines if not line.get_label().startswith("_")]
     assert [line.get_label() for line in lines] == drawn
     np.testing.assert_allclose(lines[len(lines) // 2].get_xydata(), torch.stack([t, t], -1))
+
+
+def test_no_line_is_drawn_from_one_run_to_a_later_one():
+    first, second = torch.linspace(0, 10, 80, dtype=F64), torch.linspace(20, 30, 80, dtype=F64)
+    time = torch.cat([first, second])
+    missing = MissingRate("equation", "v", "t", time, time.sin(), torch.full((160,), 0.1), "1/s", time, time.sin())
+    (curve,) = [line for line in plots.missing_rate(missing).lines if line.get_label() == "estimate"]
+    assert np.isnan(curve.get_xdata()).nonzero()[0].tolist() == [80]
+    recording = Recording(runs=[Run(t, {"v": t.sin()}, initial={"v": 0.0}) for t in (first, second)])
+    ax = plots.residual_map(recording, torch.zeros(160, dtype=F64), driver="t", values=time)
+    (means,) = [line for line in ax.lines if "local mean" in line.get_label()]
+    (gap,) = np.isnan(means.get_xdata()).nonzero()[0]
+    assert means.get_xdata()[gap - 1] < 10 < 20 < means.get_xdata()[gap + 1]
+
+
+@pytest.mark.parametrize(
+    ("there", "cuts"),
+    [([], []), ([1.5], [2]), ([0.5], []), ([3.5], []), ([1.5, 2.5], [2])],
+)
+def test_a_line_is_broken_where_both_sides_are_lines_still(there, cuts):
+    at = np.arange(5.0)
+    x, y = pieces.broken(at, there, at**2)
+    assert np.isnan(y).nonzero()[0].tolist() == cuts
+    np.testing.assert_array_equal(x[~np.isnan(x)], at)
 
 
 def test_runs_are_whole_numbers():

@@ -26,6 +26,7 @@ LINESPACING = 1.1  # of two lines in one row
 MOST_LETTERS = 44  # of a user's text on a figure
 WORD = 10  # letters of a word that are left out rather than breaking it
 MOST_POINTS = 2000  # drawn in one panel; more cannot be told apart
+HOLE = 8.0  # times the usual step from which on one has nothing between its ends
 
 
 @dataclass(frozen=True)
@@ -298,6 +299,23 @@ def thinned(count: int) -> np.ndarray:
     if count <= MOST_POINTS:
         return np.arange(count)
     return np.linspace(0, count - 1, MOST_POINTS).round().astype(int)
+
+
+def holes(times: np.ndarray) -> list[float]:
+    """Middles of what lies between runs of which none reaches over it, by their times in ascending order."""
+    steps = np.diff(times)
+    usual = np.median(steps[steps > 0]) if (steps > 0).any() else np.inf
+    return [float(0.5 * (times[k] + times[k + 1])) for k in np.flatnonzero(steps > HOLE * usual)]
+
+
+def broken(at: np.ndarray, there: Iterable[float], *curves: np.ndarray) -> list[np.ndarray]:
+    """Abscissae in ascending order and curves, each with a break at some places that leaves two points on either side
+    of it, which make a line."""
+    cuts: list[int] = []
+    for cut in np.searchsorted(at, list(there)).tolist():
+        if cut >= 2 + (cuts[-1] if cuts else 0) and cut <= len(at) - 2:
+            cuts.append(cut)
+    return [np.insert(np.asarray(each, dtype=float), cuts, np.nan) for each in (at, *curves)]
 
 
 def rms(values: np.ndarray) -> float:

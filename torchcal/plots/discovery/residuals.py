@@ -20,9 +20,11 @@ from torchcal.plots.discovery.pieces import (
     Look,
     as_mask,
     as_numbers,
+    broken,
     draw_key,
     finish,
     finite,
+    holes,
     is_log,
     places_of,
     rms,
@@ -188,6 +190,8 @@ def residual_map(
     keep = keep[np.argsort(x[keep], kind="stable")]
     many = len(keep) > 40
     bins = _bins(x, keep, period) if many else []
+    between = holes(x[keep]) if driver in ("t", "time") else []
+    bins = [part for rows in bins for part in np.split(rows, np.searchsorted(x[rows], between)) if len(part)]
     dots = keep[thinned(len(keep))]
     along = "time" if driver == "t" else driver
     outline = [withStroke(linewidth=3.5, foreground="white")] if len(dots) > OPAQUE else []  # or it would hide dots
@@ -203,11 +207,11 @@ def residual_map(
                 zorder=fit.zorder - 3, label=name,
             )  # fmt: skip
         if bins:
-            centers = [np.median(x[rows]) for rows in bins]
-            means = [np.nanmean(residual[rows]) for rows in bins]
+            centers = np.array([np.median(x[rows]) for rows in bins])
+            means = np.array([np.nanmean(residual[rows]) for rows in bins])
             ax.plot(
-                centers, means, color=fit.color, ls=fit.line, lw=1.7, label=fit.name + ", local mean",
-                zorder=fit.zorder, path_effects=outline,
+                *broken(centers, between, means), color=fit.color, ls=fit.line, lw=1.7,
+                label=fit.name + ", local mean", zorder=fit.zorder, path_effects=outline,
             )  # fmt: skip
     if aside.any():
         residual = (y - fits[-1].values)[part] / unit_of

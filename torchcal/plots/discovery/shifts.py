@@ -11,10 +11,12 @@ from torchcal.plots.discovery.pieces import (
     ACCEPTED,
     Look,
     as_numbers,
+    broken,
     draw_key,
     expect,
     finish,
     finite,
+    holes,
     is_log,
     plain,
 )
@@ -122,6 +124,8 @@ def missing_rate(
         alone = len(curves) == 1
         color, dashes = (ACCEPTED, "-") if alone else style.CYCLE[number % len(style.CYCLE)]
         name = "estimate" if alone else f"run {number}" if number < NAMED_RUNS else None
+        if missing.driver == "t":
+            at, height, wide = broken(at, holes(at), height, wide)
         ax.fill_between(
             at, height - 2 * wide, height + 2 * wide, lw=0, zorder=2, color=style.MODEL_ERROR_BAND if alone else color,
             alpha=None if alone else 0.15, label="±2 sd" if number == 0 else None,
