@@ -1,5 +1,6 @@
 """What `diagnose` makes of data without noise, numbers of other packages, and simulators or terms that misbehave."""
 
+import dataclasses
 import math
 import types
 import warnings
@@ -9,6 +10,9 @@ import pytest
 import torch
 
 import torchcal as tc
+from torchcal.discovery.fits.candidates import prepare
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.hypotheses import base as base_of
 from torchcal.discovery.verdicts import decision as decision_of
 from torchcal.errors import ConvergenceWarning, DomainError, SimulatorError
 
@@ -122,6 +126,39 @@ def test_a_rate_that_is_not_finite_is_told_with_its_run():
     heavy = tc.Term("heavy", parameters=[tc.Parameter("q")], **push)
     with pytest.raises(SimulatorError, match=r"term 'heavy' at its neutral.*Got inf.*output 'x' at time = .*, run = 1"):
         tc.diagnose(body, motion, [heavy], progress=False)
+
+
+def emptied():
+    """A tank that would be empty before the end of its run at c = 3: a root of less than nothing."""
+    t = torch.linspace(0, 3, 12, dtype=F64)
+    tank = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"h": -p["c"] * torch.sqrt(s["h"])}, states={"h": "m"},
+        parameters=[tc.Parameter("c", low=0.0, initial=0.1)],
+    )  # fmt: skip
+    data = tc.Recording(runs=[tc.Run(time=t, outputs={"h": (1 - 0.1 * t) ** 2}, initial={"h": 1.0})], noise=0.005)
+    return Problem.of(tank, data)
+
+
+def moved(found):
+    return dataclasses.replace(found, values=torch.tensor([3.0], dtype=F64), warm=None)
+
+
+FINITE = r"the base where its calibration ends, with c = 3\. Got inf for .* of 12 data, first output 'h' at time"
+
+
+def test_a_base_that_is_not_finite_where_its_fit_ends_is_told(monkeypatch):
+    """At the edge of what is finite the last pass of Newton's method may be the last that is."""
+    monkeypatch.setattr(base_of, "_sharpen", lambda found, sd=None: found if sd is None else moved(found))
+    with pytest.raises(SimulatorError, match=FINITE):
+        base_of.calibrate_base(emptied(), {}, 2, 0)
+
+
+def test_no_term_is_blamed_for_what_the_base_alone_does():
+    found, _ = base_of.calibrate_base(emptied(), {}, 2, 0)
+    (offset,) = tc.terms.sensor(outputs=("h",))[:1]
+    assert prepare(found.problem, found, [offset], {}).name == offset.name
+    with pytest.raises(SimulatorError, match=FINITE):
+        prepare(found.problem, moved(found), [offset], {})
 
 
 def test_a_base_that_explains_nothing_is_told_of_where_noise_may_be_all_there_is():

@@ -12,7 +12,7 @@ from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.ranges import NOTHING, Anything, Scale, sized, with_room
 from torchcal.discovery.fits.shapes import driver_values, grid_of_shapes, lies_anywhere, shape_points
-from torchcal.discovery.fits.trial import check_repeats, place_of
+from torchcal.discovery.fits.trial import check_finite, check_repeats, place_of
 from torchcal.errors import SimulatorError, TorchcalError
 from torchcal.simulators import Trajectories, free_parameters, is_value_of
 from torchcal.simulators.static import asks_for_numbers
@@ -278,6 +278,8 @@ def prepare(
     name = " + ".join(term.name for term in terms)
     values = dict(zip([problem.parameters[i].name for i in own], neutral, strict=True))
     if not bool(torch.isfinite(y).all()):
+        for alone in (found, dataclasses.replace(found, warm=None)):  # with other steps a term begins without a guess
+            check_finite(alone)
         bad = (~torch.isfinite(y[0])).nonzero()[:, 0]
         raise SimulatorError(
             f"Expected finite outputs with the term {name!r} at its neutral values {values}. Got {float(y[0, bad[0]])} "

@@ -1,16 +1,17 @@
-"""What is asked of a simulator or a term before long work: that it repeats itself, and is fast and exact enough."""
+"""What is asked of a simulator or a term before long work: that it repeats itself, is finite, fast and exact enough."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
 
+from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.problem import Problem
 from torchcal.errors import SimulatorError, SurrogateWarning, TorchcalWarning, warn
 from torchcal.simulators import ExternalSimulator, PolynomialSurrogate
 
-__all__ = ["check_repeats", "place_of", "warn_if_coarse", "warn_if_long"]
+__all__ = ["check_finite", "check_repeats", "place_of", "point_of", "warn_if_coarse", "warn_if_long"]
 
 #: Difference of two evaluations, relative to the largest output, up to which a simulator repeats itself.
 JITTER = 1e-4
@@ -19,6 +20,25 @@ JITTER = 1e-4
 EVALUATIONS, LONG = (1000, 10000), 120.0
 #: Error of a surrogate, in the noise sd, from which on it may be what is found.
 COARSE = 0.5
+
+
+def check_finite(found: Fitted) -> None:
+    """Raise if the base's outputs are not finite where its calibration ends: that may be at an edge of what is.
+
+    Raises:
+        SimulatorError: If they are not.
+    """
+    problem = found.problem
+    y = problem.evaluate(found.values[None], [], found.warm)[0][0]
+    bad = (~torch.isfinite(y)).nonzero()[:, 0]
+    if len(bad):
+        raise SimulatorError(
+            f"Expected finite outputs of the base where its calibration ends, with "
+            f"{point_of(problem, found.values, found.free)}. Got {float(y[bad[0]])} for {len(bad)} of {problem.n} "
+            f"data, first {place_of(problem, int(bad[0]))} (that is the base alone, without any candidate: keep its "
+            "logarithms, roots and quotients finite wherever its states may go, as in torch.sqrt(h.clamp_min(1e-9)), "
+            "or give its parameters bounds within which it is finite)."
+        )
 
 
 def check_repeats(problem: Problem, values: Tensor, what: str = "the simulator") -> None:
@@ -91,6 +111,11 @@ def warn_if_coarse(problem: Problem) -> None:
             "error. Raise its order=, narrow its box, or add the error to the noise.",
             SurrogateWarning,
         )
+
+
+def point_of(problem: Problem, values: Tensor, free: Sequence[int]) -> str:
+    """Some parameters by their places with their values ``(P,)``, in words."""
+    return ", ".join(f"{problem.parameters[i].name} = {float(values[i]):.3g}" for i in free)
 
 
 def place_of(problem: Problem, k: int) -> str:

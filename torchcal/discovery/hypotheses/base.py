@@ -12,6 +12,7 @@ from torchcal.discovery.fits.fitting import Fitted, fit, refit
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.sharpen import SOLVER_SHARE, sharpen
 from torchcal.discovery.fits.starts import follow_slopes, starts
+from torchcal.discovery.fits.trial import check_finite, point_of
 from torchcal.discovery.misfit.growth import growth
 from torchcal.discovery.misfit.noise import Noise, estimate
 from torchcal.discovery.misfit.outliers import spikes
@@ -64,7 +65,7 @@ def calibrate_base(
 
     Raises:
         ConvergenceError: If no starting value gives finite outputs.
-        SimulatorError: If the solution does not settle when time steps are halved.
+        SimulatorError: If the solution does not settle when time steps are halved, or is not finite where the fit ends.
     """
     recording = problem.recording
     exact = isinstance(recording.noise, str)
@@ -77,7 +78,7 @@ def calibrate_base(
     if found is None:
         raise ConvergenceError(
             f"Expected finite outputs of the base at one of {num_starts} starting values at least. Got none, the first "
-            f"with {_point(problem, begin[0], free)}. Give initial= near the truth, or bounds, to the parameters (a "
+            f"with {point_of(problem, begin[0], free)}. Give initial= near the truth, or bounds, to the parameters (a "
             "rate is about 1 over the time in which something happens), and look at the runs' initial values."
         )
     found = _unwound(_sharpen(found))
@@ -106,6 +107,8 @@ def calibrate_base(
             noise = _without_memory(noise, away)
             remembering = refit(base, noise.whitening(base.problem))
         base = _sharpen(remembering, noise.sd)
+    if isinstance(base.problem.simulator, Trajectories):  # Newton's method may end where the next pass is infinite
+        check_finite(base)
     return base, noise
 
 
@@ -290,10 +293,6 @@ def _sharpen(found: Fitted, sd: Tensor | None = None) -> Fitted:
         return found
     raise SimulatorError(
         "Expected the solution to settle when time steps are halved. Got a change of "
-        f"{error:.3g} after {HALVED} times, with {_point(found.problem, found.values, found.free)} (a discontinuous "
+        f"{error:.3g} after {HALVED} times, with {point_of(found.problem, found.values, found.free)} (a discontinuous "
         "model: smooth it, or give max_step=; or a fit that an initial= far from the truth led astray)."
     )
-
-
-def _point(problem: Problem, values: Tensor, free: list[int]) -> str:
-    return ", ".join(f"{problem.parameters[i].name} = {float(values[i]):.3g}" for i in free)
