@@ -619,6 +619,17 @@ def test_rates_that_cannot_be_used_are_told_at_once(rates, message: str) -> None
         bound.check(bound.x, tries)
 
 
+def test_a_name_that_an_output_asks_for_in_vain_is_told_with_what_there_is() -> None:
+    model = tc.ODESimulator(
+        lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"]}, {"x": None, "v": None}, [tc.Parameter("k")],
+        observe={"x": lambda t, s, p, u: s["x"] + u["g"]},
+    )  # fmt: skip
+    bound = model.bind(short_recording())
+    there = r"no 'g' among states \['x', 'v'\], .*Run\(inputs="
+    with pytest.raises(SimulatorError, match=f"output 'x'.*KeyError: 'g'.*{there}"):
+        bound.at(bound.x)(torch.ones(len(bound.names), dtype=F64))
+
+
 def test_good_rates_pass_the_check() -> None:
     bound = oscillator().bind(tc.Recording(runs=[run_of(np.linspace(0, 2, 7), {"x": 1.0})]))
     assert bound.check(bound.x, tensor(4.0, 0.2, 0.0).expand(4, -1)) == 7

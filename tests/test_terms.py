@@ -344,6 +344,15 @@ def test_a_term_that_returns_no_tensor_is_blamed_by_name(static: bool, where: di
         run()
 
 
+@pytest.mark.parametrize("where", [{"rates": "v"}, {"outputs": "x"}, {"shifts": "k"}])
+def test_a_name_that_a_term_in_time_asks_for_in_vain_is_told_with_what_there_is(where: dict[str, str]) -> None:
+    kinds: dict[str, Any] = {kind: {place: lambda t, s, p, u, *y: u["w"]} for kind, place in where.items()}
+    term = tc.Term("blown", parameters=[tc.Parameter("e")], **kinds)
+    there = r"no 'w' among states \['x', 'v'\], parameters \['k'.*'e'\] and inputs \['f'\].*Run\(inputs=\.\.\.\)"
+    with pytest.raises(SimulatorError, match=f"'blown'. One of them raised KeyError: 'w'.*{there}"):
+        outputs(extend(body(), [term]), **{"blown.e": 0.0})
+
+
 def test_a_term_may_return_a_table_or_a_number_of_numpy() -> None:
     for returned in (np.full(3, 0.5), np.float32(0.5), np.int64(2)):
         term = tc.Term("table", shifts={"m": lambda x, p, r=returned: r}, parameters=[tc.Parameter("e")])

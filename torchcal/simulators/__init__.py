@@ -1,7 +1,7 @@
 """Simulators: parameters, models written in torch, external codes, polynomial surrogates."""
 
 from torchcal.simulators.build import build_surrogate
-from torchcal.simulators.careful import careful
+from torchcal.simulators.careful import careful, unknown_name
 from torchcal.simulators.design import Evaluations
 from torchcal.simulators.external import ExternalSimulator
 from torchcal.simulators.held_out import HeldOutError
@@ -65,5 +65,6 @@ __all__ = [
     "settled",
     "settled_implicitly",
     "step_errors",
+    "unknown_name",
     "workable",
 ]

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchcal.errors import SimulatorError
 from torchcal.simulators.dual import transformed
 
-__all__ = ["careful", "real"]
+__all__ = ["careful", "real", "unknown_name"]
 
 
 def careful(seen: set[int], what: str, function: Callable[..., Any], **given: Any) -> Any:
@@ -81,6 +81,16 @@ def real(value: Any, like: Tensor, shape: torch.Size, what: str) -> Tensor:
         raise SimulatorError(
             f"Expected {what} of shape {tuple(shape)}. Got {tuple(value.shape)} (write it elementwise)."
         ) from error
+
+
+def unknown_name(error: Exception, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> str:
+    """What there is beside a name that a function in time asked for in vain, in a sentence; empty for other errors."""
+    if not isinstance(error, KeyError) or not error.args or any(error.args[0] in given for given in (s, p, u)):
+        return ""
+    return (
+        f" There is no {error.args[0]!r} among states {list(s)}, parameters {list(p)} and inputs {list(u)} (inputs "
+        "come with the runs, Run(inputs=...))."
+    )
 
 
 def _copied(value: Any) -> Any:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchcal.display import raised
 from torchcal.errors import SimulatorError, TorchcalError
-from torchcal.simulators.careful import careful, real
+from torchcal.simulators.careful import careful, real, unknown_name
 from torchcal.simulators.grid import Grid
 from torchcal.simulators.layout import Layout, Values
 from torchcal.simulators.parameter import spans
@@ -245,12 +245,7 @@ def _advice(error: Exception, s: Mapping[str, Any], p: Mapping[str, Any], u: Map
             " Use torch functions on t, s, p and u, and torch.where for if: values of many points come at once, with "
             "gradients."
         )
-    if not isinstance(error, KeyError) or not error.args or any(error.args[0] in given for given in (s, p, u)):
-        return ""
-    return (
-        f" There is no {error.args[0]!r} among states {list(s)}, parameters {list(p)} and inputs {list(u)} (inputs "
-        "come with the runs, Run(inputs=...))."
-    )
+    return unknown_name(error, s, p, u)
 
 
 def _ended(states: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchcal.data import Recording
 from torchcal.display import raised
 from torchcal.errors import DomainError, RecordingError, SimulatorError
-from torchcal.simulators.careful import careful, real
+from torchcal.simulators.careful import careful, real, unknown_name
 from torchcal.simulators.grid import Grid
 from torchcal.simulators.implicit import ImplicitSteps
 from torchcal.simulators.layout import Layout
@@ -356,6 +356,7 @@ class Trajectories(Simulator):
             except Exception as error:
                 raise SimulatorError(
                     f"Expected the output {name!r} as a tensor. Its function raised {raised(error)}."
+                    f"{unknown_name(error, s, p, self.grid.sample_u)}"
                 ) from error
             parts.append(real(value, seen, seen.shape[:-1], f"the output {name!r}"))
         return torch.cat(parts, dim=-1)

@@ -19,6 +19,7 @@ from torchcal.simulators import (
     careful,
     is_value_of,
     nameless_advice,
+    unknown_name,
 )
 
 __all__ = ["Term", "neutral_of", "outer"]
@@ -296,7 +297,7 @@ class Term:
         except TorchcalError:
             raise
         except Exception as error:
-            advice = nameless_advice(error, given[0]) if letters[0] == "x" else ""
+            advice = nameless_advice(error, given[0]) if letters[0] == "x" else unknown_name(error, *given[1:4])
             if asks_for_numbers(error):
                 advice = (
                     " Use torch functions on them, without .detach(), and torch.where for if: derivatives are needed."
