@@ -560,6 +560,35 @@ def test_what_only_a_combination_tells_has_no_sd_of_its_own():
     assert told == ["a = 2 (not determined)", "b = 3 (not determined)", "c = 1 ± 0.1"]
 
 
+@pytest.mark.parametrize("noise", [None, 0.01])
+def test_an_estimate_that_is_zero_but_for_rounding_keeps_its_sd(noise):
+    """What rounding leaves of it is no size that an sd could be large beside."""
+    x = torch.arange(20, dtype=F64)
+    curve = tc.Simulator(
+        lambda x, p: p["a"] + p["b"] * x + p["c"] * x**2, [tc.Parameter(name, initial=1.0) for name in "abc"]
+    )
+    d = tc.diagnose(curve, tc.Recording(x=x, y=x**2, noise=noise), [], progress=False)
+    a, b, c = d.base.estimates
+    assert abs(a.value) + abs(b.value) < 1e-9
+    assert 0 < c.sd < b.sd < a.sd < 0.01
+    assert "not determined" not in str(d)
+
+
+@pytest.mark.parametrize(("value", "sd", "slope"), [(1e-5, 1e38, 1e-40), (0.0, 1e150, 0.0), (100.0, 3e6, 0.0)])
+def test_an_estimate_that_moves_no_datum_is_not_determined(value, sd, slope):
+    """As a time constant far below the first sample."""
+    found = SimpleNamespace(
+        values=torch.tensor([value], dtype=F64), free=[0], at_bound=torch.zeros(1, dtype=torch.bool),
+        sd=lambda: torch.tensor([sd], dtype=F64), jacobian=torch.full((5, 1), slope, dtype=F64),
+        whitening=lambda values: values,
+        problem=SimpleNamespace(
+            parameters=[tc.Parameter("tau", initial=100.0)], in_time=True, index=torch.arange(5),
+            recording=SimpleNamespace(noise=None, spread=torch.ones(5, dtype=F64)),
+        ),
+    )  # fmt: skip
+    assert str(explain.estimates(found, [0])[0]).endswith("(not determined)")
+
+
 def test_what_is_hardly_told_apart_keeps_its_sd():
     """As a slope far from where its line begins."""
     x = torch.linspace(1000, 1001, 60, dtype=F64)

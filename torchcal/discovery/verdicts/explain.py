@@ -41,6 +41,9 @@ UNSEEN = 1e-6
 ROUNDED = 1e-12
 #: Share of an estimate from which on its sd is so large that it may be told in a combination only.
 LOOSE = 0.1
+#: How many times the size of a parameter an sd must be to say that the data do not determine it; and the share of the
+#: data's spread up to which what an estimate does to them is rounding.
+BEYOND, NOTHING = 1e5, 1e-6
 #: Correlation of what two candidates do from which on they are nearly the same, and log evidence by which refits tell
 #: them apart all the same.
 NEARLY = 0.99
@@ -67,13 +70,14 @@ def estimates(
 ) -> tuple[Estimate, ...]:
     """Estimates of some parameters, with their intervals where there are any. Without noise the misfit takes its place.
 
-    An sd beyond what the bounds allow, or far beyond the estimate, says that the data do not determine it, as does a
-    combination with others that moves no datum, whose sd is rounding. Where the edge of a static window is a step, its
-    end is known by the gaps between data that it may lie in.
+    An sd beyond what the bounds allow, or far beyond the parameter's size, says that the data do not determine it, as
+    does no effect at all, or a combination with others that moves no datum, whose sd is rounding. Where the edge of a
+    static window is a step, its end is known by the gaps between data that it may lie in.
     """
     sd = stated_sd(found)
     loose = _loose(found)
-    combined = {name for group in _untold(found, ROUNDED)[1] for name in group}
+    unseen, groups = _untold(found, ROUNDED)
+    combined = {name for group in groups for name in group}
     bound = {i for i, at in zip(found.free, found.at_bound.tolist(), strict=True) if at}
     result = []
     for i in places:
@@ -85,11 +89,23 @@ def estimates(
         if window is not None and not found.problem.in_time and q.name.endswith(tuple(ENDS.values())):
             spread = _stepped_sd(found, i, window, spread)
         allowed = math.inf if q.low is None or q.high is None else q.high - q.low
-        if spread > min(1e5 * abs(value) or math.inf, allowed) or (q.name in combined and bool(loose[i])):
+        far = spread > allowed or (spread > BEYOND * abs(value) and spread > BEYOND * _size(found, i))
+        if far or q.name in unseen or (q.name in combined and bool(loose[i])):
             spread = math.inf
         at_bound = i in bound or (i in found.free and value in (q.low, q.high) and not is_window(q.name))
         result.append(Estimate(q.name, value, spread, unit, at_bound, (intervals or {}).get(i)))
     return tuple(result)
+
+
+def _size(found: Fitted, i: int) -> float:
+    """Size of a free parameter: its estimate's, and of one that is 0 but for rounding that of its first guess, or 1."""
+    value, first = abs(float(found.values[i])), found.problem.parameters[i].initial
+    if value:
+        problem = found.problem
+        moved = value * found.jacobian[:, found.free.index(i)].abs()
+        if bool((moved > NOTHING * problem.recording.spread[problem.index]).any()):
+            return value
+    return max(value, abs(first or 1.0))
 
 
 def stated_sd(found: Fitted) -> Tensor:
