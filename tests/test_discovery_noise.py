@@ -322,6 +322,21 @@ def test_two_neighbours_alone_that_are_set_aside_are_told(noise):
     assert not [line for line in d.symptoms if "neighbours" in line]
 
 
+@pytest.mark.parametrize(("count", "apart", "chance"), [(12, [], "0.15"), (16, [], "0.12"), (16, [3], None)])
+def test_two_neighbours_of_few_data_that_are_set_aside_are_told_unless_there_are_other_outliers(count, apart, chance):
+    x = torch.linspace(0, 1, count, dtype=F64)
+    y = 1 + 2 * x + draw(count, 0.1, 1)
+    y[[count // 2, count // 2 + 1, *apart]] -= 2.0  # 20 sd
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    d = tc.diagnose(line, tc.Recording(x=x, y=y, noise=0.1), [], seed=0, progress=False)
+    assert d.set_aside.nonzero()[:, 0].tolist() == sorted([count // 2, count // 2 + 1, *apart])
+    told = [line for line in d.symptoms if "two that were set aside as outliers are neighbours" in line]
+    assert len(told) == (not apart)
+    if told:
+        assert f"probability of {chance}, and there are no others. Something short may act there" in told[0]
+        assert str(d).startswith("Verdict: consistent (nothing is surely missing)")
+
+
 def test_what_begins_or_ends_steeply_is_no_outlier():
     x = torch.linspace(0, 1, 80, dtype=F64)
     for tau in (0.03, 0.05, 0.1):

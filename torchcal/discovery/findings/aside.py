@@ -16,7 +16,8 @@ CHANCE = 0.1
 
 
 def side_by_side(problem: Problem, off: Tensor, aside: Tensor) -> list[str]:
-    """Outliers that are neighbours, and on the same side, where that is hardly chance (`chance_of_pairs`).
+    """Outliers that are neighbours, and on the same side, where that is hardly chance (`chance_of_pairs`), or no others
+    tell that this recording has any: two of few data are easily neighbours, however far they are off.
 
     Neighbours are those in time, along the only condition, or along one of several where the others are the same.
 
@@ -37,14 +38,16 @@ def side_by_side(problem: Problem, off: Tensor, aside: Tensor) -> list[str]:
     # 1 of data in one row; replicates are no neighbours.
     ways = sum(int((at[places].diff() != 0).sum()) for places, at in curves) / max(problem.n - 1, 1)
     chance = chance_of_pairs(len(pairs), above, below, problem.n, ways)
-    if chance >= CHANCE:
+    others = int(aside.sum()) > len({k for pair in pairs for k in pair})
+    if chance >= CHANCE and others:
         return []
     first, second = max(pairs, key=lambda pair: float(far[list(pair)].abs().min()))
+    alone = ", and there are no others" if chance >= CHANCE else ""
     return [
         f"two that were set aside as outliers are neighbours, {place_of(problem, first)} and "
         f"{place_of(problem, second)}, off by {float(far[first]):+.1f} and {float(far[second]):+.1f} noise sd: "
-        f"outliers are so by chance with a probability of {chance:.2g}. Something short may act there; repeat them, or "
-        "record more densely there"
+        f"outliers are so by chance with a probability of {chance:.2g}{alone}. Something short may act there; repeat "
+        "them, or record more densely there"
     ]
 
 
