@@ -104,6 +104,28 @@ def test_a_fit_in_a_side_valley_is_no_end(seed):
     assert rise(high) == pytest.approx(SIDES**2, rel=0.05)
 
 
+@pytest.mark.parametrize("seed", [1, 10, 11])
+def test_an_end_that_another_valley_refutes_is_sought_farther(seed):
+    """Of two decays the first may take the place of the second: fits from the best one do not see it."""
+
+    def model(x, p):
+        return p["a"] * torch.exp(-p["k"] * x) + p["b"] * torch.exp(-p["m"] * x)
+
+    truth = {"a": 1.0, "k": 0.3, "b": 1.5, "m": 1.0}
+    noise = 0.05 * torch.randn(40, generator=torch.Generator().manual_seed(seed), dtype=F64)
+    y = model(X, {name: torch.tensor(value, dtype=F64) for name, value in truth.items()}) + noise
+    parameters = [tc.Parameter(name, initial=value) for name, value in truth.items()]
+    problem = Problem.of(tc.Simulator(model, parameters), tc.Recording(x=X, y=y, noise=0.05))
+    whitening = problem.whitening(torch.full_like(y, 0.05), torch.zeros(1, dtype=F64))
+    found = fit(problem, whitening, torch.tensor([[*truth.values()]], dtype=F64), [0, 1, 2, 3])
+    rates = np.concatenate([np.linspace(-2, 0, 60), np.geomspace(0.01, 60, 500)])
+    waves, data = np.exp(-rates[:, None] * X.numpy()), y.numpy()
+    for end in by_profile(found, [2])[2]:
+        left = data - end * waves  # the other decay at any rate, by linear least squares
+        chi2 = (left**2).sum(1)[:, None] - (left @ waves.T) ** 2 / (waves**2).sum(1)
+        assert math.sqrt(chi2.min() / 0.05**2 - found.chi2) == pytest.approx(SIDES, abs=0.1)
+
+
 @pytest.mark.parametrize(
     ("rise", "where"),
     [

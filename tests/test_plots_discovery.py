@@ -794,6 +794,31 @@ def test_no_line_is_drawn_from_one_run_to_a_later_one():
 
 
 @pytest.mark.parametrize(
+    ("spans", "found"),
+    [([], []), ([(0, 9)], []), ([(20, 30), (0, 10)], [15.0]), ([(0, 10), (9, 30), (1, 5), (32, 40)], [31.0])],
+)
+def test_a_hole_is_where_no_run_reaches(spans, found):
+    assert pieces.holes(spans) == found
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        torch.logspace(-2, 2, 120, dtype=F64),
+        torch.cat([torch.linspace(0, 1, 80, dtype=F64), torch.linspace(2, 80, 79, dtype=F64)]),
+    ],
+)
+def test_one_run_of_uneven_samples_is_one_line(times):
+    missing = MissingRate("equation", "v", "t", times, times.sin(), torch.full_like(times, 0.1), "1/s", times, times)
+    (curve,) = [line for line in plots.missing_rate(missing).lines if line.get_label() == "estimate"]
+    assert np.isfinite(curve.get_xdata()).all()
+    recording = Recording(runs=[Run(times, {"v": times.sin()}, initial={"v": 0.0})])
+    ax = plots.residual_map(recording, torch.zeros_like(times), driver="t", values=times)
+    (means,) = [line for line in ax.lines if "local mean" in line.get_label()]
+    assert np.isfinite(means.get_xdata()).all()
+
+
+@pytest.mark.parametrize(
     ("there", "cuts"),
     [([], []), ([1.5], [2]), ([0.5], []), ([3.5], []), ([1.5, 2.5], [2])],
 )

@@ -4,6 +4,7 @@ import dataclasses
 import math
 import time
 
+import torch
 from torch import Tensor
 
 from torchcal.data import Recording
@@ -26,6 +27,7 @@ from torchcal.discovery.findings.symptoms import (
 )
 from torchcal.discovery.findings.where import locate, missing_rate, needed_shifts, sharpened
 from torchcal.discovery.fits.fitting import Fitted
+from torchcal.discovery.fits.trial import check_finite
 from torchcal.discovery.hypotheses import verify
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.own_noise import beside
@@ -33,7 +35,7 @@ from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.judged import Judged
 from torchcal.discovery.misfit.embedded import embed_each, model_error_sd
 from torchcal.discovery.misfit.noise import Noise
-from torchcal.discovery.records import Location, Scores, Table
+from torchcal.discovery.records import Scores, Table
 from torchcal.discovery.verdicts import explain
 from torchcal.discovery.verdicts.decision import Decision
 from torchcal.discovery.verdicts.given import begun_elsewhere, held_otherwise, unbounded
@@ -48,8 +50,6 @@ __all__ = ["Asked", "conclude"]
 
 #: Probability of what is tied from which on its noise is told.
 HALF = 0.5
-#: Share of the misfit that a place removes, from which on what is left along its driver is told there alone.
-LOCATED = 0.9
 #: Power of the stated detection limits.
 POWER = 0.95
 
@@ -86,6 +86,8 @@ def conclude(judged: Judged, asked: Asked, *, interrupted: str = "") -> Diagnosi
         interrupted: In words, or empty.
     """
     search, decision, mask = judged.search, judged.decision, judged.mask
+    if not bool(torch.isfinite(search.base.y).all()):
+        check_finite(search.base)
     best = decision.best
     if best is not None and (found := explain.deeper(search, best)) is not None:
         best.found, best.structure, best.residual = found, None, None
@@ -122,13 +124,8 @@ def conclude(judged: Judged, asked: Asked, *, interrupted: str = "") -> Diagnosi
         apart = [*unbounded(search), *begun_elsewhere(search), *more_than_replicates(search, least), *apart]
         apart += in_rows(search, least)
     places = [] if decision.verdict == "consistent" else sharpened(search)
-    where: Table[Location] = Table([], ("kind", "target"))
-    if decision.verdict != "consistent":
-        where = locate(search, places, shown, named=best is not None)
     if decision.verdict in ("ambiguous", "unexplained"):
-        # What no candidate does is left of the best of them, and is told where it is located.
-        located = [place.driver for place in where[:1] if place.share >= LOCATED]
-        apart = [*held_otherwise(search), *apart, *shared(search, least, located)]
+        apart = [*held_otherwise(search), *apart, *shared(search, least, places)]
     remaining, depends = 0.0 if decision.verdict == "consistent" else 1.0, ""
     if best is not None:
         white = best.structure is not None and best.structure.p_value >= PLAINLY_WHITE and not search.exact
@@ -144,7 +141,9 @@ def conclude(judged: Judged, asked: Asked, *, interrupted: str = "") -> Diagnosi
         verdict=decision.verdict,
         terms=_in_order(search, best) if best else [],
         tied=decision.tied,
-        where=where,
+        where=Table([], ("kind", "target"))
+        if decision.verdict == "consistent"
+        else locate(search, places, shown, named=best is not None),
         ranking=ranking(search, decision, mask),
         detection_limit=limits(search, 1.0 - asked.confidence, POWER, contained),
         remaining=remaining,

@@ -78,8 +78,8 @@ def refit_several(search: Search) -> None:
     best = max(fitted, key=lambda m: m.weight)
     if search.examine(best).p_value < 0.01 or search.exact:
         third = math.log(0.2 * PRIOR["several"] / (count * (count - 1) * max(count - 2, 1) / 6))
-        more = [j for j in _next_terms(search, best, THIRD) if _distinct(search, [(*best.numbers, j)])]
-        search.models += _refitted(search, [_with_third(search, best, j, third) for j in more])
+        more = _distinct(search, [(*best.numbers, j) for j in _next_terms(search, best, THIRD)])
+        search.models += _refitted(search, [_with_third(search, best, j, third) for *_, j in more])
         leader = search.physical_leader
         if leader is not None and len(leader.numbers) == 3:
             _one_fewer(search, leader, prior)

@@ -85,11 +85,12 @@ def real(value: Any, like: Tensor, shape: torch.Size, what: str) -> Tensor:
 
 def unknown_name(error: Exception, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> str:
     """What there is beside a name that a function in time asked for in vain, in a sentence; empty for other errors."""
-    if not isinstance(error, KeyError) or not error.args or any(error.args[0] in given for given in (s, p, u)):
+    name = error.args[0] if isinstance(error, KeyError) and error.args else None
+    if not isinstance(name, str) or any(name in given for given in (s, p, u)):
         return ""
     return (
-        f" There is no {error.args[0]!r} among states {list(s)}, parameters {list(p)} and inputs {list(u)} (inputs "
-        "come with the runs, Run(inputs=...))."
+        f" There is no {name!r} among states {list(s)}, parameters {list(p)} and inputs {list(u)} (inputs come with "
+        "the runs, Run(inputs=...))."
     )
 
 

@@ -42,7 +42,7 @@ def side_by_side(problem: Problem, off: Tensor, aside: Tensor) -> list[str]:
     if chance >= CHANCE and others:
         return []
     first, second = max(pairs, key=lambda pair: float(far[list(pair)].abs().min()))
-    alone = ", and there are no others" if chance >= CHANCE else ""
+    alone = ", and there are no others" if int(aside.sum()) == 2 else ""
     return [
         f"two that were set aside as outliers are neighbours, {place_of(problem, first)} and "
         f"{place_of(problem, second)}, off by {float(far[first]):+.1f} and {float(far[second]):+.1f} noise sd: "

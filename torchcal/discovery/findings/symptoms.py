@@ -11,6 +11,7 @@ from torchcal.discovery.fits.problem import SWEEP, Problem, breaks, remembered
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.noise import GRID, LEAST, decorrelated, estimate
+from torchcal.discovery.misfit.places import Place
 from torchcal.discovery.misfit.replicates import goes_on_along, in_common_at
 from torchcal.discovery.verdicts.doubts import ALONG, along_rows, between_outputs, goes_on
 from torchcal.discovery.verdicts.explain import estimates, stated_sd
@@ -35,6 +36,8 @@ COMPARED, UNLIKE, RATIO = 12, 0.01, 2.0
 #: Times what replicates tell of the noise that means of conditions scatter by, from which on that is told where these
 #: are in no order; levels of a condition that it takes; and how rarely chance may scatter them so.
 SCATTER, MEANS, RARELY = 1.5, 8, 0.005
+#: Share of the misfit that a change removes, from which on what it leaves is what is left.
+NEARLY_ALL = 0.9
 #: How rarely noise of each output may go together by chance as much as what is left of two.
 SELDOM = 0.001
 
@@ -215,12 +218,13 @@ def in_rows(search: Search, found: Fitted) -> list[str]:
     ]
 
 
-def shared(search: Search, found: Fitted, located: Sequence[str] = ()) -> list[str]:
-    """Outputs of which data at one value of a condition share what a fit leaves, in words; but for conditions along
-    which the misfit is located."""
+def shared(search: Search, found: Fitted, places: Sequence[Place] = ()) -> list[str]:
+    """Outputs of which data at one value of a condition share what a fit leaves, in words; but for those of which a
+    smooth change along that condition, which is told as the place of the misfit, would leave nothing shared."""
     if search.exact:
         return []
     several = len(search.problem.recording.outputs) > 1
+    located = _located(search, places)
     return [
         f"data at one {condition} share what is left{f' of {name}' if several else ''}, {size:.1f} times what they "
         f"differ by, in no order along {condition}: that is no noise of each datum, but something faster than the "
@@ -228,8 +232,20 @@ def shared(search: Search, found: Fitted, located: Sequence[str] = ()) -> list[s
         for name, condition, size in in_common_at(
             found.problem, search.noise.whitening(found.problem).vector(found.residual)
         )
-        if condition not in located
+        if (name, condition) not in located
     ]
+
+
+def _located(search: Search, places: Sequence[Place]) -> set[tuple[str, str]]:
+    """Outputs, and conditions along which a smooth change removes nearly all of the misfit, and leaves nothing of these
+    outputs that data at one value share."""
+    residual, found = search.residual, set[tuple[str, str]]()
+    for place in places:
+        if place.share >= NEARLY_ALL:
+            left = residual.e - residual.tangent(place.channel.response(place.profile[:, None]))[:, 0]
+            still = {(name, condition) for name, condition, _ in in_common_at(search.base.problem, left)}
+            found |= {(name, place.driver) for name in search.problem.recording.outputs} - still
+    return found
 
 
 def along(search: Search, found: Fitted) -> list[str]:

@@ -25,6 +25,8 @@ COARSE = 0.5
 def check_finite(found: Fitted) -> None:
     """Raise if the base's outputs are not finite where its calibration ends: that may be at an edge of what is.
 
+    Newton's method may end where they are finite, and the next pass is not.
+
     Raises:
         SimulatorError: If they are not.
     """

@@ -158,16 +158,17 @@ class Lines:
         ``(n, B)``, ``(sizes, m)``; and of every run the waves ``(m, data, 2)`` and their products with themselves and
         with the residuals, ``(m, 2, 2)`` and ``(m, 2, B)``."""
         near, one = self._around(number), torch.eye(2, dtype=torch.float64)
+        prior = torch.tensor([self._variance(size) for size in sizes.tolist()], dtype=torch.float64)
+        prior = prior[:, None, None, None]
         logs, found = torch.zeros(len(sizes), len(near), dtype=torch.float64), []
         for places, _ in self.parts:
             angle = 2 * math.pi * near[:, None] * self.along[places]
             design = torch.stack([angle.cos(), angle.sin()], dim=-1)
             gram, products = design.mT @ design, design.mT @ residuals[places]
-            for k, size in enumerate(sizes.tolist()):
-                prior = self._variance(size)
-                amplitudes = torch.linalg.solve(gram + one / prior, products[..., :1])
-                gain = (products[..., :1] * amplitudes).sum((1, 2))
-                logs[k] += 0.5 * (gain - torch.logdet(one + prior * gram))
+            inner = one + prior * gram  # (sizes, frequencies, 2, 2)
+            first = products[..., :1]
+            gain = (first * torch.linalg.solve(inner, prior * first)).sum((2, 3))
+            logs += 0.5 * (gain - torch.logdet(inner))
             found.append((design, gram, products))
         return logs, found
 

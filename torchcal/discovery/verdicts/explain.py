@@ -23,6 +23,7 @@ __all__ = [
     "estimates",
     "fit_record",
     "identifiability",
+    "is_open",
     "misfit_size",
     "one_law",
     "other_minima",
@@ -89,12 +90,16 @@ def estimates(
         if window is not None and not found.problem.in_time and q.name.endswith(tuple(ENDS.values())):
             spread = _stepped_sd(found, i, window, spread)
         allowed = math.inf if q.low is None or q.high is None else q.high - q.low
-        far = spread > allowed or (spread > BEYOND * abs(value) and spread > BEYOND * _size(found, i))
-        if far or q.name in unseen or (q.name in combined and bool(loose[i])):
+        if spread > allowed or is_open(found, i, spread) or q.name in unseen or (q.name in combined and bool(loose[i])):
             spread = math.inf
         at_bound = i in bound or (i in found.free and value in (q.low, q.high) and not is_window(q.name))
         result.append(Estimate(q.name, value, spread, unit, at_bound, (intervals or {}).get(i)))
     return tuple(result)
+
+
+def is_open(found: Fitted, i: int, sd: float) -> bool:
+    """Whether the data do not determine a free parameter, by the sd of its estimate."""
+    return sd > BEYOND * abs(float(found.values[i])) and sd > BEYOND * _size(found, i)
 
 
 def _size(found: Fitted, i: int) -> float:

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchcal.discovery.fits.fitting import FINISH, MAX_STEPS, Fitted, fit
 from torchcal.discovery.fits.local import is_window
 from torchcal.discovery.fits.starts import starts
+from torchcal.discovery.verdicts.explain import is_open
 from torchcal.errors import SimulatorError
 
 __all__ = ["by_profile"]
@@ -23,8 +24,9 @@ FITS, STEPS, STRETCH = 14, 30, 4.0
 #: How near the points within and beyond an end lie where the rise jumps between them, as a share of its distance; and
 #: points in a row on one side of it, after which the next is the middle.
 JUMP, IN_A_ROW = 0.02, 2
-#: How many times as far as the farthest point known to be within may that beyond be which stands for an end in the end.
-ROUGH = 1.3
+#: How many times as far as the farthest point known to be within may that beyond be which stands for an end in the end;
+#: and points in a row within it after which it is open.
+ROUGH, OPEN = 1.3, 5
 #: A rise that is none, and one that is more than any.
 TINY, HUGE = 1e-6, 1e3
 #: Power of the distance that the rise grows with at least, to be followed: else it is as good as flat.
@@ -47,6 +49,7 @@ class _End:
         wall: Of the parameter's bound.
         values: All parameters ``(P,)`` at the farthest point known to be within the interval.
         last: The same at the last point.
+        outside: The same at the nearest point known to be beyond the interval.
         rise: Root of the rise of χ² at the last point.
         within: Distance of the farthest point known to be within the interval, with its rise.
         beyond: That of the nearest one known to be beyond it, with its rise.
@@ -62,19 +65,24 @@ class _End:
     rise: float = math.nan
     within: tuple[float, float] | None = None
     beyond: tuple[float, float] | None = None
+    outside: Tensor | None = None
     in_a_row: int = 0
     ended: bool = False
 
     @property
     def distance(self) -> float | None:
-        """Of the end, or somewhat more; infinite where no point is known to be beyond it, None where it was not found.
-        """
+        """Of the end, or somewhat more; infinite where many points are within it and none is known to be beyond, None
+        where it was not found."""
         if self.ended:
             return self.wall if self.away > (1 - AT_WALL) * self.wall else self.away
         if self.beyond is None:
-            return math.inf
-        near = self.within is not None and self.beyond[0] <= ROUGH * self.within[0]
-        return self.beyond[0] if near else None
+            return math.inf if self.in_a_row >= OPEN else None
+        return self.beyond[0] if self.nearly else None
+
+    @property
+    def nearly(self) -> bool:
+        """Whether points within and beyond tell where it is, roughly."""
+        return self.within is not None and self.beyond is not None and self.beyond[0] <= ROUGH * self.within[0]
 
     def see(self, rise: float, values: Tensor) -> None:
         """Take note of the rise at the point that was looked at, and choose the next one."""
@@ -86,7 +94,7 @@ class _End:
         if rise < SIDES:
             self.within, self.values = here, values
         else:
-            self.beyond = here
+            self.beyond, self.outside = here, values
         if self.within is not None and self.beyond is not None:
             low, high = self.within[0], self.beyond[0]
             if high - low <= JUMP * high:
@@ -133,8 +141,8 @@ def by_profile(
     stuck = {i for i, at in zip(found.free, found.at_bound.tolist(), strict=True) if at}
     result = {}
     for i in places:
-        q, value = found.problem.parameters[i], float(found.values[i])
-        if i not in found.free or i in stuck or is_window(q.name) or not 0 < float(sd[i]) < 1e5 * abs(value):
+        left_out = i not in found.free or i in stuck or is_window(found.problem.parameters[i].name)
+        if left_out or not 0 < float(sd[i]) < math.inf or is_open(found, i, float(sd[i])):
             continue
         try:
             ends = None if stopped() else _ends(found, i, float(sd[i]))
@@ -171,16 +179,23 @@ def _ends(found: Fitted, i: int, sd: float) -> tuple[float, float] | None:
         low, high = (_at(value, end.sign * end.away, log) for end in both)
         if number == 0 and not _misleads(found, i, sd, (low, high), PERHAPS):
             return None
+    for end in both:
+        if not end.ended and end.nearly:
+            _confirm(found, i, end)
     low_at, high_at = (end.distance for end in both)
     return None if low_at is None or high_at is None else (_at(value, -low_at, log), _at(value, high_at, log))
 
 
 def _confirm(found: Fitted, i: int, end: _End) -> None:
     """Look once more where χ² seems to have risen enough, from first guesses too, and in as many steps as it takes:
-    there may be another valley, and along a bent one steps are short."""
-    held = {k: float(value) for k, value in enumerate(end.last) if k == i or k not in found.free}
-    again = _fitted(found, i, torch.cat([end.last[None], starts(found.problem, GUESSES, 0, held)]))
+    there may be another valley, and along a bent one steps are short. What is refuted is beyond no more."""
+    values, away = end.last, end.away
+    if end.rise < SIDES - NEAR and end.beyond is not None and end.outside is not None:
+        values, away = end.outside, end.beyond[0]
+    held = {k: float(value) for k, value in enumerate(values) if k == i or k not in found.free}
+    again = _fitted(found, i, torch.cat([values[None], starts(found.problem, GUESSES, 0, held)]))
     if again is not None and (rise := math.sqrt(max(again.chi2 - found.chi2, 0.0))) < SIDES - NEAR:
+        end.away, end.beyond, end.in_a_row = away, None, 0
         end.see(rise, again.values)
 
 
@@ -204,7 +219,7 @@ def _look(found: Fitted, i: int, ends: Sequence[_End], points: Sequence[float]) 
         if chi2 < found.chi2 - LOWER:
             return False
         end.see(math.sqrt(max(chi2 - found.chi2, 0.0)), values)
-        if end.ended and end.rise >= SIDES - NEAR:
+        if end.ended and (end.rise >= SIDES - NEAR or end.beyond is not None):
             _confirm(found, i, end)
     return True
 

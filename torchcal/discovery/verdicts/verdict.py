@@ -210,13 +210,18 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     decision.pliant = all(
         m.window is not None or (len(m.names) > 1 and not shared) or only_instruments(m) for m in decision.tied_models
     )
-    shares = _shares(decision, ranked)
-    second, least = (shares[1], shares[-1]) if len(shares) > 1 else (1.0, 1.0)
-    likely = decision.none > min(1 - UNKNOWN, second, max(least, WORTH))
+    likely = _none_is_likely(decision, ranked)
     fewest = [tied for tied in decision.tied if not any({*other} < {*tied} for other in decision.tied)]
     if len(fewest) < 2 or likely or local or decision.pliant or decision.doubt:
         decision.tied.append(list(NONE))
     return decision
+
+
+def _none_is_likely(decision: Decision, ranked: Sequence[Model]) -> bool:
+    """Whether something unknown is as likely as what is tied, so that it is, too."""
+    shares = _shares(decision, ranked)
+    second, least = (shares[1], shares[-1]) if len(shares) > 1 else (1.0, 1.0)
+    return decision.none > min(1 - UNKNOWN, second, max(least, WORTH))
 
 
 def _worth_telling(decision: Decision, model: Model) -> bool:
@@ -314,15 +319,17 @@ def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) 
         _tie_larger(search, decision, holding, sure)
     if sure < SURE or decision.doubt or not shown.physical:
         decision.verdict = "ambiguous"
+        nested = [m for m in search.models if m.physical and m not in holding and m.content > best.content]
         if alone:
             # What acts in a window may stand in for the same everywhere and something beside it, and a term for one
             # that frees more.
             more = [m for m in holding if best.window is not None and len(m.names) > len(best.names)]
-            more += [m for m in search.models if m.physical and m not in holding and m.content > best.content]
-            more = [m for m in more if m.window is None and not m.note and _is_worth(decision, m)]
+            more = [m for m in [*more, *nested] if m.window is None and not m.note and _is_worth(decision, m)]
             decision.tied_models = [best, *sorted(more, key=lambda m: -decision.probability[id(m)])]
             decision.tied = [list(names) for names in dict.fromkeys(m.names for m in decision.tied_models)]
-        decision.tied.append(list(NONE))
+        ranked = sorted((m for m in search.models if m.physical), key=lambda m: -m.weight)
+        if decision.doubt or not any(m in nested for m in decision.tied_models) or _none_is_likely(decision, ranked):
+            decision.tied.append(list(NONE))
         return
     decision.verdict, decision.best = "named", shown
     prove(search, decision, mask)

@@ -26,7 +26,6 @@ LINESPACING = 1.1  # of two lines in one row
 MOST_LETTERS = 44  # of a user's text on a figure
 WORD = 10  # letters of a word that are left out rather than breaking it
 MOST_POINTS = 2000  # drawn in one panel; more cannot be told apart
-HOLE = 8.0  # times the usual step from which on one has nothing between its ends
 
 
 @dataclass(frozen=True)
@@ -301,11 +300,14 @@ def thinned(count: int) -> np.ndarray:
     return np.linspace(0, count - 1, MOST_POINTS).round().astype(int)
 
 
-def holes(times: np.ndarray) -> list[float]:
-    """Middles of what lies between runs of which none reaches over it, by their times in ascending order."""
-    steps = np.diff(times)
-    usual = np.median(steps[steps > 0]) if (steps > 0).any() else np.inf
-    return [float(0.5 * (times[k] + times[k + 1])) for k in np.flatnonzero(steps > HOLE * usual)]
+def holes(spans: Iterable[tuple[float, float]]) -> list[float]:
+    """Middles of what lies between runs of which none reaches over it, by the first and last times of each."""
+    found, reached = [], math.inf
+    for first, last in sorted(spans):
+        if first > reached:
+            found.append(0.5 * (reached + first))
+        reached = last if reached == math.inf else max(reached, last)
+    return found
 
 
 def broken(at: np.ndarray, there: Iterable[float], *curves: np.ndarray) -> list[np.ndarray]:

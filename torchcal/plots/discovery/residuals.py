@@ -190,7 +190,7 @@ def residual_map(
     keep = keep[np.argsort(x[keep], kind="stable")]
     many = len(keep) > 40
     bins = _bins(x, keep, period) if many else []
-    between = holes(x[keep]) if driver in ("t", "time") else []
+    between = holes(_spans(recording)) if driver in ("t", "time") else []
     bins = [part for rows in bins for part in np.split(rows, np.searchsorted(x[rows], between)) if len(part)]
     dots = keep[thinned(len(keep))]
     along = "time" if driver == "t" else driver
@@ -244,6 +244,11 @@ def _bins(x: np.ndarray, keep: np.ndarray, period: float | None) -> list[np.ndar
     part = np.floor((x[keep] - levels[0]) * PER_PERIOD / period)
     bins = [keep[part == number] for number in np.unique(part)]
     return bins if np.median([len(rows) for rows in bins]) >= 2 else []
+
+
+def _spans(recording: Recording) -> list[tuple[float, float]]:
+    """First and last time of every run."""
+    return [(float(run.time[0]), float(run.time[-1])) for run in getattr(recording, "runs", None) or ()]
 
 
 def _levels(others: Mapping[str, np.ndarray], rows: np.ndarray, look: Look) -> list[tuple[np.ndarray, str, float]]:

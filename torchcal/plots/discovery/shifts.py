@@ -16,7 +16,6 @@ from torchcal.plots.discovery.pieces import (
     expect,
     finish,
     finite,
-    holes,
     is_log,
     plain,
 )
@@ -27,6 +26,8 @@ if TYPE_CHECKING:
 #: Difference of the runs at the same time, as a share of the range, up to which one curve shows them all, as up to an
 #: sd; and how many runs the legend names.
 SAME, NAMED_RUNS = 0.02, 6
+#: How many times as long as the longest of some before and after a step is that lies between two runs.
+HOLE, BESIDE = 8.0, 3
 #: Times the sd of the better known quarter of the stretches up to which one tells something, and sd of its own from
 #: which on its shift does.
 KNOWN, CLEAR = 4.0, 2.0
@@ -125,7 +126,7 @@ def missing_rate(
         color, dashes = (ACCEPTED, "-") if alone else style.CYCLE[number % len(style.CYCLE)]
         name = "estimate" if alone else f"run {number}" if number < NAMED_RUNS else None
         if missing.driver == "t":
-            at, height, wide = broken(at, holes(at), height, wide)
+            at, height, wide = broken(at, _between_runs(at), height, wide)
         ax.fill_between(
             at, height - 2 * wide, height + 2 * wide, lw=0, zorder=2, color=style.MODEL_ERROR_BAND if alone else color,
             alpha=None if alone else 0.15, label="±2 sd" if number == 0 else None,
@@ -137,6 +138,16 @@ def missing_rate(
     if legend:
         draw_key(ax)
     return ax
+
+
+def _between_runs(times: np.ndarray) -> list[float]:
+    """Middles of what lies between one run and a later one, by times in ascending order: steps that are far longer than
+    those before and after."""
+    steps = np.diff(times)
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(steps, BESIDE), 2 * BESIDE + 1).copy()
+    around[:, BESIDE] = 0.0
+    there = np.flatnonzero(steps > HOLE * around.max(1, initial=0.0))
+    return [float(0.5 * (times[k] + times[k + 1])) for k in there]
 
 
 def _by_run(
