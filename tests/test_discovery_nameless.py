@@ -282,6 +282,22 @@ def test_what_is_located_along_a_condition_is_not_told_once_more_as_shared(perio
     assert any("data at one T share what is left" in row for row in d.symptoms) is told
 
 
+def test_what_another_output_shares_is_told_beside_a_misfit_along_the_same_condition():
+    at, pressure = (c.ravel() for c in np.meshgrid(np.linspace(200, 1000, 17), [0.2, 1, 5, 20], indexing="ij"))
+    batches = np.repeat(np.random.default_rng(7).standard_normal(17), 4)
+    noise = 0.1 * np.random.default_rng(1).standard_normal((2, 68))
+    y = {"mu": 18 + 1.5 * np.sin((at - 200) / 800 * 2 * np.pi) + noise[0], "k": 5 + 0.15 * batches + noise[1]}
+    base = tc.Simulator(
+        lambda x, p: {"mu": p["mu"] + 0 * x["P"] + 0 * x["T"], "k": p["c"] + 0 * x["P"]},
+        [tc.Parameter("mu"), tc.Parameter("c")],
+    )
+    d = diagnose(base, tc.Recording(x={"T": at, "P": pressure}, y=y, noise=0.1), [])
+    told = [row for row in d.symptoms if "share what is left" in row]
+    assert d.where[0].driver == "T"
+    assert len(told) == 1
+    assert "data at one T share what is left of k" in told[0]
+
+
 # --- terms in a range that another condition of few levels takes the shape from --------------------------------------
 
 

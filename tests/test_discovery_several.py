@@ -386,3 +386,16 @@ def test_a_term_that_frees_more_is_the_same_and_more(seed, verdict):
     else:
         assert d.tied == [["competitive inhibition"], ["mixed inhibition"]]
         assert d.experiment is None  # what one has beside the other is at its neutral value
+
+
+def test_sets_that_add_the_same_are_one():
+    contents = ({"a"}, {"b"}, {"a", "b"}, {"x"}, {"b", "c"})
+    search = SimpleNamespace(
+        candidates=[SimpleNamespace(content=frozenset(content)) for content in contents],
+        models=[SimpleNamespace(content=frozenset(c), window=window) for c, window in (("ax", None), ("bx", 1))],
+        failed=set(),
+    )
+    sets = [(0, 1), (0, 3), (1, 3), (0, 4), (2, 4), (2, 3)]
+    assert several._distinct(search, sets) == [(1, 3), (0, 4), (2, 3)]
+    search.failed = {2}
+    assert several._distinct(search, sets)[0] == (0, 1)  # of what could not be fitted another set is tried

@@ -327,8 +327,8 @@ def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) 
             more = [m for m in [*more, *nested] if m.window is None and not m.note and _is_worth(decision, m)]
             decision.tied_models = [best, *sorted(more, key=lambda m: -decision.probability[id(m)])]
             decision.tied = [list(names) for names in dict.fromkeys(m.names for m in decision.tied_models)]
-        ranked = sorted((m for m in search.models if m.physical), key=lambda m: -m.weight)
-        if decision.doubt or not any(m in nested for m in decision.tied_models) or _none_is_likely(decision, ranked):
+        held = [m for m in decision.tied_models if m in nested]
+        if decision.doubt or not held or _none_is_likely(decision, [m for m in search.models if m.physical]):
             decision.tied.append(list(NONE))
         return
     decision.verdict, decision.best = "named", shown
