@@ -105,7 +105,10 @@ def models_of(names: str) -> tuple[list[SimpleNamespace], tc.Recording]:
     recording = tc.Recording(x={"x": torch.linspace(-1, 1, 9, dtype=F64)}, y=torch.zeros(9, dtype=F64))
     problem = SimpleNamespace(in_time=False, recording=recording, simulator=None)
     found = SimpleNamespace(problem=problem)
-    return [SimpleNamespace(names=(name,), where=None, window=None, found=found) for name in names], recording
+    models = [
+        SimpleNamespace(names=(name,), content=frozenset(name), where=None, window=None, found=found) for name in names
+    ]
+    return models, recording
 
 
 def test_pairs_that_nothing_tells_apart_are_left_aside_and_said(monkeypatch):

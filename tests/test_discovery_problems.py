@@ -146,11 +146,13 @@ def moved(found):
 FINITE = r"the base where its calibration ends, with c = 3\. Got inf for .* of 12 data, first output 'h' at time"
 
 
-def test_a_base_that_is_not_finite_where_its_fit_ends_is_told(monkeypatch):
-    """At the edge of what is finite the last pass of Newton's method may be the last that is."""
-    monkeypatch.setattr(base_of, "_sharpen", lambda found, sd=None: found if sd is None else moved(found))
-    with pytest.raises(SimulatorError, match=FINITE):
-        base_of.calibrate_base(emptied(), {}, 2, 0)
+def test_a_base_that_is_not_finite_where_its_fit_ends_is_told():
+    """A tank that runs empty, with a root of less than nothing: a fit ends at the edge of what is finite."""
+    t = torch.linspace(0, 10, 60, dtype=F64)
+    y = (1 - 0.14 * t).clamp_min(0) ** 2 + torch.as_tensor(0.005 * np.random.default_rng(0).standard_normal(60))
+    tank = emptied().simulator.ode
+    with pytest.raises(SimulatorError, match=r"base where its calibration ends, with c = .* Got inf for .* of 60 data"):
+        tc.diagnose(tank, tc.Recording(runs=[tc.Run(time=t, outputs={"h": y})], noise=0.005), [], progress=False)
 
 
 def test_no_term_is_blamed_for_what_the_base_alone_does():

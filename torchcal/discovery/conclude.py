@@ -4,7 +4,6 @@ import dataclasses
 import math
 import time
 
-import torch
 from torch import Tensor
 
 from torchcal.data import Recording
@@ -27,7 +26,6 @@ from torchcal.discovery.findings.symptoms import (
 )
 from torchcal.discovery.findings.where import locate, missing_rate, needed_shifts, sharpened
 from torchcal.discovery.fits.fitting import Fitted
-from torchcal.discovery.fits.trial import check_finite
 from torchcal.discovery.hypotheses import verify
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.own_noise import beside
@@ -86,8 +84,6 @@ def conclude(judged: Judged, asked: Asked, *, interrupted: str = "") -> Diagnosi
         interrupted: In words, or empty.
     """
     search, decision, mask = judged.search, judged.decision, judged.mask
-    if not bool(torch.isfinite(search.base.y).all()):
-        check_finite(search.base)
     best = decision.best
     if best is not None and (found := explain.deeper(search, best)) is not None:
         best.found, best.structure, best.residual = found, None, None

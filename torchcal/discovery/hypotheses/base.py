@@ -12,7 +12,7 @@ from torchcal.discovery.fits.fitting import Fitted, fit, refit
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.sharpen import SOLVER_SHARE, sharpen
 from torchcal.discovery.fits.starts import follow_slopes, starts
-from torchcal.discovery.fits.trial import point_of
+from torchcal.discovery.fits.trial import check_finite, point_of
 from torchcal.discovery.misfit.growth import growth
 from torchcal.discovery.misfit.noise import Noise, estimate
 from torchcal.discovery.misfit.outliers import spikes
@@ -65,7 +65,7 @@ def calibrate_base(
 
     Raises:
         ConvergenceError: If no starting value gives finite outputs.
-        SimulatorError: If the solution does not settle when time steps are halved.
+        SimulatorError: If the solution does not settle when time steps are halved, or is not finite where the fit ends.
     """
     recording = problem.recording
     exact = isinstance(recording.noise, str)
@@ -107,6 +107,8 @@ def calibrate_base(
             noise = _without_memory(noise, away)
             remembering = refit(base, noise.whitening(base.problem))
         base = _sharpen(remembering, noise.sd)
+    if isinstance(base.problem.simulator, Trajectories):
+        check_finite(base)
     return base, noise
 
 
