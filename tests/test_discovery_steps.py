@@ -1,6 +1,7 @@
 """Steps and bumps, which slow noise may take as well as physics."""
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -82,6 +83,18 @@ def test_what_was_taken_out_counts_for_itself_and_for_no_other():
     every, number = lines.evidence(residual.e[:, None], SIZES)
     each = [lines.evidence_of(residual, torch.tensor(k), SIZES) for k in range(len(lines.frequencies))]
     assert np.logaddexp.reduce(each) == pytest.approx(float(every[0]), abs=0.05)  # between those of the grid, too
+    # Each is the mean over the frequencies around it, and the sizes, of the marginal likelihood against none.
+    ((places, _),) = lines.parts
+    for k in range(0, len(each), 5):
+        odds = []
+        for frequency, size in itertools.product(lines._around(torch.tensor(k)).tolist(), SIZES.tolist()):
+            angle = 2 * np.pi * frequency * lines.along[places]
+            wave = torch.stack([angle.cos(), angle.sin()], dim=-1)
+            cov = torch.eye(len(places), dtype=torch.float64) + 2 * size**2 / len(places) * wave @ wave.T
+            e = residual.e[places]
+            odds.append(0.5 * float(e @ e - e @ torch.linalg.solve(cov, e) - torch.logdet(cov)))
+        expected = np.logaddexp.reduce(odds) - np.log(len(odds) * len(each))
+        assert each[k] == pytest.approx(expected, abs=1e-9)
     # Two that are alike cannot both have been there.
     wave = calibrated(1 + 0.3 * X + 0.3 * np.sin(9 * X) + 0.1 * np.random.default_rng(0).standard_normal(60), noise=0.1)
     _, rough = evidences(Residual(*wave, draws=0), (), channels(wave[0].problem, wave[0]), ())

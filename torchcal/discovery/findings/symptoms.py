@@ -224,14 +224,13 @@ def shared(search: Search, found: Fitted, places: Sequence[Place] = ()) -> list[
     if search.exact:
         return []
     several = len(search.problem.recording.outputs) > 1
-    located = _located(search, places)
+    common = in_common_at(found.problem, search.noise.whitening(found.problem).vector(found.residual))
+    located = _located(search, places) if common else ()
     return [
         f"data at one {condition} share what is left{f' of {name}' if several else ''}, {size:.1f} times what they "
         f"differ by, in no order along {condition}: that is no noise of each datum, but something faster than the "
         f"values of {condition} are apart, or an error that data at one {condition} have in common, as of a setting"
-        for name, condition, size in in_common_at(
-            found.problem, search.noise.whitening(found.problem).vector(found.residual)
-        )
+        for name, condition, size in common
         if (name, condition) not in located
     ]
 

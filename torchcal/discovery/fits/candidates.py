@@ -201,9 +201,14 @@ def call_once(base: Problem, term: Term, rows: Tensor) -> None:
         DomainError: If a function asks for what there is not.
         SimulatorError: The same; or if it changes what it is given, or gives no real numbers.
     """
-    errors = [error for values in rows if (error := _refused(base, term, values)) is not None]
-    if errors and len(errors) == len(rows):
-        raise errors[0]
+    first = None
+    for values in rows:
+        error = _refused(base, term, values)
+        if error is None:
+            return
+        first = first or error
+    if first is not None:
+        raise first
 
 
 def _refused(base: Problem, term: Term, values: Tensor) -> TorchcalError | None:

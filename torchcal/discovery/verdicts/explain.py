@@ -98,19 +98,18 @@ def estimates(
 
 
 def is_open(found: Fitted, i: int, sd: float) -> bool:
-    """Whether the data do not determine a free parameter, by the sd of its estimate."""
-    return sd > BEYOND * abs(float(found.values[i])) and sd > BEYOND * _size(found, i)
+    """Whether the data do not determine a free parameter, by the sd of its estimate.
 
-
-def _size(found: Fitted, i: int) -> float:
-    """Size of a free parameter: its estimate's, and of one that is 0 but for rounding that of its first guess, or 1."""
-    value, first = abs(float(found.values[i])), found.problem.parameters[i].initial
+    That is held against the estimate, and where this is 0 but for rounding against the first guess, or 1.
+    """
+    value, first, problem = abs(float(found.values[i])), found.problem.parameters[i].initial, found.problem
+    if not sd > BEYOND * value:
+        return False
     if value:
-        problem = found.problem
         moved = value * found.jacobian[:, found.free.index(i)].abs()
         if bool((moved > NOTHING * problem.recording.spread[problem.index]).any()):
-            return value
-    return max(value, abs(first or 1.0))
+            return True
+    return sd > BEYOND * abs(first or 1.0)
 
 
 def stated_sd(found: Fitted) -> Tensor:

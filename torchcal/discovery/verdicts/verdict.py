@@ -174,9 +174,7 @@ def decide(search: Search, detected: bool, mask: Tensor | None) -> Decision:
     decision.verdict = "ambiguous"
     covered = 0.0
     seen: set[frozenset[str]] = set()
-    groups: dict[frozenset[str], float] = {}
-    for model, share in zip(ranked, shares_of(ranked), strict=True):
-        groups[frozenset(model.names)] = groups.get(frozenset(model.names), 0.0) + share
+    groups = _by_names(ranked, shares_of(ranked))
     for model in ranked:
         names = frozenset(model.names)
         if names in seen or model.note:
@@ -260,12 +258,18 @@ def _dismiss(search: Search, ranked: list[Model]) -> None:
         model.price, model.log_evidence = model.price + UNPHYSICAL, model.log_evidence + UNPHYSICAL
 
 
+def _by_names(models: Sequence[Model], shares: Sequence[float]) -> dict[frozenset[str], float]:
+    """Of each set of terms the sum over its models, wherever they act."""
+    found: dict[frozenset[str], float] = {}
+    for model, share in zip(models, shares, strict=True):
+        names = frozenset(model.names)
+        found[names] = found.get(names, 0.0) + share
+    return found
+
+
 def _shares(decision: Decision, ranked: Sequence[Model]) -> list[float]:
     """Probabilities of the tied hypotheses, wherever they act, the largest first; another name of one has its own."""
-    shares: dict[frozenset[str], float] = {}
-    for model in ranked:
-        names = frozenset(model.names)
-        shares[names] = shares.get(names, 0.0) + decision.probability[id(model)]
+    shares = _by_names(ranked, [decision.probability[id(model)] for model in ranked])
     known = [shares.get(frozenset(tied)) for tied in decision.tied]
     best = max((share for share in known if share is not None), default=0.0)
     return sorted((best if share is None else share for share in known), reverse=True)
@@ -319,16 +323,17 @@ def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) 
         _tie_larger(search, decision, holding, sure)
     if sure < SURE or decision.doubt or not shown.physical:
         decision.verdict = "ambiguous"
-        nested = [m for m in search.models if m.physical and m not in holding and m.content > best.content]
+        physical = [m for m in search.models if m.physical]
+        nested: list[Model] = []
         if alone:
             # What acts in a window may stand in for the same everywhere and something beside it, and a term for one
             # that frees more.
-            more = [m for m in holding if best.window is not None and len(m.names) > len(best.names)]
-            more = [m for m in [*more, *nested] if m.window is None and not m.note and _is_worth(decision, m)]
-            decision.tied_models = [best, *sorted(more, key=lambda m: -decision.probability[id(m)])]
+            worth = [m for m in physical if m.window is None and not m.note and _is_worth(decision, m)]
+            nested = [m for m in worth if m not in holding and m.content > best.content]
+            more = [m for m in worth if m in holding and best.window is not None and len(m.names) > len(best.names)]
+            decision.tied_models = [best, *sorted([*more, *nested], key=lambda m: -decision.probability[id(m)])]
             decision.tied = [list(names) for names in dict.fromkeys(m.names for m in decision.tied_models)]
-        held = [m for m in decision.tied_models if m in nested]
-        if decision.doubt or not held or _none_is_likely(decision, [m for m in search.models if m.physical]):
+        if decision.doubt or not nested or _none_is_likely(decision, physical):
             decision.tied.append(list(NONE))
         return
     decision.verdict, decision.best = "named", shown

@@ -1,5 +1,6 @@
 """What the figures of a diagnosis share: colours, axes, legends, and numbers of what they were given."""
 
+import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -302,12 +303,9 @@ def thinned(count: int) -> np.ndarray:
 
 def holes(spans: Iterable[tuple[float, float]]) -> list[float]:
     """Middles of what lies between runs of which none reaches over it, by the first and last times of each."""
-    found, reached = [], math.inf
-    for first, last in sorted(spans):
-        if first > reached:
-            found.append(0.5 * (reached + first))
-        reached = last if reached == math.inf else max(reached, last)
-    return found
+    ordered = sorted(spans)
+    reached = itertools.accumulate((last for _, last in ordered), max)
+    return [0.5 * (end + first) for end, (first, _) in zip(reached, ordered[1:], strict=False) if first > end]
 
 
 def broken(at: np.ndarray, there: Iterable[float], *curves: np.ndarray) -> list[np.ndarray]:

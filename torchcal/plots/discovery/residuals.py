@@ -190,10 +190,10 @@ def residual_map(
     keep = keep[np.argsort(x[keep], kind="stable")]
     many = len(keep) > 40
     bins = _bins(x, keep, period) if many else []
-    between = holes(_spans(recording)) if driver in ("t", "time") else []
+    along = "time" if driver == "t" else driver
+    between = holes(_spans(recording)) if along == "time" else []
     bins = [part for rows in bins for part in np.split(rows, np.searchsorted(x[rows], between)) if len(part)]
     dots = keep[thinned(len(keep))]
-    along = "time" if driver == "t" else driver
     outline = [withStroke(linewidth=3.5, foreground="white")] if len(dots) > OPAQUE else []  # or it would hide dots
     groups = _levels({name: column[dots] for name, column in columns.items() if name != along}, dots, look)
     for i, fit in enumerate(fits):
