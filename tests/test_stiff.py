@@ -96,6 +96,21 @@ def test_derivatives_are_those_of_the_discrete_solution(burnt):
     torch.testing.assert_close(near.jacobian * K, anew.jacobian * K, rtol=1e-3, atol=1e-7)
 
 
+def test_stages_are_solved_along_with_the_states(burnt):
+    calls = []
+    plain = robertson()
+    rates = plain.rates
+    counted = tc.ODESimulator(
+        lambda t, s, p, u: calls.append(t) or rates(t, s, p, u), plain.states, plain.parameters, stiff=True
+    )
+    bound = counted.bind(burnt)
+    warm = bound.linearise(bound.x, K[None]).warm
+    calls.clear()
+    near = bound.linearise(bound.x, 1.2 * K[None], warm=warm)
+    assert len(calls) <= 8  # every pass of the states would take several for the stages
+    torch.testing.assert_close(near.y, bound.linearise(bound.x, 1.2 * K[None]).y, rtol=1e-7, atol=1e-12)
+
+
 def driven(stiff=True, **more):
     """A fast state that follows an input, whose rate constant may differ from run to run, and a slow one behind it."""
     return tc.ODESimulator(

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcal.simulators.layout import Values
+from torchcal.simulators.shooting import Pass
 from torchcal.simulators.steps import COPIED, SPAN, Steps
 
 __all__ = ["ImplicitSteps"]
@@ -35,7 +36,8 @@ class ImplicitSteps(Steps):
 
     The stages :math:`Y_i = s + h \sum_j a_{ij} f(t + c_j h, Y_j)` of all points are solved together by Newton's method;
     a point where it does not settle ends at NaN. Derivatives are those of the solved stages, by the implicit function
-    theorem: :math:`(1 - h A \otimes J)\, dY = ds + h A\, f_p\, dp`.
+    theorem: :math:`(1 - h A \otimes J)\, dY = ds + h A\, f_p\, dp`. Where the states are guessed, these and the stages
+    take the same passes (a lifted Newton method: Albersmeyer & Diehl 2010, SIAM J. Optim. 20, 1655).
     """
 
     order = 6
@@ -60,12 +62,50 @@ class ImplicitSteps(Steps):
         size = rates.abs().amax(dim=(0, 1)).clamp_min(1e-300)
         return float((gap / size).max())
 
-    def ends(self, values: Tensor, states: Tensor) -> Tensor:
-        """As `Steps.ends`."""
-        t, h, u = self.grid.flat
+    def stages(self, states: Tensor) -> Tensor:
+        """As `Steps.stages`: the stages, on lines from state to state."""
         begin, guess = _points(states[:, :, :-1]), _points(states[:, :, 1:])
-        found = self._stages(begin, t, h, self.layout.by_name(values, self.grid.step_run), u, guess)[:, -1]
-        return found.reshape(states[:, :, :-1].shape)
+        return _towards(begin, guess)
+
+    def linearised(self, values: Tensor, states: Tensor, columns: Sequence[int], stages: Tensor) -> Pass:
+        """As `Steps.linearised`: a Newton pass for the stages, with what changes of states and parameters add to it."""
+        hyper, runs, _, size = states.shape
+        begin = _points(states[:, :, :-1])
+        f, slopes, pushes = self._at_stages(values, stages, columns)
+        h = self.grid.flat[1]
+        lu, pivots, _ = torch.linalg.lu_factor_ex(_matrix(slopes, h))
+        gap = _gap(begin, stages, f, h)
+        still = torch.eye(size, dtype=begin.dtype).expand(hyper, STAGES, begin.shape[1], size, size)
+        right = torch.cat([gap.unsqueeze(-1), still, _pushed(pushes, h)], dim=-1).transpose(1, 2).flatten(2, 3)
+        found = torch.linalg.lu_solve(lu, pivots, right).unflatten(2, (STAGES, size)).transpose(1, 2)
+        change, carried = found[..., 0], found[..., 1 : 1 + size]
+        stages = stages + change
+        off = _share(_largest(begin), stages, change, gap, slopes, h).amax(-1)
+        shape = (hyper, runs, self.grid.num_steps, size)
+        by_begin, by_column = found[:, -1, ..., 1 : 1 + size], found[:, -1, ..., 1 + size :]
+        return Pass(
+            stages[:, -1].reshape(shape),
+            by_begin.reshape(*shape, size),
+            by_column.reshape(*shape, len(columns)),
+            stages,
+            carried,
+            off,
+            (lu, pivots, slopes),
+        )
+
+    def corrected(self, values: Tensor, states: Tensor, stages: Tensor, here: Pass) -> tuple[Tensor, Tensor, Tensor]:
+        """As `Steps.corrected`."""
+        begin = _points(states[:, :, :-1])
+        t, h, u = self.grid.flat
+        lu, pivots, slopes = here.factors
+        p = _tiled(self.layout.by_name(values, self.grid.step_run), torch.arange(len(t)), 1)
+        f = self.rates(_times(t, h), stages.flatten(1, 2), p, _inputs(u)).unflatten(1, (STAGES, -1))
+        gap = _gap(begin, stages, f, h)
+        right = gap.transpose(1, 2).flatten(2, 3).unsqueeze(-1)
+        change = torch.linalg.lu_solve(lu, pivots, right).squeeze(-1).unflatten(2, (STAGES, -1)).transpose(1, 2)
+        stages = stages + change
+        off = _share(_largest(begin), stages, change, gap, slopes, h).amax(-1)
+        return stages[:, -1].reshape(states[:, :, 1:].shape), stages, off
 
     def derivatives(self, values: Tensor, states: Tensor, columns: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
         """As `Steps.derivatives`."""
@@ -85,41 +125,40 @@ class ImplicitSteps(Steps):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Ends ``(H, M, S)`` of all steps and their derivatives by the states and by parameters, or by forces."""
         size = states.shape[-1]
-        run_of = self.grid.step_run
         t, h, u = self.grid.flat
         begin, guess = _points(states[:, :, :-1]), _points(states[:, :, 1:])
-        stages = self._stages(begin, t, h, self.layout.by_name(values, run_of), u, guess)  # (H, 3, M, S)
-        every = run_of.repeat(STAGES)
-        flat = stages.flatten(1, 2)
+        stages = self._stages(begin, t, h, self.layout.by_name(values, self.grid.step_run), u, guess)  # (H, 3, M, S)
+        _, slopes, pushes = self._at_stages(values, stages, columns)
+        still = torch.eye(size, dtype=begin.dtype).expand(*begin.shape, size)
+        if forced:
+            push = torch.stack([c * h[:, None, None] * still for c in NODES], dim=1)
+        else:
+            push = _pushed(pushes, h)
+        right = torch.cat([still.unsqueeze(1).expand(-1, STAGES, -1, -1, -1), push], dim=-1)
+        found = torch.linalg.solve_ex(_matrix(slopes, h), right.transpose(1, 2).flatten(2, 3))[0][:, :, -size:]
+        return stages[:, -1], found[..., :size], found[..., size:]
+
+    def _at_stages(self, values: Tensor, stages: Tensor, columns: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
+        """Rates ``(H, 3, M, S)`` at stages of all steps, and their derivatives by state and by some parameters."""
+        size = stages.shape[-1]
+        t, h, u = self.grid.flat
+        every, flat = self.grid.step_run.repeat(STAGES), stages.flatten(1, 2)
         with torch.enable_grad():
             copies = size if flat.numel() <= COPIED else 1
             leaf = flat.repeat(copies, 1, 1).requires_grad_(True)
             leaves = self.layout.leaves(values.repeat(copies, 1), every, columns)
             rates = self.rates(_times(t, h), leaf, leaves, _inputs(u))
             slopes, pushes = self.layout.derivatives(rates, leaf, leaves, every, columns, copied=copies > 1)
-        matrix = _matrix(slopes.unflatten(1, (STAGES, -1)), h)
-        still = torch.eye(size, dtype=begin.dtype).expand(*begin.shape, size)
-        if forced:
-            push = torch.stack([c * h[:, None, None] * still for c in NODES], dim=2)
-        else:
-            a = torch.tensor(WEIGHTS, dtype=begin.dtype)
-            by_stage = pushes.unflatten(1, (STAGES, -1))  # (H, 3, M, S, C)
-            push = torch.einsum("ij,hjmsc->hmisc", a, by_stage) * h[:, None, None, None]
-        right = torch.cat([still.unsqueeze(2).expand(-1, -1, STAGES, -1, -1), push], dim=-1).flatten(2, 3)
-        found = torch.linalg.solve_ex(matrix, right)[0][:, :, -size:]
-        return stages[:, -1], found[..., :size], found[..., size:]
+        found = (rates[: len(flat)].detach(), slopes, pushes)
+        return tuple(part.unflatten(1, (STAGES, -1)) for part in found)  # type: ignore[return-value]
 
     def _stages(
         self, s: Tensor, t: Tensor, h: Tensor, p: Values, u: dict[str, Tensor], guess: Tensor | None = None
     ) -> Tensor:
         """States ``(H, 3, M, S)`` at the stages of steps from ``s`` (H, M, S), begun towards guessed ends."""
-        c = torch.tensor(NODES, dtype=s.dtype)[:, None, None]
-        a = torch.tensor(WEIGHTS, dtype=s.dtype)
         size = s.shape[-1]
-        stages = s.unsqueeze(1).repeat(1, STAGES, 1, 1)
-        if guess is not None:
-            stages += c * (guess - s).unsqueeze(1)
-        floor = SMALLEST * s.abs().nan_to_num(nan=0.0, posinf=0.0).amax(1, keepdim=True)
+        largest = _largest(s)
+        stages = _towards(s, s if guess is None else guess)
         share = s.new_full(s.shape[:2], math.inf)
         at = torch.arange(s.shape[1])  # the points that are not settled, in one row at least
         for _ in range(PASSES):
@@ -131,21 +170,51 @@ class ImplicitSteps(Steps):
                 rates = self.rates(times, leaf, _tiled(p, at, copies), _inputs({n: v[:, at] for n, v in u.items()}))
                 slopes, _ = self.layout.derivatives(rates, leaf, {}, times, (), copied=copies > 1)
             f, slopes = rates[: len(s)].detach().unflatten(1, (STAGES, -1)), slopes.unflatten(1, (STAGES, -1))
-            gap = step[:, None] * torch.einsum("ij,hjms->hims", a, f) - (now - s[:, None, at])
+            gap = _gap(s[:, at], now, f, step)
             right = gap.transpose(1, 2).flatten(2, 3).unsqueeze(-1)
             change = torch.linalg.solve_ex(_matrix(slopes, step), right)[0]
             change = change.squeeze(-1).unflatten(2, (STAGES, size)).transpose(1, 2)
             stages[:, :, at] = now + change
-            near = stages[:, :, at].abs()
-            found = (change.abs().amax(1) / torch.maximum(near.amax(1), floor).clamp_min(1e-300)).amax(-1)
-            terms = near + step[:, None] * torch.einsum("himab,himb->hima", slopes.abs(), near)
-            found[(gap.abs() <= ROUNDING * terms).all(-1).all(1)] = 0.0
+            found = _share(largest, stages[:, :, at], change, gap, slopes, step)
             settled = (found < SMALL) | ((found < ROUNDED) & (found > 0.5 * share[:, at]))
             share[:, at] = found
             at = at[(~settled & found.isfinite()).any(0)]
             if not len(at):
                 break
         return stages.masked_fill(~(share < ROUNDED)[:, None, :, None], math.nan)
+
+
+def _largest(s: Tensor) -> Tensor:
+    """Largest values of states ``(H, M, S)`` at any point, ``(H, 1, S)``."""
+    return s.abs().nan_to_num(nan=0.0, posinf=0.0).amax(1, keepdim=True)
+
+
+def _towards(s: Tensor, ends: Tensor) -> Tensor:
+    """Stages ``(H, 3, M, S)`` on lines from states ``(H, M, S)`` to others."""
+    c = torch.tensor(NODES, dtype=s.dtype)[:, None, None]
+    return s.unsqueeze(1) + c * (ends - s).unsqueeze(1)
+
+
+def _gap(s: Tensor, stages: Tensor, rates: Tensor, h: Tensor) -> Tensor:
+    """By how much stages ``(H, 3, M, S)`` of steps from ``s`` differ from what their rates make of them."""
+    a = torch.tensor(WEIGHTS, dtype=s.dtype)
+    return h[:, None] * torch.einsum("ij,hjms->hims", a, rates) - (stages - s.unsqueeze(1))
+
+
+def _pushed(pushes: Tensor, h: Tensor) -> Tensor:
+    """What derivatives of the rates at the stages ``(H, 3, M, S, C)`` come to in the equations of these."""
+    a = torch.tensor(WEIGHTS, dtype=pushes.dtype)
+    return torch.einsum("ij,hjmsc->himsc", a, pushes) * h[:, None, None]
+
+
+def _share(largest: Tensor, stages: Tensor, change: Tensor, gap: Tensor, slopes: Tensor, h: Tensor) -> Tensor:
+    """Largest correction of the stages of a step, relative to these, ``(H, M)``; 0 where the gap is rounding."""
+    near = stages.abs()
+    size = torch.maximum(near.amax(1), SMALLEST * largest).clamp_min(1e-300)
+    found = (change.abs().amax(1) / size).amax(-1)
+    terms = near + h[:, None] * torch.einsum("himab,himb->hima", slopes.abs(), near)
+    found[(gap.abs() <= ROUNDING * terms).all(-1).all(1)] = 0.0
+    return found
 
 
 def _matrix(slopes: Tensor, h: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torchcal.simulators.recurrence import recur
 if TYPE_CHECKING:
     from torchcal.simulators.steps import Steps
 
-__all__ = ["Closed", "begun", "close_gaps"]
+__all__ = ["Closed", "Pass", "begun", "close_gaps"]
 
 #: Corrections, relative to the state where they are made, after which nothing is left to check: the next would be
 #: their square. A larger one may cross a kink, such as a clamp at zero.
@@ -29,6 +29,39 @@ CONTRACTION, SMALL_CHORD, CHORDS = 0.2, 1e-7, 4
 #: state around where they are made, up to which the derivatives before count as those of the trajectory found. Around
 #: is this share of the trajectory to either side: a state may pass zero, or stay small.
 CLOSE, NEAR, AROUND = 0.1, 1e-3, 1 / 16
+
+
+class Pass(NamedTuple):
+    """All steps and their derivatives, from states at hand.
+
+    Attributes:
+        ends: Where they end, ``(H, R, K, S)``.
+        flow: ∂ ends / ∂ states, ``(H, R, K, S, S)``.
+        forcing: ∂ ends / ∂ some parameters, ``(H, R, K, S, C)``.
+        stages: What else they are solved for, corrected, ``(H, N, R K, S)``: the stages of implicit steps, which are
+            corrected once a pass, like the states; nothing of explicit ones.
+        carried: ∂ stages / ∂ states, ``(H, N, R K, S, S)``.
+        off: Largest correction of the stages, relative to these, ``(H,)``.
+        factors: What further corrections with the same derivatives need, each ``(H, ...)``.
+    """
+
+    ends: Tensor
+    flow: Tensor
+    forcing: Tensor
+    stages: Tensor
+    carried: Tensor
+    off: Tensor
+    factors: tuple[Tensor, ...] = ()
+
+    def of(self, rows: Tensor) -> "Pass":
+        """The same of some rows."""
+        parts = (self.ends, self.flow, self.forcing, self.stages, self.carried, self.off)
+        return Pass(*(part[rows] for part in parts), factors=tuple(part[rows] for part in self.factors))
+
+    def moved(self, change: Tensor) -> Tensor:
+        """The stages, where the states at the ends of the steps change by ``(H, R, K, S)``."""
+        by_begin = torch.cat([torch.zeros_like(change[:, :, :1]), change[:, :, :-1]], dim=2).flatten(1, 2)
+        return self.stages + (self.carried @ by_begin[:, None, ..., None]).squeeze(-1)
 
 
 class Closed(NamedTuple):
@@ -67,38 +100,42 @@ def close_gaps(
     active = torch.isfinite(states).flatten(1).all(-1)
     last = torch.full((len(values),), math.inf, dtype=torch.float64)
     before = states.new_full((len(values), 1, 1, 1), 1e-300) if largest is None else largest.clamp_min(1e-300)
+    stages = steps.stages(states)
     for number in range(MAX_PASSES):
         rows = active.nonzero()[:, 0]
         if len(rows) == 0:
             break
         now = states[rows]
-        ends, flow, forcing = steps.derivatives(values[rows], now, columns)
-        gap = ends - now[:, :, 1:]
+        here = steps.linearised(values[rows], now, columns, stages[rows])
+        gap = here.ends - now[:, :, 1:]
         size = torch.maximum(now.abs().amax(dim=(1, 2), keepdim=True), before[rows])
         if number == 0:  # a guess may be zero where the trajectory is not
-            size = torch.maximum(size, ends.abs().amax(dim=(1, 2), keepdim=True))
+            size = torch.maximum(size, here.ends.abs().amax(dim=(1, 2), keepdim=True))
         worst = (gap.abs() / size).flatten(1).amax(-1)
         good = torch.isfinite(worst) & (worst < 4.0 * last[rows])
         last[rows] = worst
-        push = torch.cat([torch.nan_to_num(gap).unsqueeze(-1), begun(flow, forcing, begin[rows])], dim=-1)
-        found = recur(flow, push)
-        change = found[..., 0]
+        push = torch.cat([torch.nan_to_num(gap).unsqueeze(-1), begun(here.flow, here.forcing, begin[rows])], dim=-1)
+        solved = recur(here.flow, push)
+        change, tangent = solved[..., 0], solved[..., 1:]
         moved = torch.cat([now[:, :, :1], now[:, :, 1:] + change], dim=2)
         good &= torch.isfinite(moved).flatten(1).all(-1)
         floor = size * (SMALLEST if largest is None else SMALLEST_ANEW)
-        share = _share(change, moved, floor)
+        share = torch.maximum(_share(change, moved, floor), here.off)
         ended = share < SMALL
+        stages[rows] = here.moved(change)
         if largest is None:  # what goes on from here would carry on what chords leave
             far = (change.abs() / size).flatten(1).amax(-1)
             at = (good & ~ended & (far < CLOSE)).nonzero()[:, 0]
             if len(at):
-                moved[at], small = _chords(steps, values[rows[at]], moved[at], flow[at], floor[at], share[at])
-                ended[at] = small & (_share_around(change[at], moved[at]) < NEAR) if columns else small
+                found = _chords(steps, values[rows[at]], moved[at], stages[rows[at]], here.of(at), floor[at], share[at])
+                moved[at], stages[rows[at]], small = found
+                near = (_share_around(change[at], moved[at]) < NEAR) & (here.off[at] < NEAR)
+                ended[at] = small & near if columns else small
         states[rows] = torch.where(good[:, None, None, None], moved, now)
         settled[rows] = good & ended
         active[rows] = good & ~ended
         done = (good & ended).nonzero()[:, 0]
-        tangents[rows[done]] = torch.cat([begin[rows[done]].unsqueeze(2), found[done][..., 1:]], dim=2)
+        tangents[rows[done]] = torch.cat([begin[rows[done]].unsqueeze(2), tangent[done]], dim=2)
     return Closed(states, settled, tangents)
 
 
@@ -109,20 +146,23 @@ def begun(flow: Tensor, forcing: Tensor, begin: Tensor) -> Tensor:
 
 
 def _chords(
-    steps: "Steps", values: Tensor, states: Tensor, flow: Tensor, floor: Tensor, share: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Corrections with the derivatives of an earlier pass, and in which rows they became small."""
+    steps: "Steps", values: Tensor, states: Tensor, stages: Tensor, here: Pass, floor: Tensor, share: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """States and stages corrected with the derivatives of an earlier pass, and in which rows that became small."""
     for _ in range(CHORDS):
-        gap = steps.ends(values, states) - states[:, :, 1:]
-        change = recur(flow, torch.nan_to_num(gap).unsqueeze(-1))[..., 0]
+        ends, corrected, off = steps.corrected(values, states, stages, here)
+        gap = ends - states[:, :, 1:]
+        change = recur(here.flow, torch.nan_to_num(gap).unsqueeze(-1))[..., 0]
         moved = torch.cat([states[:, :, :1], states[:, :, 1:] + change], dim=2)
-        now = _share(change, moved, floor)
+        now = torch.maximum(_share(change, moved, floor), off)
         better = now < CONTRACTION * share
         states = torch.where(better[:, None, None, None], moved, states)
+        followed = here._replace(stages=corrected).moved(change)
+        stages = torch.where(better[:, None, None, None], followed, stages)
         share = torch.where(better, now, share)
         if bool(((share < SMALL_CHORD) | ~better).all()):
             break
-    return states, share < SMALL_CHORD
+    return states, stages, share < SMALL_CHORD
 
 
 def _share(change: Tensor, moved: Tensor, floor: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from torchcal.simulators.grid import Grid
 from torchcal.simulators.layout import Layout, Values
 from torchcal.simulators.parameter import spans
 from torchcal.simulators.recurrence import recur
-from torchcal.simulators.shooting import begun, close_gaps
+from torchcal.simulators.shooting import Pass, begun, close_gaps
 from torchcal.simulators.static import asks_for_numbers
 
 if TYPE_CHECKING:
@@ -85,13 +85,27 @@ class Steps:
         k4 = self.rates(t + h, s + full * k3, p, last)
         return s + (full / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
 
-    def ends(self, values: Tensor, states: Tensor) -> Tensor:
-        """Ends ``(H, R, K, S)`` of all steps begun at ``states``."""
+    def stages(self, states: Tensor) -> Tensor:
+        """What else there is to solve for along guessed states ``(H, R, K + 1, S)``, as of `Pass`."""
+        hyper, runs, nodes, size = states.shape
+        return states.new_zeros(hyper, 0, runs * (nodes - 1), size)
+
+    def linearised(self, values: Tensor, states: Tensor, columns: Sequence[int], stages: Tensor) -> Pass:
+        """All steps begun at ``states``, their derivatives by these and by some parameters, and corrected stages."""
+        ends, flow, forcing = self.derivatives(values, states, columns)
+        carried = stages.unsqueeze(-1).expand(*stages.shape, stages.shape[-1])
+        return Pass(ends, flow, forcing, stages, carried, values.new_zeros(len(values)))
+
+    def corrected(self, values: Tensor, states: Tensor, stages: Tensor, here: Pass) -> tuple[Tensor, Tensor, Tensor]:
+        """Ends ``(H, R, K, S)`` of all steps begun at ``states``, corrected stages, and by how much, relative to these.
+
+        The derivatives are those of an earlier pass.
+        """
         hyper, runs, _, size = states.shape
         t, h, u = self.grid.flat
         begin = states[:, :, :-1].reshape(hyper, -1, size)
         found = self.step(begin, t, h, self.layout.by_name(values, self.grid.step_run), u)
-        return found.reshape(hyper, runs, -1, size)
+        return found.reshape(hyper, runs, -1, size), stages, values.new_zeros(hyper)
 
     def derivatives(self, values: Tensor, states: Tensor, columns: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Ends of all steps begun at ``states``, and their derivatives by the states and by some parameters.
