@@ -55,8 +55,9 @@ class Pass(NamedTuple):
 
     def of(self, rows: Tensor) -> "Pass":
         """The same of some rows."""
-        parts = (self.ends, self.flow, self.forcing, self.stages, self.carried, self.off)
-        return Pass(*(part[rows] for part in parts), factors=tuple(part[rows] for part in self.factors))
+        factors = tuple(part[rows] for part in self.factors)
+        ends, flow, forcing, stages, carried, off, _ = self
+        return Pass(ends[rows], flow[rows], forcing[rows], stages[rows], carried[rows], off[rows], factors)
 
     def moved(self, change: Tensor) -> Tensor:
         """The stages, where the states at the ends of the steps change by ``(H, R, K, S)``."""
