@@ -1,5 +1,6 @@
 """Least squares, whitening and simulated noise of a diagnosis, against scipy, Cholesky and what follows by hand."""
 
+import dataclasses
 import math
 from types import SimpleNamespace
 
@@ -535,6 +536,9 @@ def test_what_is_named_is_told_at_its_lowest_minimum():
     astray, right = named(4.6), named(2.1)
     assert astray.found.chi2 > right.found.chi2 + 100
     assert deeper(search(), right) is None
+    assert deeper(search(), astray).chi2 == pytest.approx(right.found.chi2, abs=1e-3)
+    # A bound that it had run to is no place to stay; to run to one is no way to get lower.
+    astray.found = dataclasses.replace(astray.found, at_bound=torch.tensor([True, False]))
     assert deeper(search(), astray).chi2 == pytest.approx(right.found.chi2, abs=1e-3)
 
 

@@ -1041,3 +1041,76 @@ def test_a_lag_that_is_half_late_and_not_determined_is_no_name():
     assert abs(share.value - 1) > 0.3
     assert not share.sd < 1
     assert d.verdict != "named"
+
+
+def tunnelling(seed):
+    """Rates of a reaction that tunnels, and what a base without tunnelling may lack."""
+    T = np.linspace(140.0, 420.0, 40)
+    model = tc.Simulator(
+        lambda x, p: {"lnk": p["lnA"] - p["E"] * 1000 / 8.314 / x},
+        [tc.Parameter("lnA", low=5, high=50, initial=25.0), tc.Parameter("E", low=1, high=150, initial=40.0)],
+    )
+    terms = [
+        tc.Term(
+            "tunnelling",
+            outputs={"lnk": lambda x, p, y: y + torch.log(1 + p["w"] * (300 / x) ** 2)},
+            parameters=[tc.Parameter("w", low=0.0)],
+        ),
+        tc.Term(
+            "temperature exponent",
+            shifts={"lnA": lambda x, p: p["n"] * torch.log(x / 300)},
+            parameters=[tc.Parameter("n", low=-4, high=4)],
+        ),
+    ]
+    y = 26 - 32e3 / 8.314 / T + np.log(1 + 20 * (300 / T) ** 2) + 0.05 * np.random.default_rng(seed).standard_normal(40)
+    return model, tc.Recording(x=torch.tensor(T), y={"lnk": torch.tensor(y)}, noise=0.05), terms
+
+
+def test_an_effect_whose_tangent_has_the_wrong_sign_is_found_where_it_is_large():
+    d = tc.diagnose(*tunnelling(3), progress=False)
+    weights = {tuple(h.terms): h.log_evidence for h in d.ranking if h.region is None}
+    assert weights["tunnelling",] > weights["temperature exponent",] - 1
+    assert d.verdict == "ambiguous", str(d)
+
+
+def absorbed(seed=4):
+    """A drug that is swallowed and eliminated by a process that saturates: uptake and elimination in each other's place
+    fit a base without saturation as well."""
+    t = np.r_[0.25, 0.5, 1, 1.5, 2, 3, 4, 6, 8, 10, 12, 16, 20, 24, 30, 36]
+    rng, runs = np.random.default_rng(seed), []
+    for dose in (50.0, 150.0, 400.0):
+        solved = solve_ivp(
+            lambda t, y: [-0.8 * y[0], 0.8 * y[0] / 25 - 0.15 * y[1] / (1 + 0.04 * y[1])],
+            (0, 36), [dose, 0.0], t_eval=t, rtol=1e-9, atol=1e-10,
+        )  # fmt: skip
+        y = solved.y[1] + 0.1 * rng.standard_normal(len(t))
+        runs.append(
+            tc.Run(
+                time=torch.tensor(np.r_[0.0, t]),
+                outputs={"C": torch.tensor(np.r_[np.nan, y])},
+                initial={"g": dose, "C": 0.0},
+            )
+        )
+    model = tc.ODESimulator(
+        rates=lambda t, s, p, u: {
+            "g": -p["ka"] * s["g"],
+            "C": p["ka"] * s["g"] / p["V"] - p["ke"] * s["C"],
+        },
+        states=["g", "C"],
+        parameters=[tc.Parameter("ka", low=0.01, high=10), tc.Parameter("V", low=1, high=200),
+                    tc.Parameter("ke", low=0.005, high=5)],
+        observe=("C",),
+    )  # fmt: skip
+    return model, tc.Recording(runs=runs, noise=0.1, missing=True)
+
+
+def test_a_base_that_fits_with_two_rates_exchanged_hides_no_term():
+    saturable = tc.Term(
+        "saturable elimination",
+        shifts={"ke": lambda t, s, p, u: p["ke"] * (1 / (1 + p["a"] * s["C"].clamp_min(0)) - 1)},
+        parameters=[tc.Parameter("a", low=0.0)],
+    )
+    d = tc.diagnose(*absorbed(), [saturable], progress=False)
+    assert (d.verdict, d.terms) == ("named", ["saturable elimination"]), str(d)
+    (size,) = [e for e in d.final.estimates if e.name == "saturable elimination.a"]
+    assert abs(size.value - 0.04) < 3 * size.sd < 0.03

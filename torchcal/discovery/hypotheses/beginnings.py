@@ -18,11 +18,13 @@ __all__ = [
     "BENT",
     "beginnings",
     "blind_rows",
+    "farther",
     "first_guess",
     "is_far",
     "larger_effects",
     "learned",
     "make_up",
+    "valleys",
     "within_bounds",
 ]
 
@@ -42,6 +44,16 @@ LARGER, MADE_UP, SEEN = (1.0, 4.0), 12, 0.01
 NEW = 1e-3
 #: Shares of the linear estimate from which refits begin; of it at the base of another fit, those that are tried.
 STEPS, LADDER = (0.05, 1.0), tuple(4.0**k for k in range(-2, 6))
+#: Multiples of the linear estimate, or of its sd where that is more, at which a candidate begins farther away: from the
+#: base, against its linear estimate from as much, and where the base may be elsewhere.
+FARTHER, ELSEWHERE = (4.0, 16.0, 64.0), (1.0, 8.0, 64.0)
+#: Steps in which the base follows such an effect, and how many of them go on for so many more, all free but shapes.
+FOLLOWED, BEST, GONE_ON = 5, 3, 8
+#: Starts from anywhere, and from exchanged parameters at most, by which other valleys of the base are sought, and their
+#: steps; difference of a parameter, in its sd and in its size, from which on fits are in two; how many more are looked
+#: at, and up to how many times the base's χ².
+SPREAD, EXCHANGED, SETTLED = 8, 6, 15
+APART, VALLEYS, DEEP = (5.0, 0.2), 2, 3.0
 
 
 def is_far(base: Fitted) -> bool:
@@ -85,6 +97,82 @@ def within_bounds(base: Fitted, fixed: Mapping[str, float], seed: int) -> Tensor
     found = base.values.clone()
     found[stuck] = starts(base.problem, 1, seed, held)[0, stuck]
     return found
+
+
+def valleys(base: Fitted, fixed: Mapping[str, float], seed: int) -> Tensor:
+    """Other places ``(V, P)`` where fits of the base end, the best first, from anywhere and with two parameters of one
+    unit exchanged: two rates may fit as well in each other's place."""
+    problem, free, held = base.problem, base.free, base_columns(base.problem, fixed)[1]
+    low, high = problem.limits()
+    rows = [*starts(problem, SPREAD, seed + 1, held)]
+    for i, j in itertools.combinations(free, 2):
+        if problem.parameters[i].unit == problem.parameters[j].unit and len(rows) < SPREAD + EXCHANGED:
+            row = base.values.clone()
+            row[[i, j]] = row[[j, i]]
+            rows.append(row.clamp(low, high))
+    ended = fit(problem, base.whitening, torch.stack(rows), free, max_steps=SETTLED, finish=0)
+    found, sd = [base.values], base.sd()[free]
+    if ended is None or ended.ends is None or ended.ends_chi2 is None:
+        return base.values[None][:0]
+    for k in ended.ends_chi2.argsort().tolist():
+        if len(found) > VALLEYS or not float(ended.ends_chi2[k]) <= DEEP * base.chi2:
+            break
+        far = []
+        for other in found:
+            here, there = other[free], ended.ends[k, free]
+            away, size = (here - there).abs(), torch.maximum(here.abs(), there.abs())
+            far.append(bool(((away > APART[0] * sd) & (away > APART[1] * size)).any()))
+        if all(far):
+            found.append(ended.ends[k])
+    return torch.stack(found)[1:]
+
+
+def farther(
+    residual: Residual, screening: Screening, number: int, candidate: Candidate, elsewhere: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Where a candidate comes to in a few steps from larger effects, ``(H, P)``, and with which χ².
+
+    A tangent at a base that is bent may show the wrong sign, or next to nothing. From there, and with the base's
+    parameters at others ``(V, P)``, effects of all sizes are held while the base follows them; the best go on.
+    """
+    base, problem, columns = residual.found, candidate.problem, _columns(residual.found, candidate)
+    mine = (screening.owner == number).nonzero()[:, 0]
+    nothing = candidate.begin[None][:0], torch.zeros(0, dtype=torch.float64)
+    usable = mine[screening.norm[mine] > 0]
+    if len(usable) == 0:
+        return nothing
+    scores = screening.columns[:, usable].T @ residual.e
+    best = int(scores.abs().argmax())
+    column, score = int(usable[best]), float(scores[best])
+    size = max(abs(score), 1.0) / float(screening.norm[column])
+    place = candidate.amplitudes[int(screening.amplitude[column])]
+    row = candidate.begin.clone()
+    row[candidate.own] = candidate.shapes[int(screening.shape[column])]
+    side, groups = candidate.one_sided(place), []
+    for sign in (1.0, -1.0):
+        if side and sign != side:
+            continue
+        sizes = FARTHER if sign * score > 0 else (1.0, *FARTHER)
+        groups.append(_each(row, place, [float(row[place]) + sign * size * k for k in sizes]))
+        for other in elsewhere:
+            moved = row.clone()
+            moved[columns] = other[base.free]
+            groups.append(_each(moved, place, [float(row[place]) + sign * size * k for k in ELSEWHERE]))
+    low, high = problem.limits()
+    w = residual.noise.whitening(problem)
+    tried = []
+    for group in groups:
+        rows = torch.stack(group).clamp(low, high)
+        found = fit(problem, w, rows.unique(dim=0), columns, max_steps=FOLLOWED, finish=0)
+        if found is not None:
+            tried.append((found.chi2, found.values))
+    if not tried:
+        return nothing
+    tried.sort(key=lambda one: one[0])
+    shape = [i for i in candidate.own if i not in candidate.amplitudes]
+    free = [i for i in candidate.free if i not in shape]
+    last = fit(problem, w, torch.stack([values for _, values in tried[:BEST]]), free, max_steps=GONE_ON, finish=0)
+    return nothing if last is None or last.ends is None or last.ends_chi2 is None else (last.ends, last.ends_chi2)
 
 
 def make_up(base: Fitted, candidate: Candidate, row: Tensor, effect: Tensor) -> Tensor:

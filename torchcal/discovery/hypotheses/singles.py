@@ -1,7 +1,18 @@
 """Single terms that act everywhere: those that the screening leaves a chance, refitted."""
 
+import torch
+
 from torchcal.discovery.hypotheses.aliases import merge
-from torchcal.discovery.hypotheses.beginnings import BENT, beginnings, first_guess, is_far, learned
+from torchcal.discovery.hypotheses.beginnings import (
+    BENT,
+    beginnings,
+    farther,
+    first_guess,
+    is_far,
+    learned,
+    valleys,
+    within_bounds,
+)
 from torchcal.discovery.hypotheses.model import Hypothetical
 from torchcal.discovery.hypotheses.refitting import improve, refit_together
 from torchcal.discovery.hypotheses.search import Search
@@ -16,6 +27,9 @@ FEW, CHANCE = 6, 0.2
 #: Share of the misfit of a bent base that the best term leaves at most, and the probability of as much structure in
 #: noise below which it leaves something, for others to be tried from its base.
 MOSTLY, PLAINLY = 0.5, 0.01
+#: χ² a datum of the base from which on terms are also tried farther away than tangents tell; and by how much χ² must
+#: fall below that of a term's fit for it to begin there.
+STRONG, LOWER = 2.0, 2.0
 
 
 def refit_singles(search: Search, *, detected: bool = True) -> None:
@@ -37,6 +51,8 @@ def refit_singles(search: Search, *, detected: bool = True) -> None:
     search.models += [model for model in found if model is not None]
     search.reweigh()
     _learn(search)
+    if detected:
+        _go_farther(search)
     merge(search)
 
 
@@ -59,5 +75,31 @@ def _learn(search: Search) -> None:
             continue
         if len(rows):
             wanted.append(Hypothetical((i,), search.candidates[i], rows, search.prior))
+    improve(search, wanted)
+    search.reweigh()
+
+
+def _go_farther(search: Search) -> None:
+    """Where much is missing, or the base fits elsewhere too or ran to a bound, every term begins at larger effects too.
+    """
+    if search.exact or search.stop.is_set():
+        return
+    within = within_bounds(search.base, search.fixed, search.seed)
+    places = [*valleys(search.base, search.fixed, search.seed), *(() if within is None else (within,))]
+    if not (places or search.base.chi2 > STRONG * search.problem.n):
+        return
+    elsewhere = torch.stack([*places, first_guess(search.base, search.fixed, search.seed)])
+    wanted = []
+    for i, candidate in enumerate(search.candidates):
+        if search.screening.best[i] < 0:
+            continue
+        own = search.plain.get(i)
+        least = search.base.chi2 if own is None else min(own.found.chi2, search.base.chi2)
+        try:
+            rows, chi2 = farther(search.residual, search.screening, i, candidate, elsewhere)
+        except SimulatorError:  # as above
+            continue
+        if bool((chi2 < least - LOWER).any()):
+            wanted.append(Hypothetical((i,), candidate, rows[chi2 < least - LOWER], search.prior))
     improve(search, wanted)
     search.reweigh()

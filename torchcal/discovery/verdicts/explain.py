@@ -344,8 +344,9 @@ def deeper(search: Search, model: Model) -> Fitted | None:
     if again is None or not again.chi2 < found.chi2 - DEEPER:
         return None
     better = fit(found.problem, found.whitening, again.values[None], found.free)
-    same = better is not None and torch.equal(better.at_bound, found.at_bound) and better.chi2 < found.chi2 - DEEPER
-    return better if same else None
+    if better is None or bool((better.at_bound & ~found.at_bound).any()):
+        return None
+    return better if better.chi2 < found.chi2 - DEEPER else None
 
 
 def _sized(search: Search, model: Model) -> list[int]:
