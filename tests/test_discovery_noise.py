@@ -1007,3 +1007,21 @@ def test_few_data_in_slow_noise_of_unknown_size_raise_few_alarms(rho):
     seeds = 60
     alarms = sum(two_outputs_in_slow_noise(seed, rho).verdict != "consistent" for seed in range(seeds))
     assert alarms <= most(seeds, 0.02, tail=3e-3)
+
+
+def test_noise_does_not_grow_because_one_of_two_terms_was_missing_when_it_was_estimated():
+    v, d, length = (a.ravel() for a in np.meshgrid(np.geomspace(0.02, 1.5, 9), [1, 3, 6.0], [0.2, 0.6], indexing="ij"))
+    truth = 9 * v * length / d**2 + v**2 * length / d + 0.4 * v**2
+    y = truth + 0.05 * np.random.default_rng(10).standard_normal(54)
+    bed = tc.Simulator(
+        lambda x, p: {"dp": p["A"] * x["v"] * x["L"] / x["d"] ** 2 + p["B"] * x["v"] ** 2 * x["L"] / x["d"]},
+        [tc.Parameter("A", low=0, initial=10.0), tc.Parameter("B", low=0, high=100, neutral=0.0)],
+    )
+    ends = tc.Term("ends", outputs={"dp": lambda x, p, y: y + p["z"] * x["v"] ** 2}, parameters=[tc.Parameter("z")])
+    x = {name: torch.tensor(column) for name, column in {"v": v, "d": d, "L": length}.items()}
+    terms = [tc.Term("inertia", frees=("B",)), ends]
+    found = tc.diagnose(bed, tc.Recording(x=x, y={"dp": torch.tensor(y)}), terms, progress=False)
+    assert (found.verdict, set(found.terms)) == ("named", {"inertia", "ends"}), str(found)
+    assert "growing" not in str(found)
+    (size,) = [e for e in found.final.estimates if e.name == "ends.z"]
+    assert abs(size.value - 0.4) < 3 * size.sd < 0.04

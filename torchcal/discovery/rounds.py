@@ -169,17 +169,21 @@ def with_explained(search: Search, observed: Problem, confidence: float) -> Sear
 
 
 def without_others(search: Search, observed: Problem) -> Search:
-    """The search with the outliers of several terms, where these are others than those of the best single one.
+    """The search with the outliers of several terms, or noise that grows as it does beside these, where that is not as
+    beside the best single one.
 
     Its models are fitted again, and no others.
     """
     best = search.physical_leader
     if best is None or len(best.numbers) < 2 or search.stop.is_set():
         return search
-    sticking = outliers(search, observed.keep)
+    sticking, unit = outliers(search, observed.keep), other_growth(search)
     if sticking is None or torch.equal(observed.keep & ~sticking, search.problem.keep):
+        sticking = None
+    if sticking is None and unit is None:
         return search
-    other = _of(search, observed.keeping(~sticking))
+    kept = search.problem if sticking is None else observed.keeping(~sticking)
+    other = _of(search, kept, unit=search.unit if unit is None else unit)
     other.screen_all()
     take_over(other, search.models)
     return other if not search.stop.is_set() and other.physical_leader is not None else search
