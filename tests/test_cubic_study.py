@@ -21,6 +21,12 @@ from examples import cubic
 from torchcal.results import AdditiveCalibration, Calibration
 
 CASES = [(model, n) for model in cubic.MODELS for n in cubic.SIZES]
+ALL = [
+    pytest.param(model, n, gamma, marks=() if (n == 11) == (gamma == 1.0) else pytest.mark.slow)
+    for model, n in CASES
+    for gamma in (1.0, 0.5)
+]
+"""Each model runs always with each size and each γ, but not with every pair of them."""
 MORE_DATA = math.sqrt(11 / 51)
 SEEDS = (0, 1, 2, 3)
 
@@ -112,8 +118,7 @@ class Oracle:
         return best
 
 
-@pytest.mark.parametrize("gamma", [1.0, 0.5])
-@pytest.mark.parametrize(("model", "n"), [case for case in CASES if case[0] != "cubic"])
+@pytest.mark.parametrize(("model", "n", "gamma"), [case for case in ALL if case.values[0] != "cubic"])
 def test_map_is_that_of_an_independent_search(model: str, n: int, gamma: float) -> None:
     oracle = Oracle(model, n, gamma=gamma)
     theta = oracle.best()
@@ -155,8 +160,7 @@ def test_the_quadratic_model_has_two_equal_maxima_that_mirror_each_other(n: int,
 # --- cold start ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("model", "n"), CASES)
-@pytest.mark.parametrize("gamma", [1.0, 0.5])
+@pytest.mark.parametrize(("model", "n", "gamma"), ALL)
 def test_cold_start_from_any_seed_reaches_the_same_map(model: str, n: int, gamma: float) -> None:
     first = map_of(model, n, gamma=gamma)
     spread = float(first.recording.spread[0])
@@ -229,7 +233,7 @@ def test_more_data_narrow_the_posterior_and_the_conventional_push_forward() -> N
     assert cubic.root_mean_square(many) / cubic.root_mean_square(few) == pytest.approx(MORE_DATA, rel=0.3)
 
 
-@pytest.mark.parametrize("n", cubic.SIZES)
+@pytest.mark.parametrize("n", [11, pytest.param(51, marks=pytest.mark.slow)])
 def test_conventional_calibration_has_its_analytic_posterior(n: int) -> None:
     """With flat λ and ln σ, λ is Student's with N − d degrees of freedom: Cov = RSS / (N − d − 2) (BᵀB)⁻¹."""
     basis, y = Oracle("linear", n).basis, Oracle("linear", n).y

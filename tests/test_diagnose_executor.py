@@ -116,10 +116,13 @@ def test_other_processes_give_the_same(motion, here):
         pickle.dumps(library())
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(2, mp_context=context) as pool:
-        check_same(diagnose(motion, executor=pool), here)
+        recorder = Recorder(pool)
+        check_same(diagnose(motion, executor=recorder), here)
+        assert len(recorder.futures) > 0
         assert pool.submit(math.sqrt, 4.0).result() == 2.0  # left open, and in order
 
 
+@pytest.mark.slow
 def test_threads_give_the_same(motion, here):
     pytest.importorskip("cloudpickle")
     threads = torch.get_num_threads()
@@ -152,7 +155,7 @@ def fan(x, p):
     return p["m"] * torch.log(x)
 
 
-@pytest.mark.parametrize("workers", [1, 2])
+@pytest.mark.parametrize("workers", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_simulators_without_time(workers):
     """Their derivatives are forward ones, of which torch keeps one level for all threads."""
     x = torch.linspace(0.5, 2, 30, dtype=F64)

@@ -131,7 +131,9 @@ def test_a_ripple_over_decades_of_a_condition_is_something_unknown(binding):
     assert d.noise.sd["y"] == pytest.approx(0.01, rel=1.0)
 
 
-@pytest.mark.parametrize("rho", [0.0, 0.6, 0.9])
+@pytest.mark.parametrize(
+    "rho", [pytest.param(0.0, marks=pytest.mark.slow), 0.6, pytest.param(0.9, marks=pytest.mark.slow)]
+)
 def test_without_the_ripple_nothing_is_missing(binding, rho):
     assert dose_response(binding, 0.0, 1, rho=rho).verdict == "consistent"
 

@@ -451,7 +451,7 @@ def test_an_instrument_that_all_likelier_hypotheses_hold_is_no_name():
         lambda x: 4 * (x - 0.15).clamp_min(0) ** 2,
         pytest.param(lambda x: 4 * (x - 0.25).clamp_min(0) ** 2, marks=pytest.mark.slow),
         pytest.param(lambda x: 3 * (x - 0.2).clamp_min(0) ** 1.5, marks=pytest.mark.slow),
-        lambda x: torch.sin(3 * x),
+        pytest.param(lambda x: torch.sin(3 * x), marks=pytest.mark.slow),
     ],
 )
 def test_three_terms_together_and_windows_make_no_name_of_one(bend):

@@ -304,7 +304,7 @@ def test_both_data_at_one_level_of_a_grid_that_are_set_aside_are_told():
     assert "b = 40 and output 'y' at a = 1.579, b = 60" in told
 
 
-@pytest.mark.parametrize("noise", [0.05, None])
+@pytest.mark.parametrize("noise", [pytest.param(0.05, marks=pytest.mark.slow), None])
 def test_two_neighbours_alone_that_are_set_aside_are_told(noise):
     x = torch.linspace(0, 10, 50, dtype=F64)
     y = 2 * torch.exp(-0.3 * x) + draw(50, 0.05, 3)

@@ -83,9 +83,18 @@ def crept(tertiary, seed=0):
     return x, clean + sd * np.random.default_rng(seed).standard_normal(16), sd
 
 
-@pytest.mark.parametrize(("tertiary", "place"), [(0.075, None), (0.0, 15), (0.0, 10)])
-@pytest.mark.parametrize("unit", [1e-6, 1e6])
-def test_what_one_datum_shows_alone_is_told_and_no_name(tertiary, place, unit):
+@pytest.mark.parametrize(
+    ("unit", "tertiary", "place"),
+    [
+        (1e-6, 0.075, None),
+        (1e6, 0.0, 15),
+        (1e-6, 0.0, 10),
+        pytest.param(1e6, 0.075, None, marks=pytest.mark.slow),
+        pytest.param(1e-6, 0.0, 15, marks=pytest.mark.slow),
+        pytest.param(1e6, 0.0, 10, marks=pytest.mark.slow),
+    ],
+)
+def test_what_one_datum_shows_alone_is_told_and_no_name(unit, tertiary, place):
     # The last in time is a hundred sd off the base, by tertiary creep or by mistake; that in the middle is a mistake.
     x, y, sd = crept(tertiary)
     if place is not None:

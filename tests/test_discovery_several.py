@@ -367,7 +367,7 @@ def inhibited(competitive: float, uncompetitive: float, seed: int) -> tuple[tc.S
     return tc.Simulator(rate, parameters), tc.Recording(x=x, y={"v": y}, noise=1.0)
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_terms_that_free_what_a_third_one_frees_are_no_more_models(seed):
     d = tc.diagnose(*inhibited(1.0, 0.15, seed), INHIBITED, progress=False)
     assert (d.verdict, d.terms) == ("named", ["mixed inhibition"])

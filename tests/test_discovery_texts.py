@@ -789,7 +789,7 @@ def test_opposites_that_have_one_sign_each_are_not_the_same(low, told):
     assert any("less and more are nearly the same" in row for row in d.identifiability) is told
 
 
-@pytest.mark.parametrize("size", [0.1, -0.1])
+@pytest.mark.parametrize("size", [0.1, pytest.param(-0.1, marks=pytest.mark.slow)])
 def test_what_may_not_have_the_sign_that_was_found_is_no_alias(size):
     x = torch.linspace(1, 3, 40, dtype=F64)
     base = tc.Simulator(lambda x, p: p["k"] / x, [tc.Parameter("k", low=0.0)])

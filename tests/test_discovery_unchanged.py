@@ -161,7 +161,7 @@ def test_a_noisier_run_is_no_missing_physics(seed):
     assert high == pytest.approx(0.2, rel=0.4)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_a_run_whose_noise_goes_on_is_not_taken_for_a_quieter_one(seed):
     model, plain = cooling((0.1,) * 3, (100,) * 3, (0.05,) * 3, seed)
     runs = list(plain.runs)
@@ -192,7 +192,9 @@ def test_time_is_on_no_logarithmic_scale_wherever_its_clock_begins():
     assert Span.of(at, time=False).log
 
 
-@pytest.mark.parametrize(("origin", "size"), [(0.0, 1.0), (-10.0, 1.0), (0.0, 1000.0)])
+@pytest.mark.parametrize(
+    ("origin", "size"), [pytest.param(0.0, 1.0, marks=pytest.mark.slow), (-10.0, 1.0), (0.0, 1000.0)]
+)
 def test_a_shape_without_bounds_is_sought_where_the_data_are(origin, size):
     z = torch.linspace(0, 5, 60, dtype=F64)
     x, y = z * size + origin, 1 + 2 * z + 0.5 * torch.exp(-(((z - 3) / 0.5) ** 2)) + 0.05 * white(60, 0)

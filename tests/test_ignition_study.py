@@ -265,7 +265,7 @@ def test_coefficients_are_correlated_as_in_the_paper(posteriors: dict[str, Calib
     assert float(r[1, 4]) == pytest.approx(-0.60, abs=0.12)
 
 
-@pytest.mark.parametrize("key", ["1a", "2"])
+@pytest.mark.parametrize("key", ["1a", pytest.param("2", marks=pytest.mark.slow)])
 def test_epsilon_scales_the_posterior_of_alpha(key: str, posteriors: dict, prepared: dict[str, Study]) -> None:
     (wide, wide_error), (narrow, narrow_error) = (
         _sd_with_error(study.upright(one)) for one in (posteriors[key], _posterior(prepared[key], 1e-4, 60))

@@ -301,7 +301,7 @@ def test_the_maximum_is_that_of_the_plain_search(recording: tc.Recording) -> Non
     torch.testing.assert_close(means[0], means[1], rtol=1e-4, atol=1e-4)
 
 
-@pytest.mark.parametrize("apart", [0.0, 1.0])
+@pytest.mark.parametrize("apart", [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
 def test_starts_that_disagree_are_told_also_where_the_best_is_refined(
     monkeypatch: pytest.MonkeyPatch, apart: float
 ) -> None:

@@ -152,7 +152,8 @@ def test_the_reference_of_gravity_is_the_largest_distance():
 @pytest.mark.parametrize(
     ("time", "mine", "told"),
     [("s", "min", True), pytest.param("h", "min", True, marks=pytest.mark.slow),
-     ("min", "minutes", False), ("s", "ticks", False), ("min", None, False)],
+     ("min", "minutes", False), pytest.param("s", "ticks", False, marks=pytest.mark.slow),
+     pytest.param("min", None, False, marks=pytest.mark.slow)],
 )  # fmt: skip
 def test_a_library_in_another_unit_of_time_is_told(time, mine, told):
     model, recording = decay((1.0,), units={"time": mine, "A": "mol/L"} if mine else None)

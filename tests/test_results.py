@@ -582,8 +582,14 @@ def test_a_part_of_a_file_is_told(sampled, tmp_path, end):
         Calibration.load(path)
 
 
-@pytest.mark.parametrize("lost", ["map", "prediction", "observed_data", "constant_data"])
-@pytest.mark.parametrize("name", ["point", "additive"])
+@pytest.mark.parametrize(
+    ("name", "lost"),
+    [
+        *(("point", lost) for lost in ("map", "prediction", "observed_data", "constant_data")),
+        ("additive", "prediction"),  # the others are read by the same lines
+        *(pytest.param("additive", lost, marks=pytest.mark.slow) for lost in ("map", "observed_data", "constant_data")),
+    ],
+)
 def test_a_file_that_lacks_a_group_is_told(name, request, tmp_path, lost):
     result = request.getfixturevalue(name)
     path = tmp_path / "result.nc"
@@ -595,8 +601,17 @@ def test_a_file_that_lacks_a_group_is_told(name, request, tmp_path, lost):
 
 @pytest.mark.parametrize(
     "lost",
-    [("settings",), ("diagnostics",), ("recording",), ("kind",), ("format",)]
-    + [("settings", name) for name in ("center", "order", "units", "embedding")],
+    [
+        pytest.param(("settings",), marks=pytest.mark.slow),
+        ("diagnostics",),
+        ("recording",),
+        ("kind",),
+        pytest.param(("format",), marks=pytest.mark.slow),
+        ("settings", "center"),
+        pytest.param(("settings", "order"), marks=pytest.mark.slow),
+        ("settings", "units"),
+        pytest.param(("settings", "embedding"), marks=pytest.mark.slow),
+    ],
 )
 @pytest.mark.parametrize("name", ["point", pytest.param("additive", marks=pytest.mark.slow)])  # read by the same lines
 def test_a_file_that_lacks_a_setting_is_told(name, request, tmp_path, lost):

@@ -71,14 +71,17 @@ LIKELIHOODS = {
     "full": likelihoods.Full(num_samples=24, floor=0.02),
 }
 PRIORS = {"flat": priors.Flat, "uniform": uniform, "normal": normal}
-# Flat is improper with these two, and is refused.
+# Flat is improper with these two, and is refused. Each likelihood runs always with each prior, by turns with bounds.
 CASES = [
-    pytest.param(LIKELIHOODS[name], PRIORS[prior], bounded, noise, id=f"{name}, {prior}, {words}")
-    for name in LIKELIHOODS
-    for prior in PRIORS
+    pytest.param(
+        LIKELIHOODS[name], PRIORS[prior], bounded, noise, id=f"{name}, {prior}, {words}",
+        marks=() if (i + j + bounded) % 2 else pytest.mark.slow,
+    )
+    for i, name in enumerate(LIKELIHOODS)
+    for j, prior in enumerate(PRIORS)
     for bounded, noise, words in ((True, None, "bounds"), (False, 0.1, "no bounds, noise"))
     if prior != "flat" or name not in ("full", "abc_mean")
-]
+]  # fmt: skip
 
 
 def captured(monkeypatch, calibrate, *arguments, **options):

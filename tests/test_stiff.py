@@ -263,7 +263,7 @@ def test_steps_become_short_where_a_stiff_solution_jumps(stiff):
 @pytest.mark.parametrize(
     ("k", "stiff"),
     [
-        (300.0, True),
+        pytest.param(300.0, True, marks=pytest.mark.slow),
         (1e4, None),
         pytest.param(300.0, None, marks=pytest.mark.slow),
         pytest.param(1e4, True, marks=pytest.mark.slow),
