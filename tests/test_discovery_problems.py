@@ -209,3 +209,32 @@ def test_a_name_is_tied_once_wherever_it_acts(monkeypatch):
     decision.tied = [["deposition"]]
     decision_of.tie_other_names(search, model, decision)
     assert decision.tied == [["deposition"], ["night loss"]]
+
+
+def test_where_a_name_acts_is_told_though_an_unknown_change_may_be_elsewhere():
+    """Storage in a well acts at first; the base makes up for it, so that it may as well be something later."""
+
+    def theis(x, p):
+        """With the well function of Swamee & Ohija (2003, J. Irrig. Drain. Eng. 129, 70-76)."""
+        u = p["S"] * x["r"] ** 2 / (4 * p["T"] * x["t"])
+        early = (torch.log((0.56146 / u + 0.65).clamp_min(1.0001)) * (1 + u)) ** -7.7
+        return {"s": 20 / (4 * math.pi * p["T"]) * (early + u**4 * torch.exp(7.7 * u) * (2 + u) ** 3.7) ** -0.13}
+
+    t, r = np.meshgrid(np.geomspace(0.05, 72, 16), [10.0, 30.0, 90.0], indexing="ij")
+    x = {"t": torch.tensor(t.ravel()), "r": torch.tensor(r.ravel())}
+    y = theis(x, {"T": 6.0, "S": 8e-4})["s"] * (1 - 0.4 * torch.exp(-x["t"] / 0.5))
+    y += 0.01 * torch.tensor(np.random.default_rng(5).standard_normal(48))
+    well = tc.Simulator(
+        theis,
+        [tc.Parameter("T", low=0.5, high=50, initial=5.0), tc.Parameter("S", low=1e-5, high=2e-3, initial=1e-3)],
+    )
+    storage = tc.Term(
+        "storage",
+        outputs={"s": lambda x, p, y: y * (1 - p["on"] * torch.exp(-x["t"] / p["tw"]))},
+        parameters=[tc.Parameter("on", low=0.0, high=1.0), tc.Parameter("tw", low=0.05, high=5.0)],
+    )
+    d = tc.diagnose(well, tc.Recording(x=x, y={"s": y}), [storage], progress=False)
+    assert d.terms == ["storage"], str(d)
+    first = d.where[0]
+    assert (first.kind, first.target, first.driver) == ("output", "s", "t")
+    assert first.spans[-1][1] < 2, d.where

@@ -671,6 +671,7 @@ def test_places_are_told_to_a_thousandth_of_their_extent():
     span = local.Span(2459000.0, 2459030.0, False)
     assert local.region_text("t", 2459012.341, math.inf, span) == "t > 2459012.34"
     assert local.region_text("t", 12.3456, 20.0, None) == "12.35 < t < 20"
+    assert local.region_text("t", 7.998, 7.996, None) == "t near 7.997"  # it has closed
     for extent in (600.0, 3600.0, 86400.0):
         start = 1.7e9 + 0.412 * extent
         span = local.Span(1.7e9, 1.7e9 + extent, False)

@@ -41,7 +41,7 @@ from torchcal.discovery.verdicts.intervals import by_profile
 from torchcal.discovery.verdicts.lost import is_lost, misfit_in_spreads
 from torchcal.discovery.verdicts.verdict import PLAINLY_WHITE
 from torchcal.errors import ConvergenceWarning, warn
-from torchcal.simulators import Parameter, Simulator, Trajectories, is_value_of
+from torchcal.simulators import Simulator, Trajectories, is_value_of
 from torchcal.terms import Term, extend
 
 __all__ = ["Asked", "conclude"]
@@ -217,16 +217,17 @@ def _solver(simulator: Simulator) -> str:
 
 
 def _improved(simulator: Simulator, best: Model) -> Simulator:
-    """The user's simulator with the accepted terms, begun at their estimates, or at the mean of each run's."""
+    """The user's simulator with the accepted terms, begun at the estimates of both, or at the mean of each run's."""
     improved = extend(simulator, best.candidate.terms)
-    estimate = best.found.by_name
-    own = [best.found.problem.parameters[i].name for i in best.candidate.own]
+    estimate, problem = best.found.by_name, best.found.problem
+    own = {problem.parameters[i].name for i in best.candidate.own}
+    fitted = [problem.parameters[i].name for i in best.found.free]
     parameters = []
     for q in improved.parameters:
-        values = [estimate[name] for name in own if is_value_of(name, q.name)]
-        value = sum(values) / max(len(values), 1)
-        if values and q.contains(value):
-            q = Parameter(q.name, q.unit, q.low, q.high, value, None, q.transform, q.per_run)
+        names = [name for name in fitted if is_value_of(name, q.name)]
+        value = sum(estimate[name] for name in names) / max(len(names), 1)
+        if names and q.contains(value):
+            q = dataclasses.replace(q, initial=value, neutral=None if own & {*names} else q.neutral)
         parameters.append(q)
     improved.parameters = tuple(parameters)
     return improved

@@ -31,6 +31,8 @@ SLIVER = 0.02
 TIED = 4
 #: Share of what a name removes below which an unknown change of the same place does not tell what it does.
 PART = 0.5
+#: Share of a place up to which a name hardly acts there.
+MEETS = 0.25
 #: Log evidence from which on a place is listed, and how many are.
 LEAST_EVIDENCE, LISTED = 2.0, 8
 
@@ -149,7 +151,9 @@ def locate(
         mine = bool(places) and (places[0].channel.kind, places[0].channel.target) in own
         if not mine or places[0].share < PART * removed(search, best):  # as of what an instrument remembers
             likely = sorted(places, key=lambda place: -place.evidence)
-            rows.append(_contributed(search, best, [place.driver for place in likely]))
+            rows.append(_moved(search, best, search.base.y, [place.driver for place in likely]))
+        else:
+            rows += _elsewhere(search, best, places[0])
     seen: set[tuple[str, str]] = set()
     known = {(row.kind, row.target, row.driver) for row in rows}
     for place in places:
@@ -226,12 +230,13 @@ def _reads(model: Model) -> set[str]:
     return read
 
 
-def _contributed(search: Search, model: Model, drivers: Sequence[str]) -> Location:
-    """What a model moves that the base could not, along the first of some drivers: where no place stands for its term.
+def _moved(search: Search, model: Model, other: Tensor, drivers: Sequence[str]) -> Location:
+    """Where a model moves what another one gives at the data ``(n,)``, along the first of some drivers.
+
+    From the base, where no place stands for its term: that is what the base could not do.
     """
     found = model.found
-    change = found.y - search.base.y
-    size = (change / search.noise.sd[found.problem.index]).abs().nan_to_num(nan=0.0, posinf=0.0)
+    size = ((found.y - other) / search.noise.sd[found.problem.index]).abs().nan_to_num(nan=0.0, posinf=0.0)
     at_data = found.problem.drivers_at_data(found.values[None], found.warm)
     driver = next((name for name in drivers if name in at_data), next(iter(at_data)))
     values, which = at_data[driver].unique(return_inverse=True)
@@ -240,6 +245,27 @@ def _contributed(search: Search, model: Model, drivers: Sequence[str]) -> Locati
     spans, share, evidence = _ranges(values, largest), removed(search, model), _evidence(search, model)
     told: dict[str, Any] = {"extent": _extent(values), "terms": model.names, "also": tuple(also)}
     return Location(kind, target, driver, spans, share, evidence, **told)
+
+
+def _elsewhere(search: Search, model: Model, place: Place) -> list[Location]:
+    """Where a model's terms act, if hardly in its place.
+
+    An unknown change is known but for what the base makes up for: it may as well be told at the other end.
+    """
+    found, candidate = model.found, model.candidate
+    problem = found.problem
+    if place.driver not in problem.drivers_at_data(found.values[None], found.warm):
+        return []
+    bare = candidate.without(found.values, candidate.amplitudes)
+    row = _moved(search, model, problem.evaluate(bare[None], [], found.warm)[0][0], [place.driver])
+    values = place.channel.drivers[place.driver].unique()
+    acts, told = (_within(values, spans) for spans in (row.spans, _spans(place)))
+    return [row] if bool(acts.any()) and int((acts & told).sum()) <= MEETS * int(told.sum()) else []
+
+
+def _within(values: Tensor, spans: Sequence[tuple[float, float]]) -> Tensor:
+    """Which values lie in one of some ranges, bool."""
+    return torch.stack([(values >= low) & (values <= high) for low, high in spans]).any(0)
 
 
 def _evidence(search: Search, model: Model) -> float:

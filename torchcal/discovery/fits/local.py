@@ -190,5 +190,7 @@ def region_text(driver: str, low: float, high: float, span: Span | None) -> str:
     """A range of a driver in words; its ends to a thousandth of the span in a recording, where that is known."""
     extent = 0.0 if span is None else span.high - span.low
     if math.isfinite(low) and math.isfinite(high):
+        if low >= high:  # a window that has closed
+            return f"{driver} near {placed(0.5 * (low + high), extent)}"
         return f"{placed(low, extent)} < {driver} < {placed(high, extent)}"
     return f"{driver} > {placed(low, extent)}" if math.isfinite(low) else f"{driver} < {placed(high, extent)}"

@@ -123,7 +123,8 @@ def bends_to_physics(search: Search, model: Model) -> str:
     return (
         f"Several errors of one instrument follow nearly any curve, and an unknown change of the {rival.channel.kind} "
         f"{rival.channel.target} {along} would do {well} as one of what {output} reads: a check of that instrument "
-        "would tell."
+        "would tell. Physics is written by shifts= of parameters or by rates=: what outputs= makes of a reading alone "
+        "counts as an instrument."
     )
 
 
