@@ -46,9 +46,9 @@ NEW = 1e-3
 STEPS, LADDER = (0.05, 1.0), tuple(4.0**k for k in range(-2, 6))
 #: Multiples of the linear estimate, or of its sd where that is more, at which a candidate begins farther away: from the
 #: base, against its linear estimate from as much, and where the base may be elsewhere.
-FARTHER, ELSEWHERE = (4.0, 16.0, 64.0), (1.0, 8.0, 64.0)
+FARTHER, ELSEWHERE = (6.0, 48.0), (2.0, 32.0)
 #: Steps in which the base follows such an effect, and how many of them go on for so many more, all free but shapes.
-FOLLOWED, BEST, GONE_ON = 5, 3, 8
+FOLLOWED, BEST, GONE_ON = 5, 2, 8
 #: Starts from anywhere, and from exchanged parameters at most, by which other valleys of the base are sought, and their
 #: steps; difference of a parameter, in its sd and in its size, from which on fits are in two; how many more are looked
 #: at, and up to how many times the base's χ².
@@ -148,30 +148,28 @@ def farther(
     place = candidate.amplitudes[int(screening.amplitude[column])]
     row = candidate.begin.clone()
     row[candidate.own] = candidate.shapes[int(screening.shape[column])]
-    side, groups = candidate.one_sided(place), []
+    side, rows = candidate.one_sided(place), []
     for sign in (1.0, -1.0):
         if side and sign != side:
             continue
         sizes = FARTHER if sign * score > 0 else (1.0, *FARTHER)
-        groups.append(_each(row, place, [float(row[place]) + sign * size * k for k in sizes]))
+        rows += _each(row, place, [float(row[place]) + sign * size * k for k in sizes])
         for other in elsewhere:
             moved = row.clone()
             moved[columns] = other[base.free]
-            groups.append(_each(moved, place, [float(row[place]) + sign * size * k for k in ELSEWHERE]))
+            rows += _each(moved, place, [float(row[place]) + sign * size * k for k in ELSEWHERE])
     low, high = problem.limits()
     w = residual.noise.whitening(problem)
-    tried = []
-    for group in groups:
-        rows = torch.stack(group).clamp(low, high)
-        found = fit(problem, w, rows.unique(dim=0), columns, max_steps=FOLLOWED, finish=0)
-        if found is not None:
-            tried.append((found.chi2, found.values))
-    if not tried:
+    begin = torch.stack(rows).clamp(low, high).unique(dim=0)
+    found = fit(problem, w, begin, columns, max_steps=FOLLOWED, finish=0)
+    if found is None or found.ends is None or found.ends_chi2 is None:
         return nothing
-    tried.sort(key=lambda one: one[0])
+    by_size: dict[float, int] = {}  # the best of every size, which is held
+    for k in found.ends_chi2.argsort().tolist():
+        by_size.setdefault(float(found.ends[k, place]), k)
     shape = [i for i in candidate.own if i not in candidate.amplitudes]
     free = [i for i in candidate.free if i not in shape]
-    last = fit(problem, w, torch.stack([values for _, values in tried[:BEST]]), free, max_steps=GONE_ON, finish=0)
+    last = fit(problem, w, found.ends[[*by_size.values()][:BEST]], free, max_steps=GONE_ON, finish=0)
     return nothing if last is None or last.ends is None or last.ends_chi2 is None else (last.ends, last.ends_chi2)
 
 

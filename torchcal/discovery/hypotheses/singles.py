@@ -27,9 +27,10 @@ FEW, CHANCE = 6, 0.2
 #: Share of the misfit of a bent base that the best term leaves at most, and the probability of as much structure in
 #: noise below which it leaves something, for others to be tried from its base.
 MOSTLY, PLAINLY = 0.5, 0.01
-#: χ² a datum of the base from which on terms are also tried farther away than tangents tell; and by how much χ² must
-#: fall below that of a term's fit for it to begin there.
-STRONG, LOWER = 2.0, 2.0
+#: χ² a datum of the base from which on terms are also tried farther away than tangents tell; by how much χ² must fall
+#: below that of a term's fit for it to begin there; and how far from where it plays a part it may still be then, as a
+#: share of the way from the base.
+STRONG, LOWER, NEARLY = 2.0, 2.0, 0.1
 
 
 def refit_singles(search: Search, *, detected: bool = True) -> None:
@@ -89,12 +90,13 @@ def _go_farther(search: Search) -> None:
     if not (places or search.base.chi2 > STRONG * search.problem.n):
         return
     elsewhere = torch.stack([*places, first_guess(search.base, search.fixed, search.seed)])
-    wanted = []
+    wanted, aim = [], search.aim(search.models)
+    aim += NEARLY * max(search.base.chi2 - aim, 0.0)
     for i, candidate in enumerate(search.candidates):
         if search.screening.best[i] < 0:
             continue
         own = search.plain.get(i)
-        least = search.base.chi2 if own is None else min(own.found.chi2, search.base.chi2)
+        least = min(search.base.chi2 if own is None else min(own.found.chi2, search.base.chi2), aim)
         try:
             rows, chi2 = farther(search.residual, search.screening, i, candidate, elsewhere)
         except SimulatorError:  # as above
