@@ -1114,3 +1114,42 @@ def test_a_base_that_fits_with_two_rates_exchanged_hides_no_term():
     assert (d.verdict, d.terms) == ("named", ["saturable elimination"]), str(d)
     (size,) = [e for e in d.final.estimates if e.name == "saturable elimination.a"]
     assert abs(size.value - 0.04) < 3 * size.sd < 0.03
+
+
+def test_a_base_in_a_higher_minimum_is_calibrated_from_the_lower_one_and_no_term_is_named():
+    """A wave whose frequency its calibration misses, as any term that is fitted beside it may not."""
+    x = torch.linspace(0, 10, 60, dtype=torch.float64)
+    rng = np.random.default_rng(114)
+    w, guess = rng.uniform(4, 12), rng.uniform(1.5, 8)
+    y = 2 * torch.sin(w * x) + 0.1 * torch.tensor(rng.standard_normal(60))
+    wave = tc.Simulator(
+        lambda x, p: {"y": p["A"] * torch.sin(p["w"] * x)},
+        [tc.Parameter("A", low=0, initial=1.0), tc.Parameter("w", low=0, high=15, initial=guess)],
+    )
+    recording = tc.Recording(x=x, y={"y": y}, noise=0.1)
+    stuck = calibrate_base(Problem.of(wave, recording), {}, 4, 0)[0]
+    assert stuck.chi2 > 100 * 60
+    drift = tc.Term("drift", outputs={"y": lambda x, p, y: y + p["b"] * x}, parameters=[tc.Parameter("b")])
+    d = tc.diagnose(wave, recording, [drift], num_starts=4, progress=False)
+    assert d.verdict == "consistent", str(d)
+    assert next(e.value for e in d.base.estimates if e.name == "w") == pytest.approx(w, abs=0.01)
+
+
+def test_a_model_that_refuses_exchanged_parameters_is_diagnosed():
+    def decays(x, p):
+        if bool((p["ka"] < p["ke"]).any()):
+            raise ValueError("ka must exceed ke")
+        fading = torch.exp(-p["ke"] * x) - torch.exp(-p["ka"] * x)
+        return {"y": p["A"] * p["ka"] / (p["ka"] - p["ke"]) * fading}
+
+    parameters = [
+        tc.Parameter("ka", unit="1/h", low=0.5, high=50.0, initial=20.0),
+        tc.Parameter("ke", unit="1/h", low=0.001, high=2.0, initial=0.05),
+        tc.Parameter("A", low=0, initial=100.0),
+    ]
+    x = torch.linspace(0, 10, 60, dtype=torch.float64)
+    truth = decays(x, {name: torch.tensor(v) for name, v in (("ka", 4.0), ("ke", 0.2), ("A", 100.0))})["y"] + 2 * x
+    recording = tc.Recording(x=x, y={"y": truth + torch.tensor(np.random.default_rng(1).standard_normal(60))})
+    drift = tc.Term("drift", outputs={"y": lambda x, p, y: y + p["b"] * x}, parameters=[tc.Parameter("b")])
+    d = tc.diagnose(tc.Simulator(decays, parameters), recording, [drift], num_starts=4, progress=False)
+    assert (d.verdict, d.terms) == ("named", ["drift"]), str(d)

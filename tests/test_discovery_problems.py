@@ -238,3 +238,5 @@ def test_where_a_name_acts_is_told_though_an_unknown_change_may_be_elsewhere():
     first = d.where[0]
     assert (first.kind, first.target, first.driver) == ("output", "s", "t")
     assert first.spans[-1][1] < 2, d.where
+    later = next(place for place in d.where[1:] if (place.kind, place.target, place.driver) == ("output", "s", "t"))
+    assert later.spans[-1][1] > 50  # what an unknown change tells is told as well

@@ -111,6 +111,31 @@ def test_stages_are_solved_along_with_the_states(burnt):
     torch.testing.assert_close(near.y, bound.linearise(bound.x, 1.2 * K[None]).y, rtol=1e-7, atol=1e-12)
 
 
+@pytest.mark.parametrize("factor", [1.0001, 0.97])
+def test_stages_that_do_not_settle_along_with_the_states_are_solved_in_every_pass(factor):
+    """Two substances that meet fast, with a feed that is switched on and off."""
+
+    def rates(t, s, p, u):
+        met, apart = p["k1"] * s["a"] * s["b"], p["k2"] * s["c"]
+        bound, freed = p["k3"] * s["c"] * s["b"], p["k4"] * s["d"]
+        feed = p["f"] * torch.where(torch.sin(3 * torch.as_tensor(t)) > 0, 1.0, 0.0)
+        return {
+            "a": feed - met + apart - 0.3 * s["a"],
+            "b": 0.2 - met + apart - bound + freed - 0.1 * s["b"],
+            "c": met - apart - bound,
+            "d": bound - freed,
+        }
+
+    initial = {"a": 1.0, "b": 0.7, "c": 0.0, "d": 0.0}
+    names = [tc.Parameter(name) for name in ("k1", "k2", "k3", "k4", "f")]
+    model = tc.ODESimulator(rates, [*initial], names, stiff=True)
+    bound = model.bind(tc.Recording(runs=[run_of(np.linspace(0, 6, 60), initial, ("a", "b", "c", "d"))]))
+    values = tensor(14154.0, 4.2705, 34519.0, 12646.0, 1.0)
+    warm = bound.linearise(bound.x, values[None]).warm
+    near = bound.linearise(bound.x, factor * values[None], warm=warm, march=False)
+    torch.testing.assert_close(near.y, bound.linearise(bound.x, factor * values[None]).y, rtol=1e-7, atol=1e-10)
+
+
 def driven(stiff=True, **more):
     """A fast state that follows an input, whose rate constant may differ from run to run, and a slow one behind it."""
     return tc.ODESimulator(

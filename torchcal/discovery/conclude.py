@@ -217,16 +217,19 @@ def _solver(simulator: Simulator) -> str:
 
 
 def _improved(simulator: Simulator, best: Model) -> Simulator:
-    """The user's simulator with the accepted terms, begun at the estimates of both, or at the mean of each run's."""
+    """The user's simulator with the accepted terms, begun at the estimates of both, or at the mean of each run's.
+
+    What ran to a bound, or is zero, is no place to begin.
+    """
     improved = extend(simulator, best.candidate.terms)
     estimate, problem = best.found.by_name, best.found.problem
     own = {problem.parameters[i].name for i in best.candidate.own}
-    fitted = [problem.parameters[i].name for i in best.found.free]
+    fitted = {problem.parameters[i].name for i in best.found.free} - {*best.found.stuck}
     parameters = []
     for q in improved.parameters:
         names = [name for name in fitted if is_value_of(name, q.name)]
         value = sum(estimate[name] for name in names) / max(len(names), 1)
-        if names and q.contains(value):
+        if names and value != 0 and q.contains(value):
             q = dataclasses.replace(q, initial=value, neutral=None if own & {*names} else q.neutral)
         parameters.append(q)
     improved.parameters = tuple(parameters)

@@ -5,6 +5,7 @@ import math
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from torchcal.discovery.fits.fitting import refit
 from torchcal.discovery.fits.problem import Problem
@@ -32,6 +33,7 @@ from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.several import refit_several, scores_beside
 from torchcal.discovery.verdicts.verdict import WHITE, base_alone
 from torchcal.discovery.windows import refit_local
+from torchcal.errors import SimulatorError
 
 __all__ = ["settle", "with_all", "with_explained", "without_others"]
 
@@ -44,6 +46,8 @@ FEW_DATA = 0.1
 OFTEN = 5.0
 #: Degrees of freedom of replicates below which neither counts: such odds take the noise for known.
 WELL_TOLD = 20.0
+#: Models at whose parameters the base is looked at alone, and by how much its χ² must be lower there.
+LOOKED_AT, DEEPER = 4, 6.0
 #: Log odds by which outliers may fall short of models, with those of all data, for a search without them to begin.
 SHORT = 20.0
 #: Probability of the base beside the refitted candidates below which there is more than noise, whatever is left looks
@@ -215,7 +219,42 @@ def _well_told(noise: Noise) -> bool:
 
 
 def _refit(search: Search, confidence: float) -> bool:
-    """Screen and refit single terms, and local ones where there is more than noise, which is returned."""
+    """Screen and refit single terms, and local ones where there is more than noise, which is returned.
+
+    Where the base alone fits better at what has been found of its parameters, its calibration had ended in a higher
+    minimum, which any term may lead out of: then all of it once more from there.
+    """
+    detected = _refit_once(search, confidence)
+    begin = _lower(search) if detected and not search.exact and not search.stop.is_set() else None
+    if begin is not None:
+        search.calibrate_base(begin)
+        detected = _refit_once(search, confidence)
+    return detected
+
+
+def _lower(search: Search) -> Tensor | None:
+    """Parameters ``(1, P)`` at which the base fits better than where it was calibrated: in another of its valleys, or
+    those of a model without its term; None where there are none."""
+    base, rows = search.base, [*search.elsewhere]
+    names = [q.name for q in base.problem.parameters]
+    for model in sorted(search.models, key=lambda model: -model.weight)[:LOOKED_AT]:
+        row, known = base.values.clone(), model.found.by_name
+        row[base.free] = row.new_tensor([known[names[i]] for i in base.free])
+        rows.append(row)
+    if not rows:
+        return None
+    every = torch.stack(rows)
+    try:
+        y = base.problem.evaluate(every, [], base.problem.guess(base.warm, every))[0]
+    except SimulatorError:  # a term may have led where the base alone does not work
+        return None
+    chi2 = base.whitening.vector(base.problem.y - y).square().sum(-1).nan_to_num(nan=math.inf)
+    best = int(chi2.argmin())
+    return every[best : best + 1] if float(chi2[best]) < base.chi2 - DEEPER else None
+
+
+def _refit_once(search: Search, confidence: float) -> bool:
+    """The same with the base as it was calibrated."""
     search.models = []
     search.screen_all()
     detected = at_once = search.exact or search.p_detect < 1.0 - confidence

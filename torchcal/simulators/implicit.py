@@ -41,6 +41,7 @@ class ImplicitSteps(Steps):
     """
 
     order = 6
+    solved_for = True
 
     def step(self, s: Tensor, t: Tensor, h: Tensor, p: Values, u: dict[str, Tensor]) -> Tensor:
         """As `Steps.step`."""
@@ -66,6 +67,13 @@ class ImplicitSteps(Steps):
         """As `Steps.stages`: the stages, on lines from state to state."""
         begin, guess = _points(states[:, :, :-1]), _points(states[:, :, 1:])
         return _towards(begin, guess)
+
+    def solved(self, values: Tensor, states: Tensor, stages: Tensor) -> Tensor:
+        """As `Steps.solved`."""
+        t, h, u = self.grid.flat
+        begin, guess = _points(states[:, :, :-1]), _points(states[:, :, 1:])
+        found = self._stages(begin, t, h, self.layout.by_name(values, self.grid.step_run), u, guess)
+        return torch.where(found.isfinite().all(1, keepdim=True).all(-1, keepdim=True), found, stages)
 
     def linearised(self, values: Tensor, states: Tensor, columns: Sequence[int], stages: Tensor) -> Pass:
         """As `Steps.linearised`: a Newton pass for the stages, with what changes of states and parameters add to it."""

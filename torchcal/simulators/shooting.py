@@ -94,6 +94,21 @@ def close_gaps(
         columns: Places of the parameters to derive by.
         largest: Where the trajectory goes on from an earlier one, its largest states, ``(H, 1, 1, S)``.
     """
+    found = _closed(steps, values, guess, columns, largest, nested=False)
+    left = ~found.settled
+    if not steps.solved_for or not bool(left.any()):
+        return found
+    # Where both together do not settle, the stages are solved anew in every pass of the states.
+    most = None if largest is None else largest[left]
+    for whole, part in zip(found, _closed(steps, values[left], guess[left], columns, most, nested=True), strict=True):
+        whole[left] = part
+    return found
+
+
+def _closed(
+    steps: "Steps", values: Tensor, guess: Tensor, columns: Sequence[int], largest: Tensor | None, *, nested: bool
+) -> Closed:
+    """The same in one way: stages in the passes of the states, or ``nested`` in each of these."""
     states = guess.clone()
     tangents = states.new_full((*states.shape, len(columns)), math.inf)
     begin = steps.first_slopes(values, columns)
@@ -107,6 +122,8 @@ def close_gaps(
         if len(rows) == 0:
             break
         now = states[rows]
+        if nested:
+            stages[rows] = steps.solved(values[rows], now, stages[rows])
         here = steps.linearised(values[rows], now, columns, stages[rows])
         gap = here.ends - now[:, :, 1:]
         size = torch.maximum(now.abs().amax(dim=(1, 2), keepdim=True), before[rows])

@@ -50,6 +50,7 @@ class Steps:
     """
 
     order = 5
+    solved_for = False  # whether there is more to solve for than the states
 
     ode: "ODESimulator"
     layout: Layout
@@ -89,6 +90,10 @@ class Steps:
         """What else there is to solve for along guessed states ``(H, R, K + 1, S)``, as of `Pass`."""
         hyper, runs, nodes, size = states.shape
         return states.new_zeros(hyper, 0, runs * (nodes - 1), size)
+
+    def solved(self, values: Tensor, states: Tensor, stages: Tensor) -> Tensor:
+        """The stages at some states, where they can be found; as they are elsewhere."""
+        return stages
 
     def linearised(self, values: Tensor, states: Tensor, columns: Sequence[int], stages: Tensor) -> Pass:
         """All steps begun at ``states``, their derivatives by these and by some parameters, and corrected stages."""

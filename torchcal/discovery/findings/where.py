@@ -145,6 +145,7 @@ def locate(
         for place in (found if sensor else _by_plausibility(search, found))
         if place.evidence >= LEAST_EVIDENCE
     ]
+    apart = None  # an unknown change that is told beside what a name does
     if named and best is not None and best.window is None:
         own, reads = _own_places(search, best), _reads(best)
         places.sort(key=lambda place: _rank(place, own, reads))
@@ -152,13 +153,14 @@ def locate(
         if not mine or places[0].share < PART * removed(search, best):  # as of what an instrument remembers
             likely = sorted(places, key=lambda place: -place.evidence)
             rows.append(_moved(search, best, search.base.y, [place.driver for place in likely]))
-        else:
-            rows += _elsewhere(search, best, places[0])
+        elif (row := _elsewhere(search, best, places[0])) is not None:
+            rows.append(row)
+            apart = places[0]
     seen: set[tuple[str, str]] = set()
     known = {(row.kind, row.target, row.driver) for row in rows}
     for place in places:
         key = _key(place)
-        if key[:2] in seen or key in known:
+        if key[:2] in seen or (key in known and place is not apart):
             continue
         seen.add(key[:2])
         extent = _extent(place.channel.drivers[place.driver])
@@ -247,7 +249,7 @@ def _moved(search: Search, model: Model, other: Tensor, drivers: Sequence[str]) 
     return Location(kind, target, driver, spans, share, evidence, **told)
 
 
-def _elsewhere(search: Search, model: Model, place: Place) -> list[Location]:
+def _elsewhere(search: Search, model: Model, place: Place) -> Location | None:
     """Where a model's terms act, if hardly in its place.
 
     An unknown change is known but for what the base makes up for: it may as well be told at the other end.
@@ -255,12 +257,12 @@ def _elsewhere(search: Search, model: Model, place: Place) -> list[Location]:
     found, candidate = model.found, model.candidate
     problem = found.problem
     if place.driver not in problem.drivers_at_data(found.values[None], found.warm):
-        return []
+        return None
     bare = candidate.without(found.values, candidate.amplitudes)
     row = _moved(search, model, problem.evaluate(bare[None], [], found.warm)[0][0], [place.driver])
     values = place.channel.drivers[place.driver].unique()
     acts, told = (_within(values, spans) for spans in (row.spans, _spans(place)))
-    return [row] if bool(acts.any()) and int((acts & told).sum()) <= MEETS * int(told.sum()) else []
+    return row if bool(acts.any()) and int((acts & told).sum()) <= MEETS * int(told.sum()) else None
 
 
 def _within(values: Tensor, spans: Sequence[tuple[float, float]]) -> Tensor:

@@ -52,6 +52,7 @@ def calibrate_base(
     *,
     clean: bool = False,
     unit: Tensor | None = None,
+    begin: Tensor | None = None,
 ) -> tuple[Fitted, Noise]:
     """Fit the base, set outliers aside, estimate the noise, shorten the solver's steps where they matter.
 
@@ -62,6 +63,7 @@ def calibrate_base(
         seed: Of these.
         clean: Whether outliers are set aside already.
         unit: How unknown noise grows with the outputs, where that is known better than from the base's residual.
+        begin: One starting value ``(1, P)`` in place of these, where it is known to be better.
 
     Raises:
         ConvergenceError: If no starting value gives finite outputs.
@@ -72,9 +74,12 @@ def calibrate_base(
     free, held = base_columns(problem, fixed)
     rough = recording.noise if isinstance(recording.noise, Tensor) else 0.1 * recording.spread
     outputs = torch.zeros(len(recording.outputs), dtype=torch.float64)
-    begin = starts(problem, num_starts, seed, held)
+    known, begin = begin, starts(problem, num_starts, seed, held) if begin is None else begin
     problem = _steady(problem, begin[:1])
-    found = _from_starts(problem, begin, free, rough, outputs)
+    if known is None:
+        found = _from_starts(problem, begin, free, rough, outputs)
+    else:
+        found = fit(problem, problem.whitening(rough, outputs), known, free)
     if found is None:
         raise ConvergenceError(
             f"Expected finite outputs of the base at one of {num_starts} starting values at least. Got none, the first "

@@ -9,10 +9,12 @@ from torch import Tensor
 
 from torchcal.discovery.fits.candidates import Candidate, base_columns
 from torchcal.discovery.fits.fitting import Fitted, fit
+from torchcal.discovery.fits.problem import Problem, Whitening
 from torchcal.discovery.fits.starts import follow_slopes, starts
 from torchcal.discovery.hypotheses.screen import Screening
 from torchcal.discovery.misfit.residual import Residual
-from torchcal.errors import SimulatorError
+from torchcal.errors import DomainError, SimulatorError
+from torchcal.simulators import Solution
 
 __all__ = [
     "BENT",
@@ -110,21 +112,36 @@ def valleys(base: Fitted, fixed: Mapping[str, float], seed: int) -> Tensor:
             row = base.values.clone()
             row[[i, j]] = row[[j, i]]
             rows.append(row.clamp(low, high))
-    ended = fit(problem, base.whitening, torch.stack(rows), free, max_steps=SETTLED, finish=0)
+    ends, chi2 = _each_fitted(problem, base.whitening, torch.stack(rows), free, SETTLED)
     found, sd = [base.values], base.sd()[free]
-    if ended is None or ended.ends is None or ended.ends_chi2 is None:
-        return base.values[None][:0]
-    for k in ended.ends_chi2.argsort().tolist():
-        if len(found) > VALLEYS or not float(ended.ends_chi2[k]) <= DEEP * base.chi2:
+    for k in chi2.argsort().tolist():
+        if len(found) > VALLEYS or not float(chi2[k]) <= DEEP * base.chi2:
             break
         far = []
         for other in found:
-            here, there = other[free], ended.ends[k, free]
+            here, there = other[free], ends[k, free]
             away, size = (here - there).abs(), torch.maximum(here.abs(), there.abs())
             far.append(bool(((away > APART[0] * sd) & (away > APART[1] * size)).any()))
         if all(far):
-            found.append(ended.ends[k])
+            found.append(ends[k])
     return torch.stack(found)[1:]
+
+
+def _each_fitted(
+    problem: Problem, w: Whitening, begin: Tensor, free: list[int], steps: int, warm: Solution | None = None
+) -> tuple[Tensor, Tensor]:
+    """Where fits come to in a few steps from every start ``(H, P)``, and with which χ²; without those that the model
+    raises at, as it may far from where it is meant for."""
+    try:
+        found = fit(problem, w, begin, free, warm=warm, max_steps=steps, finish=0)
+    except (SimulatorError, DomainError):
+        if len(begin) > 1:
+            each = [_each_fitted(problem, w, row[None], free, steps) for row in begin]
+            return torch.cat([ends for ends, _ in each]), torch.cat([chi2 for _, chi2 in each])
+        found = None
+    if found is None or found.ends is None or found.ends_chi2 is None:
+        return begin[:0], torch.zeros(0, dtype=torch.float64)
+    return found.ends, found.ends_chi2
 
 
 def farther(
@@ -149,28 +166,30 @@ def farther(
     row = candidate.begin.clone()
     row[candidate.own] = candidate.shapes[int(screening.shape[column])]
     side, rows = candidate.one_sided(place), []
+    low, high = problem.limits()
     for sign in (1.0, -1.0):
         if side and sign != side:
             continue
-        sizes = FARTHER if sign * score > 0 else (1.0, *FARTHER)
-        rows += _each(row, place, [float(row[place]) + sign * size * k for k in sizes])
+        end, at = (high if sign > 0 else low)[place], float(row[place])
+        shares = [at + k * (float(end) - at) for k in GUESSED] if bool(end.isfinite()) else []
+        sizes = shares or [at + sign * size * k for k in (FARTHER if sign * score > 0 else (1.0, *FARTHER))]
+        rows += _each(row, place, sizes)
         for other in elsewhere:
             moved = row.clone()
             moved[columns] = other[base.free]
-            rows += _each(moved, place, [float(row[place]) + sign * size * k for k in ELSEWHERE])
-    low, high = problem.limits()
+            rows += _each(moved, place, shares or [at + sign * size * k for k in ELSEWHERE])
     w = residual.noise.whitening(problem)
     begin = torch.stack(rows).clamp(low, high).unique(dim=0)
-    found = fit(problem, w, begin, columns, max_steps=FOLLOWED, finish=0)
-    if found is None or found.ends is None or found.ends_chi2 is None:
-        return nothing
+    ends, chi2 = _each_fitted(problem, w, begin, columns, FOLLOWED, problem.guess(base.warm, begin))
     by_size: dict[float, int] = {}  # the best of every size, which is held
-    for k in found.ends_chi2.argsort().tolist():
-        by_size.setdefault(float(found.ends[k, place]), k)
+    for k in chi2.argsort().tolist():
+        by_size.setdefault(float(ends[k, place]), k)
+    if not by_size:
+        return nothing
     shape = [i for i in candidate.own if i not in candidate.amplitudes]
     free = [i for i in candidate.free if i not in shape]
-    last = fit(problem, w, found.ends[[*by_size.values()][:BEST]], free, max_steps=GONE_ON, finish=0)
-    return nothing if last is None or last.ends is None or last.ends_chi2 is None else (last.ends, last.ends_chi2)
+    begin = ends[[*by_size.values()][:BEST]]
+    return _each_fitted(problem, w, begin, free, GONE_ON, problem.guess(base.warm, begin))
 
 
 def make_up(base: Fitted, candidate: Candidate, row: Tensor, effect: Tensor) -> Tensor:

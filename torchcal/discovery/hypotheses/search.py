@@ -62,6 +62,7 @@ class Search:
     coarser: float = 1.0
     stop: Stop = field(default_factory=Stop)
     base: Fitted = field(init=False)
+    elsewhere: Tensor = field(init=False)
     noise: Noise = field(init=False)
     tangents: Tangents = field(init=False)
     residual: Residual = field(init=False)
@@ -99,12 +100,14 @@ class Search:
         counts = torch.bincount(self.problem.output_of)
         return self.noise.open and int(counts.max()) < LEAST
 
-    def calibrate_base(self) -> None:
-        """Calibrate the base, set outliers aside unless that is done, and estimate the noise."""
+    def calibrate_base(self, begin: Tensor | None = None) -> None:
+        """Calibrate the base, set outliers aside unless that is done, and estimate the noise; from one starting value
+        ``(1, P)`` where that is known to be better than any guess."""
         self.base, self.noise = calibrate_base(
-            self.problem, self.fixed, self.num_starts, self.seed, clean=self.clean, unit=self.unit
+            self.problem, self.fixed, self.num_starts, self.seed, clean=self.clean, unit=self.unit, begin=begin
         )
         self.problem = self.base.problem
+        self.elsewhere = self.base.values[None][:0]
         if not self.exact:
             self.tangents = Tangents.of(self.base, self.noise)
         if self.noise.open:

@@ -86,21 +86,22 @@ def _go_farther(search: Search) -> None:
     if search.exact or search.stop.is_set():
         return
     within = within_bounds(search.base, search.fixed, search.seed)
-    places = [*valleys(search.base, search.fixed, search.seed), *(() if within is None else (within,))]
+    search.elsewhere = valleys(search.base, search.fixed, search.seed)
+    places = [*search.elsewhere, *(() if within is None else (within,))]
     if not (places or search.base.chi2 > STRONG * search.problem.n):
         return
     elsewhere = torch.stack([*places, first_guess(search.base, search.fixed, search.seed)])
     wanted, aim = [], search.aim(search.models)
     aim += NEARLY * max(search.base.chi2 - aim, 0.0)
     for i, candidate in enumerate(search.candidates):
-        if search.screening.best[i] < 0:
-            continue
+        if search.stop.is_set():
+            return
         own = search.plain.get(i)
-        least = min(search.base.chi2 if own is None else min(own.found.chi2, search.base.chi2), aim)
-        try:
-            rows, chi2 = farther(search.residual, search.screening, i, candidate, elsewhere)
-        except SimulatorError:  # as above
+        if search.screening.best[i] < 0 or (own is not None and own.found.chi2 < search.problem.n):
             continue
+        least = min(search.base.chi2 if own is None else min(own.found.chi2, search.base.chi2), aim)
+        search.tick(f"larger effects of {candidate.name}")
+        rows, chi2 = farther(search.residual, search.screening, i, candidate, elsewhere)
         if bool((chi2 < least - LOWER).any()):
             wanted.append(Hypothetical((i,), candidate, rows[chi2 < least - LOWER], search.prior))
     improve(search, wanted)
