@@ -832,14 +832,14 @@ def test_a_hopeless_base_is_a_misfit_whatever_is_left_looks_like(monkeypatch):
         monkeypatch.setattr(rounds, "odds_alone", lambda search, odds=odds: odds)
         monkeypatch.setattr(rounds, "refit_singles", lambda search, detected=True: None)
         monkeypatch.setattr(rounds, "refit_local", lambda search: None)
-        assert rounds._refit(search, 0.95) is detected
+        assert rounds._refit_once(search, 0.95) is detected
     # Of few replicates the odds are none: they take for known what these hardly tell.
     monkeypatch.setattr(rounds, "base_alone", lambda search: 1e-9)
     monkeypatch.setattr(rounds, "odds_alone", lambda search: 0.0)
     for freedom, detected in ((3.0, False), (30.0, True)):
         search.p_detect = 0.6
         search.noise = types.SimpleNamespace(source="replicates", freedom=torch.tensor([freedom], dtype=F64))
-        assert rounds._refit(search, 0.95) is detected
+        assert rounds._refit_once(search, 0.95) is detected
 
 
 @pytest.mark.slow

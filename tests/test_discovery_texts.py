@@ -76,7 +76,8 @@ def located(term, *, inside=(), named=True):
     model = SimpleNamespace(
         window=None, candidate=SimpleNamespace(terms=[term]), structure=SimpleNamespace(channels=list(inside))
     )
-    with mock.patch.multiple(where, _reads=lambda model: set(), removed=lambda search, model: 0.5):
+    unknown = {"_reads": lambda model: set(), "_elsewhere": lambda search, model, place: None}
+    with mock.patch.multiple(where, removed=lambda search, model: 0.5, **unknown):
         return [(place.kind, place.target) for place in where.locate(search, places, model, named=named)]
 
 
