@@ -1104,6 +1104,19 @@ def absorbed(seed=4):
     return model, tc.Recording(runs=runs, noise=0.1, missing=True)
 
 
+def test_a_base_that_fits_as_well_with_two_rates_exchanged_says_so():
+    background = tc.Term(
+        "background", outputs={"C": lambda t, s, p, u, y: y + p["b"]}, parameters=[tc.Parameter("b", high=0.0)]
+    )
+    d = tc.diagnose(*absorbed(), [background], progress=False)
+    assert d.terms == [], str(d)
+    here = {e.name: e.value for e in d.base.estimates}
+    told = next(row for row in d.identifiability if row.startswith("the base fits about as well (χ² +0.0) with ka = "))
+    there = {name: float(value) for name, value in (part.split(" = ") for part in told.split(" with ")[1].split(", "))}
+    assert there["ka"] == pytest.approx(here["ke"], rel=0.05)
+    assert there["ke"] == pytest.approx(here["ka"], rel=0.05)
+
+
 def test_a_base_that_fits_with_two_rates_exchanged_hides_no_term():
     saturable = tc.Term(
         "saturable elimination",

@@ -227,7 +227,7 @@ def _refit(search: Search, confidence: float) -> bool:
     detected = _refit_once(search, confidence)
     begin = _lower(search) if detected and not search.exact and not search.stop.is_set() else None
     if begin is not None:
-        search.calibrate_base(begin)
+        search.restart(begin)
         detected = _refit_once(search, confidence)
     return detected
 

@@ -35,7 +35,8 @@ SHAPES, SHAPES_FAR = 3, 8
 #: χ² a datum from which on a base is far off, whatever the data vary by; from which on it is bent; and the share of the
 #: data's spread that it then misses where it is far off too.
 FAR, BENT, LOST = 30.0, 5.0, 0.5
-#: Amplitudes tried from first guesses, as shares of the range or of the largest linear estimate.
+#: Amplitudes tried from first guesses, as shares of the range or of the largest linear estimate; the last of them are
+#: also how far on the way to a bound larger effects are tried.
 GUESSED = (0.1, 0.4, 0.9)
 #: Amplitudes tried where the tangent says nothing: shares of the way from neutral to either bound, or powers of ten.
 BLIND, MAGNITUDES = (0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 0.9), range(-4, 3)
@@ -165,19 +166,20 @@ def farther(
     place = candidate.amplitudes[int(screening.amplitude[column])]
     row = candidate.begin.clone()
     row[candidate.own] = candidate.shapes[int(screening.shape[column])]
+    others = row.repeat(len(elsewhere), 1)
+    others[:, columns] = elsewhere[:, base.free]
     side, rows = candidate.one_sided(place), []
     low, high = problem.limits()
     for sign in (1.0, -1.0):
         if side and sign != side:
             continue
-        end, at = (high if sign > 0 else low)[place], float(row[place])
-        shares = [at + k * (float(end) - at) for k in GUESSED] if bool(end.isfinite()) else []
-        sizes = shares or [at + sign * size * k for k in (FARTHER if sign * score > 0 else (1.0, *FARTHER))]
-        rows += _each(row, place, sizes)
-        for other in elsewhere:
-            moved = row.clone()
-            moved[columns] = other[base.free]
-            rows += _each(moved, place, shares or [at + sign * size * k for k in ELSEWHERE])
+        at = float(row[place])
+        room = abs(float((high if sign > 0 else low)[place]) - at)
+        here = FARTHER if sign * score > 0 else (1.0, *FARTHER)
+        for begun, multiples in ((row, here), *((moved, ELSEWHERE) for moved in others)):
+            most = [share * room for share in GUESSED[-len(multiples) :]]
+            sizes = [min(k * size, end) for k, end in zip(multiples, most, strict=True)]
+            rows += _each(begun, place, [at + sign * one for one in sizes])
     w = residual.noise.whitening(problem)
     begin = torch.stack(rows).clamp(low, high).unique(dim=0)
     ends, chi2 = _each_fitted(problem, w, begin, columns, FOLLOWED, problem.guess(base.warm, begin))

@@ -115,6 +115,15 @@ class Search:
             if evidence - self.settled(self.base)[1] > CLEARLY:
                 self.noise, self.base = noise, refit(self.base, noise.whitening(self.problem))
 
+    def restart(self, begin: Tensor) -> None:
+        """As new, with the base calibrated from a starting value ``(1, P)``."""
+        for one in dataclasses.fields(self):
+            if not one.init and one.default_factory is not dataclasses.MISSING:
+                setattr(self, one.name, one.default_factory())
+            elif not one.init and one.default is not dataclasses.MISSING:
+                setattr(self, one.name, one.default)
+        self.calibrate_base(begin)
+
     def screen_all(self) -> None:
         """Tangents of all candidates, and whether there is more than noise."""
         self.residual = Residual(self.base, self.noise, seed=self.seed)

@@ -207,6 +207,7 @@ def identifiability(search: Search, best: Model | None) -> list[str]:
         for group in _merged(mixed)
     ]
     rows += _hardly_apart(search.base if best is None else best.found, {name for group in mixed for name in group})
+    rows += _as_well_elsewhere(search) if best is None else []
     screening = search.screening
     for i, candidate in enumerate(search.candidates):
         if screening.best[i] < 0 and not candidate.blind:
@@ -216,6 +217,19 @@ def identifiability(search: Search, best: Model | None) -> list[str]:
         for name, (low, high) in () if best is not None and i in best.numbers else candidate.anywhere.items():
             rows.append(f"{name} has no bounds, and was sought from {low:.4g} to {high:.4g}")
     return [*([] if best is None else one_law(best)), *rows, *_nearly_the_same(search)][:12]
+
+
+def _as_well_elsewhere(search: Search) -> list[str]:
+    """Other parameters of the base with which it fits about as well."""
+    base, rows, sd = search.base, [], search.base.sd()
+    for values in search.elsewhere:
+        y = base.problem.evaluate(values[None], [], base.warm)[0][0]
+        more = float(base.whitening.vector(base.problem.y - y).square().sum()) - base.chi2
+        if more < RIVAL:
+            moved = [i for i in base.free if float((values[i] - base.values[i]).abs()) > ELSEWHERE * float(sd[i])]
+            told = ", ".join(f"{base.problem.parameters[i].name} = {float(values[i]):.3g}" for i in moved)
+            rows.append(f"the base fits about as well (χ² {max(more, 0.0):+.1f}) with {told}")
+    return rows
 
 
 def _nearly_the_same(search: Search) -> list[str]:
