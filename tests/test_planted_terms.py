@@ -187,7 +187,7 @@ def hydraulics() -> Field:
             "discharge exponent": {"m": 0.15},
             "clogging": {"r": 0.0006},
         },
-        ("overflow",),
+        ("pump saturation",),
     )
 
 
