@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchcal.discovery.fits.candidates import spread_values
 from torchcal.discovery.fits.fitting import refit
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.base import MOST
@@ -236,19 +237,17 @@ def _lower(search: Search) -> Tensor | None:
     """Parameters ``(1, P)`` at which the base fits better than where it was calibrated: in another of its valleys, or
     those of a model without its term; None where there are none."""
     base, rows = search.base, [*search.elsewhere]
-    names = [q.name for q in base.problem.parameters]
     for model in sorted(search.models, key=lambda model: -model.weight)[:LOOKED_AT]:
-        row, known = base.values.clone(), model.found.by_name
-        row[base.free] = row.new_tensor([known[names[i]] for i in base.free])
+        row, names = base.values.clone(), [q.name for q in model.found.problem.parameters]
+        row[base.free] = spread_values(base.problem, names, model.found.values)[base.free]  # not what a term frees
         rows.append(row)
     if not rows:
         return None
     every = torch.stack(rows)
     try:
-        y = base.problem.evaluate(every, [], base.problem.guess(base.warm, every))[0]
+        chi2 = base.chi2_at(every)
     except SimulatorError:  # a term may have led where the base alone does not work
         return None
-    chi2 = base.whitening.vector(base.problem.y - y).square().sum(-1).nan_to_num(nan=math.inf)
     best = int(chi2.argmin())
     return every[best : best + 1] if float(chi2[best]) < base.chi2 - DEEPER else None
 

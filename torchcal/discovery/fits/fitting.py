@@ -92,6 +92,11 @@ class Fitted:
         parameters = self.problem.parameters
         return [parameters[i].name for i, at in zip(self.free, self.at_bound.tolist(), strict=True) if at]
 
+    def chi2_at(self, values: Tensor) -> Tensor:
+        """χ² of the same model at other parameters ``(H, P)``, ``(H,)``; infinite where its outputs are not finite."""
+        left = self.whitening.vector(self.problem.y - self.problem.evaluate(values, [])[0])
+        return left.square().sum(-1).nan_to_num(nan=torch.inf)
+
     def leads_to(self, aim: float, steps: int = FINISH) -> bool:
         """Whether it has steps to go that may lead to a χ² of ``aim`` at a multiple of their pace."""
         return self.falling > 0 and not self.chi2 - FASTER * steps / STEPS * self.falling > aim

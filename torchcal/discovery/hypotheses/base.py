@@ -74,12 +74,13 @@ def calibrate_base(
     free, held = base_columns(problem, fixed)
     rough = recording.noise if isinstance(recording.noise, Tensor) else 0.1 * recording.spread
     outputs = torch.zeros(len(recording.outputs), dtype=torch.float64)
-    known, begin = begin, starts(problem, num_starts, seed, held) if begin is None else begin
+    anew = begin is None
+    begin = starts(problem, num_starts, seed, held) if begin is None else begin
     problem = _steady(problem, begin[:1])
-    if known is None:
+    if anew:
         found = _from_starts(problem, begin, free, rough, outputs)
     else:
-        found = fit(problem, problem.whitening(rough, outputs), known, free)
+        found = fit(problem, problem.whitening(rough, outputs), begin, free)
     if found is None:
         raise ConvergenceError(
             f"Expected finite outputs of the base at one of {num_starts} starting values at least. Got none, the first "
@@ -249,8 +250,7 @@ def _unwound(found: Fitted) -> Fitted:
         turns = round(float(values[i]) / (2 * math.pi))
         if turns and names[i] in bound.initial_names:
             values[i] -= 2 * math.pi * turns
-            y = found.problem.evaluate(values[None], [])[0][0]
-            same = float(found.whitening.vector(found.problem.y - y).square().sum()) <= found.chi2 + SAME_FIT
+            same = float(found.chi2_at(values[None])) <= found.chi2 + SAME_FIT
             values[i] = values[i] if same else found.values[i]
     if torch.equal(values, found.values):
         return found

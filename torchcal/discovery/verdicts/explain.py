@@ -134,8 +134,7 @@ def _stepped_sd(found: Fitted, i: int, window: Window, spread: float) -> float:
     middle, gap = middle[near], gap[near]
     rows = found.values.repeat(len(middle), 1)
     rows[:, i] = middle
-    problem = found.problem
-    chi2 = found.whitening.vector(problem.y - problem.evaluate(rows, [])[0]).square().sum(-1).nan_to_num(nan=math.inf)
+    chi2 = found.chi2_at(rows)
     weight = gap * (0.5 * (chi2.min() - chi2)).exp()
     weight = weight / weight.sum()
     mean = float(weight @ middle)
@@ -222,9 +221,9 @@ def identifiability(search: Search, best: Model | None) -> list[str]:
 def _as_well_elsewhere(search: Search) -> list[str]:
     """Other parameters of the base with which it fits about as well."""
     base, rows, sd = search.base, [], search.base.sd()
-    for values in search.elsewhere:
-        y = base.problem.evaluate(values[None], [], base.warm)[0][0]
-        more = float(base.whitening.vector(base.problem.y - y).square().sum()) - base.chi2
+    every = search.elsewhere
+    for values, chi2 in zip(every, base.chi2_at(every).tolist() if len(every) else (), strict=True):
+        more = chi2 - base.chi2
         if more < RIVAL:
             moved = [i for i in base.free if float((values[i] - base.values[i]).abs()) > ELSEWHERE * float(sd[i])]
             told = ", ".join(f"{base.problem.parameters[i].name} = {float(values[i]):.3g}" for i in moved)
