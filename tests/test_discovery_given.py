@@ -114,6 +114,24 @@ def test_what_is_held_and_stays_is_no_ramp():
     assert not given._far(tc.Run(time=run.time, outputs=run.outputs, inputs={"c": 0 * rough + 1}))
 
 
+def test_of_several_inputs_those_that_change_far_may_go_on_otherwise():
+    run = recording(0, "linear").runs[0]
+    inputs = {"c": run.inputs["c"], "room": torch.sin(0.5 * run.time)}
+    both = tc.Run(time=run.time, outputs=run.outputs, inputs=inputs)
+    assert given._far(both) == ["c"]
+    assert given._far(tc.Run(time=run.time, outputs=run.outputs, inputs=inputs, hold={"c": "zero"})) == []
+    recorded = tc.Recording(runs=[both], noise=0.02)
+    warm = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"w": p["a"] * (p["g"] * u["c"] + p["h"] * u["room"] - s["w"])},
+        states={"w": "rad/s"}, parameters=[*motor().parameters, tc.Parameter("h")],
+    )  # fmt: skip
+    d = tc.diagnose(warm, recorded, [], seed=0, progress=False)
+    assert any("with hold={'c': 'zero', 'room': 'linear'} the base" in row for row in d.symptoms)
+    again = recorded.with_hold([{"c": "zero", "room": "linear"}])
+    assert tc.diagnose(warm, again, [], seed=0, progress=False).verdict == "consistent"
+    assert recorded.with_hold([{"c": "zero", "room": "zero"}]).runs[0].hold == "zero"
+
+
 def test_the_right_guess_leaves_nothing():
     d = tc.diagnose(motor(), recording(0, "zero"), candidates(), seed=0, progress=False)
     assert d.verdict == "consistent"

@@ -109,6 +109,25 @@ def test_runs_of_unequal_length_agree_with_scipy(hold: str) -> None:
     assert np.abs(found.numpy() - exact).max() < 1e-6
 
 
+def test_inputs_that_go_on_in_different_ways_add_up() -> None:
+    t = np.linspace(0.0, 4.0, 11)
+    inputs = {"valve": np.where(t < 1.5, 1.0, -2.0), "room": np.cos(2 * t)}
+    lag = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"x": u["valve"] + u["room"] - p["k"] * s["x"]},
+        states={"x": "m"}, parameters=[tc.Parameter("k", low=0.1, high=9.0)],
+    )  # fmt: skip
+
+    def solved(given: dict[str, np.ndarray], hold: str | dict[str, str]) -> torch.Tensor:
+        run = tc.Run(time=t, outputs={"x": t}, inputs=given, initial={"x": 0.0}, hold=hold)
+        bound = settled(lag.bind(tc.Recording(runs=[run])), tensor(2.0)[None], torch.full((11,), 1e-9, dtype=F64))
+        return bound.at(bound.x)(tensor(2.0))
+
+    both = solved(inputs, {"valve": "zero", "room": "cubic"})
+    parts = [solved(inputs | {other: 0 * t}, hold) for other, hold in (("room", "zero"), ("valve", "cubic"))]
+    torch.testing.assert_close(both, parts[0] + parts[1], rtol=0, atol=1e-8)
+    assert float((both - solved(inputs, "linear")).abs().max()) > 0.01
+
+
 def test_a_padded_short_run_is_the_same_alone() -> None:
     short = run_of(np.array([1.0, 1.1, 1.7]), {"x": -0.5, "v": 2.0})
     both = tc.Recording(runs=[run_of(np.linspace(0.0, 9.0, 200), {"x": 1.0, "v": 0.0}), short])

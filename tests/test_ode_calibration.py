@@ -514,7 +514,7 @@ def test_runs_of_all_kinds_survive_a_file(tmp_path: Path) -> None:
     data = tc.Recording(
         runs=[
             tc.Run(t, {"c": gaps, "d": np.exp(-t)}, {"in/flow": t}, {"c": 1.0, "d": 1.0}, "zero"),
-            tc.Run(t[:5], {"c": np.exp(-t[:5])}, {"in/flow": -t[:5]}, {"c": 1.0}, "cubic"),
+            tc.Run(t[:5], {"c": np.exp(-t[:5])}, {"in/flow": -t[:5]}, {"c": 1.0}, {"in/flow": "cubic"}),
         ],
         missing=True, units={"c": "mol", "time": "s", "in/flow": "L/s"}, noise=0.01,
     )  # fmt: skip

@@ -64,6 +64,22 @@ def test_a_run_is_frozen_and_copyable():
     assert dataclasses.replace(one, hold="zero").inputs_at(0.5)["f"] == 0
 
 
+def test_each_input_may_go_on_in_its_own_way():
+    inputs = {"valve": F, "room": [0, 2, 8], "load": [1, 2, 4]}
+    one = Run(T, {"x": X}, inputs, hold={"valve": "zero", "load": "cubic"})
+    assert one.holds == one.hold == {"valve": "zero", "room": "linear", "load": "cubic"}
+    at = 0.5 * (T[0] + T[1])
+    got = one.inputs_at([at, T[2]])
+    assert list(got) == list(inputs)
+    for name, hold in one.holds.items():
+        alone = Run(T, {"x": X}, {name: inputs[name]}, hold=hold)
+        assert torch.equal(got[name], alone.inputs_at([at, T[2]])[name])
+    assert "input (zero) valve" in repr(one)
+    assert "input (linear) room" in repr(one)
+    assert dataclasses.replace(one, hold={"valve": "cubic", "room": "cubic", "load": "cubic"}).hold == "cubic"
+    assert Run(T, {"x": X}, inputs, hold={}).hold == "linear"
+
+
 REFUSED_RUNS = {
     "time nan": ({"time": [0, NAN, 1]}, RecordingError, r"in time\. Got nan at index 1.*a time must be known"),
     "time inf": ({"time": [0, 1, INF]}, RecordingError, r"in time\. Got inf at index 2"),
@@ -89,6 +105,8 @@ REFUSED_RUNS = {
     "input time": ({"inputs": {"time": F}}, RecordingError, r"names in inputs other than .*Got 'time'"),
     "both": ({"inputs": {"x": F}}, RecordingError, r"outputs and inputs with different names\. Got 'x' in both"),
     "hold": ({"hold": "nearest"}, RecordingError, r"hold among \['linear', 'zero', 'cubic'\]\. Got 'nearest'"),
+    "hold of none": ({"hold": {"g": "zero"}}, RecordingError, r"names in hold among the inputs \['f'\]\. Got 'g'"),
+    "hold by input": ({"hold": {"f": "late"}}, RecordingError, r"hold of input 'f' among .*Got 'late'"),
     "hold None": ({"hold": None}, RecordingError, r"hold among .*Got None"),
     "initial a number": ({"initial": 1.0}, RecordingError, r"initial: a dict.*Got float"),
     "initial name": ({"initial": {0: 1.0}}, RecordingError, r"names in initial: non-empty strings\. Got 0"),

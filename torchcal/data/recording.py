@@ -15,7 +15,7 @@ from torchcal.data.arrays import sample_spread, value_range
 from torchcal.data.frames import check_columns, column_names, read_csv
 from torchcal.data.noise import noise_sd
 from torchcal.data.parts import run_parts, static_parts
-from torchcal.data.run import SEVERAL, Run, change, fingerprint
+from torchcal.data.run import SEVERAL, Run, change, fingerprint, together
 from torchcal.errors import RecordingError, ShapeError
 
 __all__ = ["Recording"]
@@ -335,7 +335,7 @@ class Recording:
         known = [{state: v for state, v in run.initial.items() if state not in mine} for run, mine in pairs]
         return self._with_runs(change(run, initial=left) for run, left in zip(self.runs, known, strict=True))
 
-    def with_hold(self, holds: Sequence[str]) -> "Recording":
+    def with_hold(self, holds: Sequence[str | Mapping[str, str]]) -> "Recording":
         """The same recording with inputs that go on otherwise between samples, in each run in turn: see `Run`.
 
         Raises:
@@ -344,7 +344,10 @@ class Recording:
         if self.runs is None or len(holds) != len(self.runs):
             have = "none" if self.runs is None else len(self.runs)
             raise RecordingError(f"Expected a hold for each run. Got {len(holds)} for {have}.")
-        return self._with_runs(change(run, hold=hold) for run, hold in zip(self.runs, holds, strict=True))
+        return self._with_runs(
+            change(run, hold=together(hold) if isinstance(hold, Mapping) else hold)
+            for run, hold in zip(self.runs, holds, strict=True)
+        )
 
     def _with_runs(self, runs: Iterable[Run]) -> "Recording":
         twin = copy.copy(self)

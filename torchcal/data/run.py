@@ -14,7 +14,7 @@ from torchcal.data.frames import check_columns, column_names
 from torchcal.data.interpolation import HOLDS, evaluate_pieces, pieces
 from torchcal.errors import DomainError, RecordingError, ShapeError
 
-__all__ = ["SEVERAL", "Run", "change", "convert", "fingerprint"]
+__all__ = ["SEVERAL", "Run", "change", "convert", "fingerprint", "together"]
 
 RESERVED = ("time", "run", "t")
 """Names that a recording in time has for itself."""
@@ -41,14 +41,14 @@ class Run:
         initial: Dict from state names to values at ``time[0]``, in the units of the simulator's states. A state
             that is not named is calibrated.
         hold: How the inputs go on between samples: ``"linear"``, ``"zero"`` (each value stays until the next
-            sample), or ``"cubic"`` (a spline).
+            sample), or ``"cubic"`` (a spline); or a dict of these by input, where those not named go on linearly.
 
     Attributes:
         time: Tensor ``(T,)``.
         outputs: Dict of tensors ``(T,)``; NaN where missing.
         inputs: Dict of tensors ``(T,)``; empty if there are none.
         initial: Dict of floats; empty if nothing is known.
-        hold: As given.
+        hold: For all inputs, or a dict by input where they differ; see `holds`.
         units: Dict from names of outputs and inputs, and ``"time"``, to the units that the arrays came with.
 
     Raises:
@@ -65,7 +65,7 @@ class Run:
     outputs: dict[str, Tensor]
     inputs: dict[str, Tensor]
     initial: dict[str, float]
-    hold: str
+    hold: str | dict[str, str]
     units: dict[str, str] = field(init=False)
     _quantities: dict[str, Any] = field(init=False)
 
@@ -75,7 +75,7 @@ class Run:
         outputs: Mapping[str, Any],
         inputs: Mapping[str, Any] | None = None,
         initial: Mapping[str, Any] | None = None,
-        hold: str = "linear",
+        hold: str | Mapping[str, str] = "linear",
     ) -> None:
         by_default_on_cpu()
         given_outputs, given_inputs = _series(outputs, "outputs"), _series(inputs, "inputs")
@@ -85,10 +85,7 @@ class Run:
             raise RecordingError(
                 f"Expected outputs and inputs with different names. Got {both[0]!r} in both (rename one)."
             )
-        if not isinstance(hold, str) or hold not in HOLDS:
-            raise RecordingError(
-                f"Expected hold among {list(HOLDS)}. Got {hold!r} (how inputs go on between samples)."
-            )
+        holds = _holds(hold, given_inputs)
         known = _initial(initial)
 
         labelled = {"time": ("time", time)}
@@ -114,7 +111,7 @@ class Run:
         put(self, "outputs", {name: arrays[name] for name in given_outputs})
         put(self, "inputs", {name: arrays[name] for name in given_inputs})
         put(self, "initial", known)
-        put(self, "hold", hold)
+        put(self, "hold", holds)
         put(self, "units", units)
         put(self, "_quantities", quantities)
 
@@ -148,12 +145,24 @@ class Run:
             )
         if not self.inputs:
             return {}
-        values = evaluate_pieces(self._pieces, self.time, at.clamp(first, last), side)
-        return dict(zip(self.inputs, values, strict=True))
+        found: dict[str, Tensor] = {}
+        for names, coefficients in self._pieces:
+            found |= zip(names, evaluate_pieces(coefficients, self.time, at.clamp(first, last), side), strict=True)
+        return {name: found[name] for name in self.inputs}
+
+    @property
+    def holds(self) -> dict[str, str]:
+        """How each input goes on between samples."""
+        return dict.fromkeys(self.inputs, self.hold) if isinstance(self.hold, str) else dict(self.hold)
 
     @cached_property
-    def _pieces(self) -> Tensor:
-        return pieces(self.time, torch.stack(list(self.inputs.values())), self.hold)
+    def _pieces(self) -> list[tuple[list[str], Tensor]]:
+        """Names and coefficients of the inputs that go on alike."""
+        groups = [[name for name, hold in self.holds.items() if hold == one] for one in HOLDS]
+        return [
+            (names, pieces(self.time, torch.stack([self.inputs[name] for name in names]), hold))
+            for hold, names in zip(HOLDS, groups, strict=True) if names
+        ]  # fmt: skip
 
     @classmethod
     def from_frame(
@@ -189,7 +198,7 @@ class Run:
         unit = f" {self.units['time']}" if "time" in self.units else ""
         lines = [f"Run: {len(self.time)} samples, time {value_range(self.time)}{unit}"]
         series = [("output", name, values) for name, values in self.outputs.items()]
-        series += [(f"input ({self.hold})", name, values) for name, values in self.inputs.items()]
+        series += [(f"input ({hold})", name, self.inputs[name]) for name, hold in self.holds.items()]
         for kind, name, values in series:
             title = f"{name} [{self.units[name]}]" if name in self.units else name
             line = f"  {kind} {title}: {value_range(values[~torch.isnan(values)])}"
@@ -219,7 +228,7 @@ def fingerprint(run: Run) -> tuple[Any, ...] | None:
     series = {f"output {name}": values for name, values in run.outputs.items()}
     series |= {f"input {name}": values for name, values in run.inputs.items()} | {"time": run.time}
     held = tuple(sorted((name, values.nan_to_num(nan=torch.inf).numpy().tobytes()) for name, values in series.items()))
-    return run.hold, tuple(sorted(run.initial.items())), held
+    return tuple(sorted(run.holds.items())), tuple(sorted(run.initial.items())), held
 
 
 def convert(run: Run, units: Mapping[str, str], where: str) -> Run:
@@ -244,6 +253,27 @@ def convert(run: Run, units: Mapping[str, str], where: str) -> Run:
         inputs={name: converted(name, array, f"inputs[{name!r}]") for name, array in run.inputs.items()},
         units={name: unit for name, unit in units.items() if name in names},
     )
+
+
+def together(holds: Mapping[str, str]) -> str | dict[str, str]:
+    """How inputs go on, in a word where all go on alike."""
+    kinds = set(holds.values()) or {HOLDS[0]}
+    return kinds.pop() if len(kinds) == 1 else dict(holds)
+
+
+def _holds(given: Any, inputs: Mapping[str, Any]) -> str | dict[str, str]:
+    """How inputs go on between samples, checked."""
+    by_input = isinstance(given, Mapping)
+    if by_input and (unknown := [name for name in given if name not in inputs]):
+        raise RecordingError(f"Expected names in hold among the inputs {list(inputs)}. Got {unknown[0]!r}.")
+    for name, one in given.items() if by_input else [("", given)]:
+        if not isinstance(one, str) or one not in HOLDS:
+            of = f" of input {name!r}" if by_input else ""
+            raise RecordingError(
+                f"Expected hold{of} among {list(HOLDS)}. Got {one!r} (how inputs go on between samples; a dict says "
+                "it for each)."
+            )
+    return together({name: given.get(name, HOLDS[0]) for name in inputs}) if by_input else given
 
 
 def _series(given: Any, what: str) -> dict[str, Any]:

@@ -88,7 +88,7 @@ def sharpened(search: Search) -> list[Place]:
 def _has_levels(search: Search, driver: str) -> bool:
     """Whether a driver has no values but those of the data: a condition, or an input that is held between samples."""
     runs = search.problem.recording.runs
-    return runs is None or all(run.hold == "zero" and driver in run.inputs for run in runs)
+    return runs is None or all(run.holds.get(driver) == "zero" for run in runs)
 
 
 def _met(values: Tensor, low: float, high: float) -> tuple[float, float]:

@@ -153,7 +153,7 @@ def _moved(search: Search, shown: Sequence[Mapping[str, str]], least: float) -> 
 
 
 def other_hold(search: Search, part: Fitted) -> Fitted | None:
-    """A fit with inputs that change far between samples held the other way there; None where none do.
+    """A fit with inputs that change far between samples held the other way; None where none do.
 
     In all of such runs, or in those alone that it suits. It has no parameter more. Computed once for a fit.
     """
@@ -195,9 +195,9 @@ def held_otherwise(search: Search) -> list[str]:
     if evidence(search, found) - begun < max(TOLD, AS_MUCH * best):
         return []
     pairs = list(zip(search.problem.recording.runs or (), found.problem.recording.runs or (), strict=True))
-    changed = [(r, new.hold) for r, (old, new) in enumerate(pairs) if new.hold != old.hold]
+    changed = [(r, repr(new.hold)) for r, (old, new) in enumerate(pairs) if new.hold != old.hold]
     holds = {hold for _, hold in changed}
-    how = f"hold='{holds.pop()}'" if len(holds) == 1 else "the other hold="
+    how = f"hold={holds.pop()}" if len(holds) == 1 else "the other hold="
     if len(changed) < len(pairs):
         how += f" in run{'s' if len(changed) > 1 else ''} {', '.join(str(r) for r, _ in changed)}"
     left = f"the base's RMSE is {_rmse(found):.4g} in place of {_rmse(search.base):.4g}"
@@ -213,15 +213,17 @@ def evidence(search: Search, found: Fitted) -> float:
 
 def _far_runs(search: Search) -> list[bool]:
     """In which runs an input changes far between samples."""
-    return [_far(run) for run in search.problem.recording.runs or ()]
+    return [bool(_far(run)) for run in search.problem.recording.runs or ()]
 
 
-def _far(run: Run) -> bool:
-    """Whether an input changes so far between samples that it matters how it goes on there; not where all are held and
-    mostly stay at their values."""
-    far = any(float(u.diff().abs().max()) > FAR * float(u.std()) > 0 for u in run.inputs.values())
-    steps = run.hold == "zero" and all(float((u.diff() == 0).double().mean()) > STAYS for u in run.inputs.values())
-    return run.hold in MISTAKEN and far and not steps
+def _far(run: Run) -> list[str]:
+    """Inputs that change so far between samples that it matters how they go on there; not what is held and mostly stays
+    at its values."""
+    return [
+        name for name, u in run.inputs.items()
+        if run.holds[name] in MISTAKEN and float(u.diff().abs().max()) > FAR * float(u.std()) > 0
+        and not (run.holds[name] == "zero" and float((u.diff() == 0).double().mean()) > STAYS)
+    ]  # fmt: skip
 
 
 def _by_run(found: Fitted) -> Tensor:
@@ -233,9 +235,12 @@ def _by_run(found: Fitted) -> Tensor:
 
 
 def _held(search: Search, part: Fitted, which: Sequence[bool]) -> Fitted | None:
-    """A fit with the inputs of some runs held the other way."""
+    """A fit with the inputs of some runs that change far held the other way."""
     runs = search.problem.recording.runs or ()
-    holds = [MISTAKEN[run.hold] if other else run.hold for run, other in zip(runs, which, strict=True)]
+    holds = [
+        run.holds | {name: MISTAKEN[run.holds[name]] for name in _far(run)} if other else run.hold
+        for run, other in zip(runs, which, strict=True)
+    ]
     return _refitted(search, part, search.problem.recording.with_hold(holds), {})
 
 
