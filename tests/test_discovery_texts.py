@@ -673,6 +673,10 @@ def test_places_are_told_to_a_thousandth_of_their_extent():
     assert local.region_text("t", 2459012.341, math.inf, span) == "t > 2459012.34"
     assert local.region_text("t", 12.3456, 20.0, None) == "12.35 < t < 20"
     assert local.region_text("t", 7.998, 7.996, None) == "t near 7.997"  # it has closed
+    begun = local.Span(0.03, 5.0, log=False)  # at an end of all data a window lets half of the term act
+    assert local.region_text("x", -math.inf, 0.031, begun) == "x near 0.031"
+    assert local.region_text("x", 5.0, math.inf, begun) == "x near 5"
+    assert local.region_text("x", -math.inf, 0.1, begun) == "x < 0.1"
     for extent in (600.0, 3600.0, 86400.0):
         start = 1.7e9 + 0.412 * extent
         span = local.Span(1.7e9, 1.7e9 + extent, False)

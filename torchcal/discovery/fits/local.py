@@ -28,6 +28,9 @@ SHORT = 0.02
 #: The narrowest of a static recording, whose ends are sought between its data: no time step has to meet them.
 STEP = 1e-4
 
+#: Share of the driver's range up to which a window has closed.
+CLOSED = 1e-3
+
 #: Names of the parameters of a window's ends.
 ENDS = {"from": "window from", "to": "window to"}
 WIDTH_OF_EDGE = "window edge"
@@ -189,8 +192,9 @@ def beyond(parameter: Parameter) -> float:
 def region_text(driver: str, low: float, high: float, span: Span | None) -> str:
     """A range of a driver in words; its ends to a thousandth of the span in a recording, where that is known."""
     extent = 0.0 if span is None else span.high - span.low
-    if math.isfinite(low) and math.isfinite(high):
-        if low >= high:  # a window that has closed
-            return f"{driver} near {placed(0.5 * (low + high), extent)}"
+    ends = [end for end in (low, high) if math.isfinite(end)]
+    if low >= high or (span is not None and ends and span.share(low, high) <= CLOSED):  # at one end of all data, too
+        return f"{driver} near {placed(sum(ends) / len(ends), extent)}"
+    if len(ends) > 1:
         return f"{placed(low, extent)} < {driver} < {placed(high, extent)}"
     return f"{driver} > {placed(low, extent)}" if math.isfinite(low) else f"{driver} < {placed(high, extent)}"
