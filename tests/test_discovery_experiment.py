@@ -52,6 +52,27 @@ def test_static_options_keep_to_what_they_say_and_to_positive_conditions():
             assert float(chosen["x"]["shift"].min()) == pytest.approx(-2.0)
 
 
+def test_noise_of_new_data_is_that_of_the_nearest_recorded_ones():
+    f = torch.logspace(0, 4, 5, dtype=F64)
+    sd = torch.tensor([100.0, 10.0, 1.0, 0.1, 0.01], dtype=F64)
+    static = tc.Recording(x={"f": f, "T": 300.0 + 0 * f}, y=0 * f, noise=sd)
+    new = tc.Recording(x={"f": [0.1, 5.0, 900.0, 2e5], "T": [300.0, 310.0, 290.0, 300.0]}, y=[0.0] * 4)
+    problem = Problem.of(tc.Simulator(lambda x, p: p["a"] + 0 * x["f"], [tc.Parameter("a")]), static)
+    noise = SimpleNamespace(sd=sd)
+    found = experiment._sd_there(SimpleNamespace(problem=problem, y=0 * f), new, torch.zeros(4, dtype=F64), noise)
+    assert found.tolist() == [100.0, 10.0, 0.1, 0.01]
+    even = experiment._sd_there(SimpleNamespace(problem=problem, y=0 * f), new, 0 * f, SimpleNamespace(sd=0 * sd + 2))
+    assert even.tolist() == [2.0] * 4
+    decay = tc.ODESimulator(lambda t, s, p, u: {"x": -p["k"] * s["x"]}, {"x": "m"}, [tc.Parameter("k", initial=1.0)])
+    run = tc.Run(time=[0.0, 1.0, 2.0], outputs={"x": [8.0, 4.0, 2.0]}, initial={"x": 8.0})
+    in_time = Problem.of(decay, tc.Recording(runs=[run], noise=[0.8, 0.4, 0.2]))
+    y = torch.tensor([8.0, 4.0, 2.0], dtype=F64)
+    later = tc.Recording(runs=[tc.Run(time=[0.0, 9.0], outputs={"x": [5.0, 0.0]}, initial={"x": 5.0})])
+    noise = SimpleNamespace(sd=torch.tensor([0.8, 0.4, 0.2], dtype=F64))
+    fit_there = SimpleNamespace(problem=in_time, y=y)
+    assert experiment._sd_there(fit_there, later, torch.tensor([5.0, 0.0], dtype=F64), noise).tolist() == [0.4, 0.2]
+
+
 def rivals():
     """Base, recording and terms: an offset, and a signal in proportion to a small dose, apart only far below the doses
     recorded."""

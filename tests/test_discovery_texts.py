@@ -378,6 +378,8 @@ def test_an_embedded_error_is_not_told_by_thousands():
     assert "(sd 0.1; more than 100 in log-likelihood before b)" in where_text._embedded(finding(embedded=errors))
     errors[0].log_likelihood = 21.0
     assert "20.0 in log-likelihood before b" in where_text._embedded(finding(embedded=errors))
+    errors[1].log_likelihood = errors[0].log_likelihood - 0.04
+    assert "about as likely in a (sd 0.1) as in b (sd" in where_text._embedded(finding(embedded=errors))
 
 
 def test_what_is_removed_and_what_remains_are_all():
@@ -758,6 +760,9 @@ def test_there_is_no_sure_sign_where_a_term_is_likelier_than_the_base(share, sig
     text = said(finding("consistent", ranking=[row(["drag"], share), row([], 0.3)]))
     assert f"There is {sign} of missing physics." in text
     assert ("Yet drag is likelier" in text) == (share > 0.3)
+    text = said(finding("consistent", ranking=[row(["drag"], 0.6 * share), row(["sag"], 0.55 * share), row([], 0.3)]))
+    together = "Yet the terms that were tried are, taken together, likelier than the base alone (probability 0.57 and"
+    assert (together in text) == (share > 0.3)
 
 
 def test_a_term_that_frees_what_is_free_is_told():

@@ -613,6 +613,7 @@ def test_the_range_that_sharp_edges_put_first_is_that_of_its_rivals_too(monkeypa
     monkeypatch.setattr(windows_module, "_rivals", rivals)
     monkeypatch.setattr(windows_module, "_refine_edges", lambda search, prior: put(sharp))
     monkeypatch.setattr(windows_module, "_turn", lambda search, prior: None)
+    monkeypatch.setattr(windows_module, "_hand_back", lambda search: None)
     monkeypatch.setattr(windows_module, "_reshape", lambda search: False)
     monkeypatch.setattr(windows_module, "_keep_all", lambda search, wanted: None)
     windows_module.refit_local(search)

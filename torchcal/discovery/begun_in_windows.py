@@ -95,7 +95,7 @@ def wanted_changes(
             static=not search.problem.in_time, edge=edges.get(kind, False),
         )  # fmt: skip
         try:
-            candidate = prepare(search.base.problem, search.base, [local], search.fixed)
+            candidate = prepare(search.base.problem, search.base, [local], search.fixed, screened=False)
             begin, chi2 = _begin(search, model, candidate, chosen, span)
         except (SimulatorError, DomainError):
             continue
@@ -143,7 +143,7 @@ def in_any_window(search: Search, model: Model) -> Hypothetical | None:
     cuts = [span.moved(span.low, k / (CUTS - 1) * span.size) for k in range(CUTS)]
     local = localised(term, w.driver, cuts[0], cuts[-1], span, static=not search.problem.in_time, edge=True)
     try:
-        candidate = prepare(search.base.problem, search.base, [local], search.fixed)
+        candidate = prepare(search.base.problem, search.base, [local], search.fixed, screened=False)
         begin, _ = _begin(search, model, candidate, list(itertools.combinations(cuts, 2)), span)
     except (SimulatorError, DomainError):
         return None

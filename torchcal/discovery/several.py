@@ -395,8 +395,9 @@ def _hypothetical(
     terms.sort(key=lambda term: not replaces(search.base.problem, search.base.values, term))  # else others are lost
     try:
         candidate = prepare(
-            search.base.problem, search.base, terms, search.fixed, drivers_scale(search.base.problem, search.base)
-        )
+            search.base.problem, search.base, terms, search.fixed, drivers_scale(search.base.problem, search.base),
+            screened=False,
+        )  # fmt: skip
     except (SimulatorError, DomainError):
         return None
     names = [q.name for q in candidate.problem.parameters]

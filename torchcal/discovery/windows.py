@@ -12,7 +12,7 @@ from torchcal.discovery.fits.candidates import prepare
 from torchcal.discovery.fits.local import EDGE, ENDS, SHORT, WIDTH_OF_EDGE, WIDTHS, Span, beyond, is_window, localised
 from torchcal.discovery.hypotheses.aliases import duplicate
 from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
-from torchcal.discovery.hypotheses.refitting import refit_together
+from torchcal.discovery.hypotheses.refitting import improve, refit_together
 from torchcal.discovery.hypotheses.screen import Window, windows_of
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.channels import responses
@@ -99,6 +99,18 @@ def refit_local(search: Search) -> None:
     if not _drivers_of_leads(search) <= before and _rivals(search, prior, edge=True):  # sharp edges put another first
         search.reweigh()
     _turn(search, prior)
+    _hand_back(search)
+
+
+def _hand_back(search: Search) -> None:
+    """Begin the leader's term everywhere from what it has come to in a window, which may be a better minimum."""
+    lead = search.physical_leader
+    if lead is None or lead.window is None or len(lead.numbers) != 1:
+        return
+    candidate, known = search.candidates[lead.numbers[0]], lead.found.by_name
+    begin = torch.tensor([[known[q.name] for q in candidate.problem.parameters]], dtype=torch.float64)
+    improve(search, [Hypothetical(lead.numbers, candidate, begin, search.prior)])
+    search.reweigh()
 
 
 def _turn(search: Search, prior: float) -> None:
@@ -366,7 +378,7 @@ def _begun(
     span = span.edged(w.low, w.high)
     local = localised(term, w.driver, w.low, w.high, span, static=not search.problem.in_time, edge=edge)
     try:
-        candidate = prepare(search.base.problem, search.base, [local], search.fixed)
+        candidate = prepare(search.base.problem, search.base, [local], search.fixed, screened=False)
     except (SimulatorError, DomainError):
         return None
     column = search.screening.acting[w.candidate]

@@ -12,6 +12,7 @@ from torchcal.data import Recording
 from torchcal.discovery.findings.conditions import ANYWHERE, Option, bolder, denser, simple
 from torchcal.discovery.findings.feasible import Feasible
 from torchcal.discovery.fits.fitting import Fitted
+from torchcal.discovery.fits.local import Span
 from torchcal.discovery.fits.problem import Problem, Whitening
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.misfit.noise import Noise
@@ -34,6 +35,8 @@ LEAST = 2.0
 WORTH = 1.01
 #: Solver error, in noise sd, up to which a model bears an experiment, with steps of its kind halved so often at most.
 SETTLED, HALVINGS = 0.1, 3
+#: New data whose nearest recorded ones are sought at once.
+PIECE = 1024
 #: How many times the largest reading no experiment shall make an output.
 FAR = 100.0
 
@@ -155,7 +158,7 @@ def _bearable(models: Sequence[Model], recording: Recording, noise: Noise) -> bo
         if isinstance(simulator, Trajectories):
             bound, values = _there(model.found, simulator, recording)
             try:
-                there = settled(bound, values, SETTLED * _sd(recording, noise), halvings=HALVINGS, switch=False)
+                there = settled(bound, values, SETTLED * _usual_sd(recording, noise), halvings=HALVINGS, switch=False)
             except TorchcalError:
                 return False
             if not bool(torch.isfinite(there.outputs_of(values, there.solve(values))).all()):
@@ -190,7 +193,7 @@ def _separations(pairs: Sequence[Pair], recording: Recording, noise: Noise) -> l
             return None
         predictions.append(y)
         slopes.append(jacobian)
-    white = _whitening(models[0].found.problem, recording, noise)
+    white = _whitening(models[0].found, recording, predictions[0], noise)
     predictions, slopes = [white.vector(y) for y in predictions], [white(jacobian) for jacobian in slopes]
     distances = []
     for a, b in ((models.index(one), models.index(other)) for one, other in pairs):
@@ -224,21 +227,52 @@ def _explodes(model: Model, y: Tensor, noise: Noise) -> bool:
     return any(float(new.abs().max()) > FAR * float(old.max()) for old, new in pairs)
 
 
-def _whitening(problem: Problem, recording: Recording, noise: Noise) -> Whitening:
-    """Of noise at new conditions, which has the memory of that of the recording, however close samples are."""
-    correlation = noise.correlation
+def _whitening(found: Fitted, recording: Recording, y: Tensor, noise: Noise) -> Whitening:
+    """Of noise at new conditions, where a fit shows ``y``; it has the memory of that of the recording, however close
+    samples are."""
+    correlation, problem = noise.correlation, found.problem
     if problem.recording.runs and recording.runs and not problem.by_sample:
         usual = [float(runs[0].time.diff().median()) for runs in (recording.runs, problem.recording.runs)]
         correlation = correlation ** (usual[0] / usual[1])
     new = dataclasses.replace(Problem.of(problem.simulator, recording), by_sample=problem.by_sample)
-    return new.whitening(_sd(recording, noise), correlation)
+    return new.whitening(_sd_there(found, recording, y, noise), correlation)
 
 
-def _sd(recording: Recording, noise: Noise) -> Tensor:
+def _usual_sd(recording: Recording, noise: Noise) -> Tensor:
     """Of each new datum, as of the median datum of its output, ``(n_total,)``."""
     outputs = len(recording.outputs)
     per_output = torch.stack([part[torch.isfinite(part)].median() for part in noise.sd.chunk(outputs)])
     return per_output.repeat_interleave(recording.n)
+
+
+def _sd_there(found: Fitted, recording: Recording, y: Tensor, noise: Noise) -> Tensor:
+    """Of each new datum, where a fit shows ``y`` ``(n_total,)``: that of the datum of its output at the nearest
+    conditions, or in time of the nearest value."""
+    problem, sd = found.problem, _usual_sd(recording, noise)
+    for output in problem.output_of.unique().tolist():
+        mine = problem.output_of == output
+        known = noise.sd[problem.index[mine]]
+        here = slice(output * recording.n, (output + 1) * recording.n)
+        if bool((known == known[0]).all()):
+            sd[here] = known[0]
+        elif problem.in_time:
+            sd[here] = known[_nearest(found.y[mine][:, None], y[here, None])]
+        else:
+            at = problem.recording.columns[problem.condition_of[mine]]
+            scales = [Span.of(column, time=False) for column in at.T]
+            old, new = (
+                torch.stack([
+                    scale.distance(column.clamp(scale.low, scale.high), scale.low) / (scale.size or 1.0)
+                    for scale, column in zip(scales, columns.T, strict=True)
+                ], dim=1) for columns in (at, recording.columns)
+            )  # fmt: skip
+            sd[here] = known[_nearest(old, new)]
+    return sd
+
+
+def _nearest(old: Tensor, new: Tensor) -> Tensor:
+    """Which of some points ``(n, C)`` is nearest to each of others, ``(m,)``."""
+    return torch.cat([torch.cdist(piece, old).argmin(1) for piece in new.split(PIECE)])
 
 
 def _there(found: Fitted, simulator: Trajectories, recording: Recording) -> tuple[Trajectories, Tensor]:

@@ -92,11 +92,14 @@ def likelier(d: Any) -> str:
     base = sum(row.probability for row in d.ranking if not row.terms)
     sound = [row for row in d.ranking if row.terms and row.refitted and row.physical and not row.note]
     best = max(sound, key=lambda row: row.probability, default=None)
-    if best is None or best.probability <= base:
+    every = sum(row.probability for row in sound)
+    if best is None or every <= base:
         return ""
     known = ", or a known noise sd," if d.noise.source == "estimated" else ""
+    alone = best.probability > base
+    which = f"{called(d, best.terms)} is" if alone else "the terms that were tried are, taken together,"
     return (
-        f" Yet {called(d, best.terms)} is likelier than the base alone (probability {best.probability:.2f} and "
+        f" Yet {which} likelier than the base alone (probability {best.probability if alone else every:.2f} and "
         f"{chance(base)}), which chance may have done; more data{known} would tell."
     )
 

@@ -33,6 +33,8 @@ TIED = 4
 PART = 0.5
 #: Share of a place up to which a name hardly acts there.
 MEETS = 0.25
+#: Share of a driver's extent beside its end in which an edge is none.
+BESIDE = 1e-3
 #: Log evidence from which on a place is listed, and how many are.
 LEAST_EVIDENCE, LISTED = 2.0, 8
 
@@ -134,7 +136,8 @@ def locate(
         share, evidence, extent = removed(search, local), _evidence(search, local), _extent(drivers)
         span = (low, high)
         if local is search.unnamed:
-            told: dict[str, Any] = {"edges": tuple(end for end in (w.low, w.high) if math.isfinite(end)), "at": w.at}
+            inner = (float(drivers.min()) + BESIDE * extent, float(drivers.max()) - BESIDE * extent)
+            told: dict[str, Any] = {"edges": tuple(e for e in (w.low, w.high) if inner[0] < e < inner[1]), "at": w.at}
         else:
             told = {"terms": local.names, "also": tuple(also)}
             span = _met(drivers, low, high) if _has_levels(search, w.driver) else span

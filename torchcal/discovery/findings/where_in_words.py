@@ -11,6 +11,8 @@ __all__ = ["share_in_words", "where_in_words"]
 
 #: Log evidence below the best place's down to which another one is told beside it.
 CLOSE = 3.0
+#: Difference in log-likelihood up to which model error is as likely in one parameter as in another.
+AS_LIKELY = 0.5
 #: Share of a driver's range from which on spans say nothing.
 EVERYWHERE = 0.9
 #: Share of the misfit by which another one removes more.
@@ -135,6 +137,11 @@ def _embedded(d: Any) -> str:
     if len(d.embedded) < 2 or d.embedded[0].sd <= 0:
         return ""
     first, second = d.embedded[:2]
+    if first.log_likelihood - second.log_likelihood < AS_LIKELY:
+        return (
+            f" Model error embedded in one parameter at a time is about as likely in {first.parameter} (sd "
+            f"{first.sd:.3g}) as in {second.parameter} (sd {second.sd:.3g})."
+        )
     return (
         f" Model error embedded in one parameter at a time is likeliest in {first.parameter} (sd {first.sd:.3g}; "
         f"{up_to(first.log_likelihood - second.log_likelihood)} in log-likelihood before {second.parameter})."

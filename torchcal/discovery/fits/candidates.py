@@ -11,7 +11,14 @@ from torch import Tensor
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.ranges import NOTHING, Anything, Scale, sized, with_room
-from torchcal.discovery.fits.shapes import driver_values, grid_of_shapes, lies_anywhere, shape_points
+from torchcal.discovery.fits.shapes import (
+    combined,
+    driver_values,
+    finer,
+    lies_anywhere,
+    points_of_shapes,
+    shape_points,
+)
 from torchcal.discovery.fits.trial import check_finite, check_repeats, place_of
 from torchcal.errors import SimulatorError, TorchcalError
 from torchcal.simulators import Trajectories, free_parameters, is_value_of
@@ -43,7 +50,7 @@ class Candidate:
         amplitudes: Places among them whose neutral values switch the terms off.
         neutral: Neutral values of ``own`` (the middle of the bounds for a shape without one).
         shapes: Values of ``own`` on a grid of shapes, ``(G, len(own))``, amplitudes neutral.
-        tangents: ∂y/∂amplitude at each shape, ``(G, n, len(amplitudes))``.
+        tangents: ∂y/∂amplitude at each shape, ``(G, n, len(amplitudes))``; none if it is not to be screened.
         begin: Base estimate with the terms at neutral, ``(P,)``.
         bent: Starting values ``(S, P)`` of one whose tangents are the base's, but whose larger effects are not.
     """
@@ -243,9 +250,17 @@ def _refused(base: Problem, term: Term, values: Tensor) -> TorchcalError | None:
 
 
 def prepare(
-    base: Problem, found: Fitted, terms: Sequence[Term], fixed: Mapping[str, float], scale: Scale = NOTHING
+    base: Problem,
+    found: Fitted,
+    terms: Sequence[Term],
+    fixed: Mapping[str, float],
+    scale: Scale = NOTHING,
+    *,
+    screened: bool = True,
 ) -> Candidate:
     """Extend the simulator by terms and take the tangents of their amplitudes at the base's fit.
+
+    Without these, and with fewer shapes, where it is to be refitted and not ``screened``.
 
     Raises:
         SimulatorError: If the terms change the simulator at their neutral values, or give no finite outputs there.
@@ -307,11 +322,20 @@ def prepare(
     if not amplitudes:  # a product of parameters, or a threshold: try each with the others away from neutral
         amplitudes = _hidden_amplitudes(problem, own, certain, begin, linear)
     shape = [place for place in own if place not in amplitudes]
-    grid = grid_of_shapes(problem, shape, driver_values(base, found, terms, [problem.parameters[i] for i in shape]))
-    rows = begin.expand(len(grid), -1).clone()
-    if shape:
+    drivers = driver_values(base, found, terms, [problem.parameters[i] for i in shape])
+    points: list[list[float]] | None = points_of_shapes(problem, shape, drivers)
+    given = [problem.parameters[i].name in drivers for i in shape]
+    tangents = begin.new_zeros(0, problem.n, len(amplitudes))
+    while points is not None:
+        grid = combined(points)
+        rows = begin.expand(len(grid), -1).clone()
         rows[:, shape] = grid
-    tangents = _in_pieces(linear, rows, amplitudes)
+        if not screened:
+            break
+        tangents = torch.nan_to_num(_in_pieces(linear, rows, amplitudes), nan=0.0, posinf=0.0, neginf=0.0)
+        if base.simulator.dear and not isinstance(base.simulator, Trajectories):
+            break
+        points = finer(problem, shape, points, tangents / found.whitening.sd[:, None], given)
     return Candidate(
         terms=terms,
         problem=problem,
@@ -320,13 +344,13 @@ def prepare(
         amplitudes=amplitudes,
         neutral=torch.tensor(neutral, dtype=torch.float64),
         shapes=rows[:, own],
-        tangents=torch.nan_to_num(tangents, nan=0.0, posinf=0.0, neginf=0.0),
+        tangents=tangents,
         begin=begin,
     )
 
 
 def _in_pieces(linear: object, rows: Tensor, amplitudes: list[int]) -> Tensor:
-    return torch.cat([linear(rows[k : k + 16], amplitudes)[1] for k in range(0, len(rows), 16)])  # type: ignore[operator]
+    return torch.cat([linear(rows[k : k + 32], amplitudes)[1] for k in range(0, len(rows), 32)])  # type: ignore[operator]
 
 
 def _hidden_amplitudes(

@@ -12,7 +12,9 @@ from torchcal.discovery.fits.problem import Problem
 from torchcal.simulators import Parameter
 from torchcal.terms import Term
 
-__all__ = ["driver_values", "grid_of_shapes", "lies_anywhere", "shape_points"]
+__all__ = [
+    "combined", "driver_values", "finer", "lies_anywhere", "points_of_shapes", "shape_points",
+]  # fmt: skip
 
 #: Points of a grid of shape parameters: along one, two, three and more of them.
 GRID_POINTS = (1, 9, 5, 4)
@@ -22,6 +24,9 @@ DRIVER_POINTS = (0, 7, 3, 2)
 ANYWHERE_POINTS = (0, 6, 4, 2)
 #: Points of the grid at most, and the fraction whose multiples spread them over all.
 MOST_POINTS, GOLDEN = 256, 0.5 * (math.sqrt(5.0) - 1.0)
+#: The same of a grid that is finer in some shapes, and points of another one that are enough then; and the share of a
+#: tangent that its neighbour has, below which the grid is too coarse.
+MOST_FINE, FEWEST, SHARED = 512, 3, 0.3
 
 
 def shape_points(parameter: Parameter, count: int) -> list[float]:
@@ -39,9 +44,14 @@ def shape_points(parameter: Parameter, count: int) -> list[float]:
         factors = torch.linspace(-2, 2, count).tolist() if count > 1 else [0.0]
         return [end + away * 2.0**k for k in factors]
     at = torch.linspace(0, 1, count + 2, dtype=torch.float64)[1:-1]
-    if parameter.transform == "log" or (low > 0 and high / low > 20):
+    if _over_decades(parameter):
         return [float(low * (high / low) ** a) for a in at]
     return [float(low + (high - low) * a) for a in at]
+
+
+def _over_decades(q: Parameter) -> bool:
+    """Whether values are laid out over the logarithm of a shape with bounds."""
+    return q.low is not None and q.high is not None and (q.transform == "log" or (q.low > 0 and q.high / q.low > 20))
 
 
 def lies_anywhere(q: Parameter) -> bool:
@@ -68,9 +78,10 @@ def driver_values(
     }  # fmt: skip
 
 
-def grid_of_shapes(problem: Problem, shape: list[int], drivers: Mapping[str, Sequence[Tensor]]) -> Tensor:
-    """Combinations ``(G, len(shape))`` of values of the parameters at places ``shape``, with what `driver_values` tells
-    of them."""
+def points_of_shapes(
+    problem: Problem, shape: Sequence[int], drivers: Mapping[str, Sequence[Tensor]]
+) -> list[list[float]]:
+    """Values at which each of the parameters at places ``shape`` is tried, with what `driver_values` tells of them."""
     level = min(len(shape), len(GRID_POINTS) - 1)
     count, more = GRID_POINTS[level], DRIVER_POINTS[level]
     points = []
@@ -87,13 +98,71 @@ def grid_of_shapes(problem: Problem, shape: list[int], drivers: Mapping[str, Seq
             low, high = q.low or 0.0, q.high if q.high is not None else math.inf
             there = [min(max(v, low), high) for v in _spaced(values[0], more)]
             points.append(shape_points(q, count - more // 2) + there)
+    return points
+
+
+def combined(points: Sequence[Sequence[float]]) -> Tensor:
+    """Combinations ``(G, len(points))`` of a value of each shape."""
     number = math.prod(len(each) for each in points)
-    if number <= MOST_POINTS:
+    if number <= MOST_FINE:
         rows = list(itertools.product(*points))
     else:  # some of all, none of them alike in most
         numbers = dict.fromkeys(int(number * (k * GOLDEN % 1.0)) for k in range(2 * MOST_POINTS))
         rows = [_combination(points, k) for k in list(numbers)[:MOST_POINTS]]
-    return torch.tensor(rows, dtype=torch.float64).reshape(len(rows), len(shape))
+    return torch.tensor(rows, dtype=torch.float64).reshape(len(rows), len(points))
+
+
+def finer(
+    problem: Problem, shape: Sequence[int], points: Sequence[list[float]], tangents: Tensor, given: Sequence[bool]
+) -> list[list[float]] | None:
+    """Values of shapes with more of them where tangents ``(G, n, amplitudes)`` of all combinations differ so much from
+    one to the next that what lies between is not seen: of a frequency, say, of which a whole cycle more fits into the
+    recording. None where they do not, or where there are as many as there may be.
+
+    Args:
+        problem: Of the candidate.
+        shape: Places of the shapes.
+        points: Their values.
+        tangents: At all `combined`.
+        given: Which shapes stay as they are.
+    """
+    counts = [len(each) for each in points]
+    if math.prod(counts) != len(tangents) or not tangents.numel():
+        return None
+    whole = tangents.reshape(*counts, *tangents.shape[1:])
+    more = [
+        [] if stays else _between(problem.parameters[place], each, _shared(whole, d, each))
+        for d, (place, each, stays) in enumerate(zip(shape, points, given, strict=True))
+    ]
+    if not any(more):
+        return None
+    if math.prod(len(each) + len(new) for each, new in zip(points, more, strict=True)) > MOST_FINE:
+        points = [each if new else each[:: max(len(each) // FEWEST, 1)] for each, new in zip(points, more, strict=True)]
+    found = [*points]
+    for d, new in enumerate(more):
+        room = MOST_FINE // math.prod(len(each) for k, each in enumerate(found) if k != d) - len(found[d])
+        found[d] = found[d] + new[:: max(-(-len(new) // max(room, 1)), 1)] if room > 0 else found[d]
+    return found if any(len(each) > len(old) for each, old in zip(found, points, strict=True)) else None
+
+
+def _shared(whole: Tensor, d: int, points: Sequence[float]) -> Tensor:
+    """Share of the tangents at each value of shape ``d``, in ascending order, that those at the one before have,
+    ``(len(points) - 1,)``; the median over the other shapes and amplitudes."""
+    whole = whole.movedim(d, 0)[torch.tensor(points).argsort()].reshape(len(points), -1, *whole.shape[-2:])
+    basis = torch.linalg.qr(whole[:-1]).Q
+    share = (basis.transpose(-1, -2) @ whole[1:]).norm(dim=-2) / whole[1:].norm(dim=-2)
+    return share.nan_to_num(nan=1.0).flatten(1).median(-1).values
+
+
+def _between(q: Parameter, points: Sequence[float], shared: Tensor) -> list[float]:
+    """Values of a shape between those that share too little, and beyond the outermost if these do."""
+    ends = [q.low, *sorted(points), q.high]
+    few = [bool(shared[0] < SHARED), *(shared < SHARED).tolist(), bool(shared[-1] < SHARED)] if len(shared) else []
+    return [
+        math.sqrt(low * high) if _over_decades(q) else 0.5 * (low + high)
+        for low, high, more in zip(ends, ends[1:], few, strict=False)
+        if more and low is not None and high is not None and low < high
+    ]
 
 
 def _spaced(values: Tensor, count: int) -> list[float]:

@@ -268,11 +268,13 @@ def learned(other: Fitted, base: Fitted, candidate: Candidate) -> Tensor:
     low, high = problem.limits()
     row = candidate.begin.clone()
     row[_columns(base, candidate)] = row.new_tensor([known[base.problem.parameters[i].name] for i in base.free])
-    begin = row.repeat(min(len(candidate.shapes), SHAPES), 1)
-    begin[:, candidate.own] = candidate.shapes[: len(begin)]
+    begin = row.repeat(len(candidate.shapes), 1)
+    begin[:, candidate.own] = candidate.shapes
     y, slope = problem.evaluate(begin, candidate.amplitudes)[:2]
     left, effects = w.vector(problem.y - y), torch.stack([w(one) for one in slope])
-    sizes = (effects * left[..., None]).sum(1).abs() / effects.square().sum(1)
+    along, square = (effects * left[..., None]).sum(1), effects.square().sum(1)
+    best = (along.square() / square).nan_to_num(nan=0.0).amax(1).argsort(descending=True, stable=True)[:SHAPES]
+    begin, sizes = begin[best], (along.abs() / square)[best]
     rows = []
     for a, place in enumerate(candidate.amplitudes):
         size = float(sizes[:, a].nan_to_num(posinf=0.0).max())

@@ -1,0 +1,132 @@
+"""Shapes of terms that lie anywhere within wide bounds: periods, frequencies and phases."""
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from scipy.integrate import solve_ivp
+
+import torchcal as tc
+from torchcal.discovery import windows
+from torchcal.discovery.fits.shapes import combined, finer
+
+F64 = torch.float64
+LINE = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a", initial=1.0), tc.Parameter("b", initial=1.0)])
+
+
+def diagnose(simulator, recording, terms):
+    return tc.diagnose(simulator, recording, terms, seed=0, progress=False)
+
+
+def wavy(period, n, seed, size=0.6):
+    x = np.linspace(0, 20, n)
+    y = 1 + 0.5 * x + size * np.cos(2 * np.pi * (x - 2) / period)
+    return tc.Recording(x=x, y=y + 0.07 * np.random.default_rng(seed).standard_normal(n), noise=0.07)
+
+
+def cosine():
+    return tc.Term(
+        "cosine",
+        outputs={"y": lambda x, p, y: y + p["A"] * torch.cos(2 * math.pi * (x - p["x0"]) / p["P"])},
+        parameters=[tc.Parameter("A"), tc.Parameter("P", low=3.0, high=20.0), tc.Parameter("x0", low=0.0, high=20.0)],
+    )
+
+
+@pytest.mark.parametrize(("period", "n"), [(3.7, 28), (4.3, 60), pytest.param(3.3, 60, marks=pytest.mark.slow)])
+def test_a_period_of_which_many_fit_into_the_recording_is_found(period, n):
+    d = diagnose(LINE, wavy(period, n, 300), [cosine()])
+    assert d.terms == ["cosine"]
+    (found,) = [e for e in d.final.estimates if e.name == "cosine.P"]
+    assert abs(found.value - period) < 4 * found.sd
+
+
+@pytest.mark.parametrize("phase", [-2.25, pytest.param(1.5, marks=pytest.mark.slow)])
+def test_a_phase_does_not_end_at_its_bound(phase):
+    x = np.linspace(0, 20, 28)
+    seed = {-2.25: 1, 1.5: 6}[phase]
+    y = 1 + 0.5 * x + 0.5 * np.sin(0.5 * x + phase) + 0.1 * np.random.default_rng(seed).standard_normal(28)
+    wave = tc.Term(
+        "wave",
+        outputs={"y": lambda x, p, y: y + p["A"] * torch.sin(p["om"] * x + p["ph"])},
+        parameters=[
+            tc.Parameter("A"), tc.Parameter("om", low=0.2, high=3.0), tc.Parameter("ph", low=-3.2, high=3.2)
+        ],
+    )  # fmt: skip
+    assert diagnose(LINE, tc.Recording(x=x, y=y, noise=0.1), [wave]).terms == ["wave"]
+
+
+@pytest.mark.slow
+def test_many_shapes_name_nothing_in_noise():
+    # Of 30 a test at 0.01 alarms in more than 3 with probability 0.0002.
+    alarms = [diagnose(LINE, wavy(3.7, 40, seed, size=0.0), [cosine()]).verdict != "consistent" for seed in range(30)]
+    assert sum(alarms) <= 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [0.1, 0.6])
+def test_a_drive_of_unknown_frequency_is_found_in_a_rate(size):
+    t = np.linspace(0, 40, 161)
+    rates = lambda q, y: [y[1], -2.3 * y[0] - 0.3 * y[1] + size * np.sin(5.1 * q + 0.7)]  # noqa: E731
+    x = solve_ivp(rates, (0, 40), [1.0, 0.0], t_eval=t, rtol=1e-9, atol=1e-10).y[0]
+    sd = 0.02 * x.std()
+    recording = tc.Recording(
+        runs=[tc.Run(time=t, outputs={"x": x + sd * np.random.default_rng(0).normal(size=161)})], noise=sd
+    )
+    model = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["x"] - p["c"] * s["v"]},
+        states={"x": "m", "v": "m/s"},
+        parameters=[tc.Parameter("k", low=0.1, high=9.0), tc.Parameter("c", low=0.0, high=3.0)],
+        observe=("x",),
+    )
+    shaker = tc.Term(
+        "shaker",
+        equation="v",
+        rate=lambda t, s, p, u: p["a"] * torch.sin(p["w"] * t) + p["b"] * torch.cos(p["w"] * t),
+        parameters=[tc.Parameter("a"), tc.Parameter("b"), tc.Parameter("w", low=0.3, high=8.0)],
+    )
+    d = diagnose(model, recording, [shaker])
+    assert d.terms == ["shaker"]
+    (found,) = [e for e in d.final.estimates if e.name == "shaker.w"]
+    assert abs(found.value - 5.1) < 4 * found.sd
+
+
+def looked(points, low, high, given=False, transform=None):
+    """What finer values are asked for of a frequency, beside two phases that tell all of it."""
+    x = torch.linspace(0, 1, 200, dtype=F64)
+    q = tc.Parameter("w", low=low, high=high, transform=transform)
+    problem = SimpleNamespace(parameters=[q, tc.Parameter("phase", low=0.0, high=4.0)])
+    both = [points, [0.0, 0.5 * math.pi]]
+    rows = combined(both)
+    tangents = torch.sin(2 * math.pi * rows[:, :1] * x + rows[:, 1:])[..., None]
+    return finer(problem, [0, 1], both, tangents, [given, True])
+
+
+def test_a_grid_is_finer_only_where_it_is_too_coarse():
+    assert looked([1.0, 1.1, 1.2], 0.9, 1.3) is None
+    assert looked([10.0, 20.0], 5.0, 25.0, given=True) is None
+    frequencies, phases = looked([10.0, 20.0, 20.1, 20.2], 5.0, 20.3)
+    assert frequencies == [10.0, 20.0, 20.1, 20.2, 7.5, 15.0]  # beyond an end only where that end is coarse
+    assert phases == [0.0, 0.5 * math.pi]
+    over_decades, _ = looked([4.0, 100.0], 1.0, 400.0, transform="log")
+    assert over_decades == [4.0, 100.0, 2.0, 20.0, 200.0]
+    assert looked(torch.linspace(0, 2550, 256).tolist(), 0.0, 2550.0) is None  # there are as many as there may be
+
+
+def test_what_fits_better_in_a_window_begins_there_everywhere(monkeypatch):
+    asked = []
+    parameters = [tc.Parameter("a"), tc.Parameter("wave.A")]
+    candidate = SimpleNamespace(problem=SimpleNamespace(parameters=parameters))
+    lead = SimpleNamespace(
+        numbers=(0,), window=SimpleNamespace(),
+        found=SimpleNamespace(by_name={"wave.window to": 3.0, "wave.A": 2.0, "a": 1.0}),
+    )  # fmt: skip
+    search = SimpleNamespace(physical_leader=lead, candidates=[candidate], prior=0.0, reweigh=lambda: None)
+    monkeypatch.setattr(windows, "improve", lambda search, wanted: asked.extend(wanted))
+    windows._hand_back(search)
+    assert asked[0].begin.tolist() == [[1.0, 2.0]]
+    assert asked[0].candidate is candidate
+    lead.window = None
+    windows._hand_back(search)
+    assert len(asked) == 1
