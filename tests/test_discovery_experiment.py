@@ -63,14 +63,27 @@ def test_noise_of_new_data_is_that_of_the_nearest_recorded_ones():
     assert found.tolist() == [100.0, 10.0, 0.1, 0.01]
     even = experiment._sd_there(SimpleNamespace(problem=problem, y=0 * f), new, 0 * f, SimpleNamespace(sd=0 * sd + 2))
     assert even.tolist() == [2.0] * 4
+    far = tc.Recording(x={"f": f.sort().values[[0, 0]], "T": [300.0, 300.0]}, y=[0.0] * 2)
+    twice = tc.Recording(x={"f": f[[0, 0, 1]], "T": [300.0] * 3}, y=[0.0] * 3, noise=[3.0, 4.0, 9.0])
+    two = SimpleNamespace(problem=Problem.of(problem.simulator, twice), y=torch.zeros(3, dtype=F64))
+    noise = SimpleNamespace(sd=torch.tensor([3.0, 4.0, 9.0], dtype=F64))
+    there = experiment._sd_there(two, far, torch.zeros(2, dtype=F64), noise)
+    assert there.tolist() == pytest.approx([math.sqrt(12.5)] * 2)  # of replicates with several
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_noise_of_a_new_run_is_that_of_data_of_like_values(first):
     decay = tc.ODESimulator(lambda t, s, p, u: {"x": -p["k"] * s["x"]}, {"x": "m"}, [tc.Parameter("k", initial=1.0)])
-    run = tc.Run(time=[0.0, 1.0, 2.0], outputs={"x": [8.0, 4.0, 2.0]}, initial={"x": 8.0})
-    in_time = Problem.of(decay, tc.Recording(runs=[run], noise=[0.8, 0.4, 0.2]))
-    y = torch.tensor([8.0, 4.0, 2.0], dtype=F64)
-    later = tc.Recording(runs=[tc.Run(time=[0.0, 9.0], outputs={"x": [5.0, 0.0]}, initial={"x": 5.0})])
-    noise = SimpleNamespace(sd=torch.tensor([0.8, 0.4, 0.2], dtype=F64))
-    fit_there = SimpleNamespace(problem=in_time, y=y)
-    assert experiment._sd_there(fit_there, later, torch.tensor([5.0, 0.0], dtype=F64), noise).tolist() == [0.4, 0.2]
+    t = torch.linspace(0, 4, 41, dtype=F64)
+    y = torch.exp(-t)
+    runs = [tc.Run(time=t, outputs={"x": y}, initial={"x": 1.0})] * 2
+    sd = torch.cat([y, 3 * y]) if first else torch.cat([3 * y, y])
+    problem = Problem.of(decay, tc.Recording(runs=runs))
+    new = tc.Recording(runs=[tc.Run(time=[0.0, 9.0], outputs={"x": [0.5, 0.0]}, initial={"x": 0.5})])
+    found = SimpleNamespace(problem=problem, y=torch.cat([y, y]))
+    there = experiment._sd_there(found, new, torch.tensor([0.5, 0.0], dtype=F64), SimpleNamespace(sd=sd))
+    mean = math.sqrt(5.0)  # of both runs
+    assert there.tolist() == pytest.approx([0.5 * mean, float(y[-2]) * mean], rel=0.2)
 
 
 def rivals():
@@ -200,13 +213,14 @@ def drifting(y: torch.Tensor) -> SimpleNamespace:
 
 
 def test_more_samples_of_slow_noise_tell_hardly_more():
-    problem = drifting(torch.arange(50, dtype=F64)).found.problem
+    found = drifting(torch.arange(50, dtype=F64)).found
     noise = SimpleNamespace(sd=torch.ones(50, dtype=F64), correlation=torch.tensor([0.9], dtype=F64))
     told = []
     for times in (1, 4, 16):
         t = torch.arange(49 * times + 1, dtype=F64) / times
         blank = tc.Recording(runs=[tc.Run(time=t, outputs={"x": torch.zeros_like(t)}, initial={"x": 0.0})])
-        told.append(float(experiment._whitening(problem, blank, noise).vector(torch.ones_like(t)).norm()))
+        white = experiment._whitening(found, blank, torch.zeros_like(t), noise)
+        told.append(float(white.vector(torch.ones_like(t)).norm()))
     assert told[2] < 1.05 * told[0]
 
 

@@ -10,7 +10,11 @@ from scipy.integrate import solve_ivp
 
 import torchcal as tc
 from torchcal.discovery import windows
-from torchcal.discovery.fits.shapes import combined, finer
+from torchcal.discovery.fits.candidates import prepare
+from torchcal.discovery.fits.fitting import fit
+from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.fits.shapes import _between, _shared, looked_at
+from torchcal.discovery.hypotheses.beginnings import learned
 
 F64 = torch.float64
 LINE = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a", initial=1.0), tc.Parameter("b", initial=1.0)])
@@ -92,26 +96,69 @@ def test_a_drive_of_unknown_frequency_is_found_in_a_rate(size):
     assert abs(found.value - 5.1) < 4 * found.sd
 
 
-def looked(points, low, high, given=False, transform=None):
-    """What finer values are asked for of a frequency, beside two phases that tell all of it."""
+def looked(points, low, high, given=False, transform=None, others=(0.0, 0.8, 1.6), also=0):
+    """Values that are looked at of a frequency, and of a phase beside it; and how many tangents that takes."""
     x = torch.linspace(0, 1, 200, dtype=F64)
     q = tc.Parameter("w", low=low, high=high, transform=transform)
     problem = SimpleNamespace(parameters=[q, tc.Parameter("phase", low=0.0, high=4.0)])
-    both = [points, [0.0, 0.5 * math.pi]]
-    rows = combined(both)
-    tangents = torch.sin(2 * math.pi * rows[:, :1] * x + rows[:, 1:])[..., None]
-    return finer(problem, [0, 1], both, tangents, [given, True])
+    asked = []
+
+    def look(rows):
+        asked.append(len(rows))
+        smooth = [(x**k).expand(len(rows), -1) for k in range(2, 2 + also)]
+        return torch.stack([torch.sin(2 * math.pi * rows[:, :1] * x + rows[:, 1:]), *smooth], dim=-1)
+
+    sd = torch.ones(200, dtype=F64)
+    grid, tangents = looked_at(problem, [0, 1], [points, list(others)], [given, False], look, sd)
+    assert torch.equal(tangents, look(grid))
+    return grid[:, 0].unique().tolist(), grid[:, 1].unique().tolist(), sum(asked[:-1])
 
 
 def test_a_grid_is_finer_only_where_it_is_too_coarse():
-    assert looked([1.0, 1.1, 1.2], 0.9, 1.3) is None
-    assert looked([10.0, 20.0], 5.0, 25.0, given=True) is None
-    frequencies, phases = looked([10.0, 20.0, 20.1, 20.2], 5.0, 20.3)
-    assert frequencies == [10.0, 20.0, 20.1, 20.2, 7.5, 15.0]  # beyond an end only where that end is coarse
-    assert phases == [0.0, 0.5 * math.pi]
-    over_decades, _ = looked([4.0, 100.0], 1.0, 400.0, transform="log")
-    assert over_decades == [4.0, 100.0, 2.0, 20.0, 200.0]
-    assert looked(torch.linspace(0, 2550, 256).tolist(), 0.0, 2550.0) is None  # there are as many as there may be
+    assert looked([1.0, 1.1, 1.2], 0.9, 1.3)[0] == [1.0, 1.1, 1.2]
+    assert looked([10.0, 20.0], 5.0, 25.0, given=True)[0] == [10.0, 20.0]
+    frequencies, phases, asked = looked([10.0, 20.0, 20.1, 20.2], 5.0, 20.3)
+    assert phases == [0.0, 0.8, 1.6]
+    assert max(np.diff([5.0, *frequencies])) < 1.0
+    assert [w for w in frequencies if w >= 20.0] == [20.0, 20.1, 20.2]
+    assert asked == 3 * len(frequencies)  # none twice
+    assert looked([10.0, 20.0, 20.1, 20.2], 5.0, 20.3, also=2)[0] == frequencies  # of an amplitude beside others too
+
+
+def test_a_grid_is_of_bounded_size_and_spares_what_changes_less():
+    nine = torch.linspace(0, 3, 9).tolist()
+    frequencies, phases, _ = looked(torch.linspace(0, 200, 9).tolist(), 0.0, 200.0, others=nine)
+    assert phases == nine[::3]
+    assert len(frequencies) * len(phases) <= 256 < len(frequencies) * 9
+
+
+def test_values_between_decades_are_their_geometric_means_and_a_jump_is_no_end_of_them():
+    q = tc.Parameter("w", low=1.0, high=400.0, transform="log")
+    assert _between(q, [4.0, 100.0], torch.tensor([0.1])) == pytest.approx([2.0, 20.0, 200.0])
+    close = [100.0, 100.001, 300.0]
+    assert _between(q, close, torch.tensor([0.0, 0.9])) == pytest.approx([10.0])
+    far = tc.Parameter("t0", low=1.7e9, high=1.7e9 + 10)
+    tangents = torch.tensor([1.0, 1.0, 1e-9], dtype=F64)[:, None, None] * torch.ones(3, 5, 1, dtype=F64)
+    shared = _shared(tangents, 0, [1.7e9 + 2, 1.7e9, 1.7e9 + 1])
+    assert shared.tolist() == [1.0, 1.0]  # in ascending order, and what is nothing is none
+    assert _between(far, [1.7e9, 1.7e9 + 1], torch.tensor([0.1])) == [1.7e9 + 0.5, 1.7e9 + 5.5]
+
+
+def test_shapes_of_what_is_dear_are_not_looked_at_more_and_the_best_begin_at_another_fit():
+    recording = wavy(3.7, 40, 1)
+    for dear in (False, True):
+        simulator = tc.Simulator(LINE.function, LINE.parameters)
+        simulator.dear = dear
+        problem = Problem.of(simulator, recording)
+        found = fit(problem, problem.whitening(0.07 * torch.ones(40, dtype=F64), torch.zeros(1, dtype=F64)),
+                    torch.ones(1, 2, dtype=F64), [0, 1])  # fmt: skip
+        candidate = prepare(problem, found, [cosine()], {})
+        assert (len(candidate.shapes) > 25) is not dear
+        assert len(prepare(problem, found, [cosine()], {}, screened=False).tangents) == 0
+        if not dear:
+            rows = learned(found, found, candidate)
+            names = [q.name for q in candidate.problem.parameters]
+            assert float((rows[:, names.index("cosine.P")] - 3.7).abs().min()) < 0.15
 
 
 def test_what_fits_better_in_a_window_begins_there_everywhere(monkeypatch):

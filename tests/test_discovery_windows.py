@@ -613,11 +613,13 @@ def test_the_range_that_sharp_edges_put_first_is_that_of_its_rivals_too(monkeypa
     monkeypatch.setattr(windows_module, "_rivals", rivals)
     monkeypatch.setattr(windows_module, "_refine_edges", lambda search, prior: put(sharp))
     monkeypatch.setattr(windows_module, "_turn", lambda search, prior: None)
-    monkeypatch.setattr(windows_module, "_hand_back", lambda search: None)
+    handed = []
+    monkeypatch.setattr(windows_module, "_hand_back", lambda search: handed.append(search.leader.weight))
     monkeypatch.setattr(windows_module, "_reshape", lambda search: False)
     monkeypatch.setattr(windows_module, "_keep_all", lambda search, wanted: None)
     windows_module.refit_local(search)
     assert asked == [("W", {})] + [("t", {"edge": True})] * moved
+    assert handed == [281.0 if moved else 264.0]
 
 
 def test_a_nameless_change_that_the_simulator_does_not_take_is_left_out(monkeypatch):

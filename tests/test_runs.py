@@ -13,6 +13,7 @@ import torch
 import torchcal as tc
 from torchcal.data import Recording, Run
 from torchcal.errors import DomainError, RecordingError, ShapeError, TorchcalError
+from torchcal.results import in_time
 
 NAN, INF = float("nan"), float("inf")
 T = [0.0, 1.0, 3.0]
@@ -78,6 +79,15 @@ def test_each_input_may_go_on_in_its_own_way():
     assert "input (linear) room" in repr(one)
     assert dataclasses.replace(one, hold={"valve": "cubic", "room": "cubic", "load": "cubic"}).hold == "cubic"
     assert Run(T, {"x": X}, inputs, hold={}).hold == "linear"
+
+
+def test_samples_between_and_runs_that_are_given_again_keep_the_hold_of_each_input():
+    one = Run(T, {"x": X}, {"f": F, "g": F}, hold={"f": "zero"})
+    more, _ = in_time._with_times(tc.Recording(runs=[one]), {"time": tensor([2.0]), "run": tensor([0.0])})
+    assert more.runs[0].holds == one.holds
+    assert float(more.runs[0].inputs["f"][2]) == F[1]
+    assert in_time._may_be(Run(T, {"x": X}, {"f": F}, hold="zero"), one)
+    assert not in_time._may_be(Run(T, {"x": X}, {"f": F}), one)
 
 
 REFUSED_RUNS = {

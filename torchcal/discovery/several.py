@@ -291,28 +291,34 @@ def _hidden(search: Search) -> set[int]:
 def _linear_pairs(search: Search, most: int) -> list[tuple[int, int]]:
     """Columns of two candidates, each at any of its shapes, that explain most together; the best of each two."""
     screening = search.screening
-    usable = (screening.norm > 0).nonzero()[:, 0]
-    usable = usable[[int(i) not in search.gone for i in screening.owner[usable]]]
-    if len(usable) < 2:
-        return []
-    columns, owner = screening.columns[:, usable], screening.owner[usable]
-    z = columns.T @ search.residual.e
-    c = columns.T @ columns
+    usable: dict[int, Tensor] = {}
+    for i in screening.owner[screening.norm > 0].unique().tolist():
+        if i not in search.gone:
+            usable[i] = ((screening.norm > 0) & (screening.owner == i)).nonzero()[:, 0]
+    found = []
+    for i, j in itertools.combinations(usable, 2):
+        gain, *pair = _best_pair(search, usable[i], usable[j])
+        if gain > 0:
+            found.append((gain, (pair[0], pair[1])))
+    return [pair for _, pair in sorted(found, key=lambda one: -one[0])[:most]]
+
+
+def _best_pair(search: Search, first: Tensor, second: Tensor) -> tuple[float, int, int]:
+    """What the best pair of two sets of columns explains together, with signs that physics allows, and the pair."""
+    screening = search.screening
+    a, b = screening.columns[:, first], screening.columns[:, second]
+    za, zb, c = (a.T @ search.residual.e)[:, None], b.T @ search.residual.e, a.T @ b
     rest = (1 - c.square()).clamp_min(1e-6)
-    size = (z[:, None] - c * z) / rest  # of the first of the two
-    gain = (z[:, None].square() + z.square() - 2 * c * z[:, None] * z) / rest
-    sided = [search.candidates[int(owner[k])].one_sided(search.amplitude(int(usable[k]))) for k in range(len(usable))]
-    sign = torch.tensor(sided, dtype=torch.float64)[:, None]
-    allowed = sign * size >= 0
-    allowed &= allowed.T & (c.abs() < NEARLY_SAME) & (owner[:, None] < owner)
+    gain = (za.square() + zb.square() - 2 * c * za * zb) / rest
+    sides = [
+        torch.tensor([search.candidates[int(screening.owner[k])].one_sided(search.amplitude(int(k))) for k in columns])
+        for columns in (first, second)
+    ]
+    allowed = (sides[0][:, None] * (za - c * zb) >= 0) & (sides[1] * (zb - c * za) >= 0) & (c.abs() < NEARLY_SAME)
     gain = torch.where(allowed, gain, torch.zeros_like(gain))
-    chosen: dict[tuple[int, int], tuple[int, int]] = {}
-    for k in gain.flatten().argsort(descending=True).tolist():
-        i, j = k // len(usable), k % len(usable)
-        if float(gain[i, j]) <= 0 or len(chosen) == most:
-            break
-        chosen.setdefault((int(owner[i]), int(owner[j])), (int(usable[i]), int(usable[j])))
-    return list(chosen.values())
+    best = int(gain.argmax())
+    one, other = divmod(best, len(second))
+    return float(gain[one, other]), int(first[one]), int(second[other])
 
 
 def _linear_row(search: Search, candidate: Candidate, columns: tuple[int, int]) -> Tensor:

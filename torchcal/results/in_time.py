@@ -150,7 +150,8 @@ def _may_be(run: Run, own: Run) -> bool:
             for name, values in given.items()
         )
 
-    same = run.initial == own.initial and run.hold == own.hold and torch.equal(run.time, own.time)
+    alike = all(own.holds.get(name) == hold for name, hold in run.holds.items())
+    same = run.initial == own.initial and alike and torch.equal(run.time, own.time)
     return same and agree(run.inputs, own.inputs) and agree(run.outputs, own.outputs)
 
 

@@ -35,8 +35,9 @@ LEAST = 2.0
 WORTH = 1.01
 #: Solver error, in noise sd, up to which a model bears an experiment, with steps of its kind halved so often at most.
 SETTLED, HALVINGS = 0.1, 3
-#: New data whose nearest recorded ones are sought at once.
-PIECE = 1024
+#: New data whose nearest recorded ones are sought at once; how many of these count in time, as several runs may have
+#: noise of several sizes at one value; and up to how much farther away others are as near.
+PIECE, ALIKE, AS_NEAR = 1024, 8, 1e-9
 #: How many times the largest reading no experiment shall make an output.
 FAR = 100.0
 
@@ -246,8 +247,8 @@ def _usual_sd(recording: Recording, noise: Noise) -> Tensor:
 
 
 def _sd_there(found: Fitted, recording: Recording, y: Tensor, noise: Noise) -> Tensor:
-    """Of each new datum, where a fit shows ``y`` ``(n_total,)``: that of the datum of its output at the nearest
-    conditions, or in time of the nearest value."""
+    """Of each new datum, where a fit shows ``y`` ``(n_total,)``: that of the data of its output at the nearest
+    conditions, or in time of the nearest values."""
     problem, sd = found.problem, _usual_sd(recording, noise)
     for output in problem.output_of.unique().tolist():
         mine = problem.output_of == output
@@ -256,7 +257,7 @@ def _sd_there(found: Fitted, recording: Recording, y: Tensor, noise: Noise) -> T
         if bool((known == known[0]).all()):
             sd[here] = known[0]
         elif problem.in_time:
-            sd[here] = known[_nearest(found.y[mine][:, None], y[here, None])]
+            sd[here] = _beside(found.y[mine][:, None], y[here, None], known, min(ALIKE, len(known)))
         else:
             at = problem.recording.columns[problem.condition_of[mine]]
             scales = [Span.of(column, time=False) for column in at.T]
@@ -266,13 +267,18 @@ def _sd_there(found: Fitted, recording: Recording, y: Tensor, noise: Noise) -> T
                     for scale, column in zip(scales, columns.T, strict=True)
                 ], dim=1) for columns in (at, recording.columns)
             )  # fmt: skip
-            sd[here] = known[_nearest(old, new)]
+            sd[here] = _beside(old, new, known, 1)
     return sd
 
 
-def _nearest(old: Tensor, new: Tensor) -> Tensor:
-    """Which of some points ``(n, C)`` is nearest to each of others, ``(m,)``."""
-    return torch.cat([torch.cdist(piece, old).argmin(1) for piece in new.split(PIECE)])
+def _beside(old: Tensor, new: Tensor, sd: Tensor, count: int) -> Tensor:
+    """Root mean square of the sd at so many of some points ``(n, C)``, and all as near, beside others ``(m, C)``."""
+    found = []
+    for piece in new.split(PIECE):
+        away = torch.cdist(piece, old, compute_mode="donot_use_mm_for_euclid_dist")
+        near = away <= away.kthvalue(count, dim=1, keepdim=True).values * (1 + AS_NEAR)
+        found.append((near * sd.square()).sum(1) / near.sum(1))
+    return torch.cat(found).sqrt()
 
 
 def _there(found: Fitted, simulator: Trajectories, recording: Recording) -> tuple[Trajectories, Tensor]:

@@ -14,8 +14,8 @@ from torchcal.discovery.fits.ranges import NOTHING, Anything, Scale, sized, with
 from torchcal.discovery.fits.shapes import (
     combined,
     driver_values,
-    finer,
     lies_anywhere,
+    looked_at,
     points_of_shapes,
     shape_points,
 )
@@ -323,19 +323,21 @@ def prepare(
         amplitudes = _hidden_amplitudes(problem, own, certain, begin, linear)
     shape = [place for place in own if place not in amplitudes]
     drivers = driver_values(base, found, terms, [problem.parameters[i] for i in shape])
-    points: list[list[float]] | None = points_of_shapes(problem, shape, drivers)
-    given = [problem.parameters[i].name in drivers for i in shape]
-    tangents = begin.new_zeros(0, problem.n, len(amplitudes))
-    while points is not None:
-        grid = combined(points)
-        rows = begin.expand(len(grid), -1).clone()
+    points = points_of_shapes(problem, shape, drivers)
+
+    def rows_of(grid: Tensor) -> Tensor:
+        rows = begin.repeat(len(grid), 1)
         rows[:, shape] = grid
-        if not screened:
-            break
-        tangents = torch.nan_to_num(_in_pieces(linear, rows, amplitudes), nan=0.0, posinf=0.0, neginf=0.0)
-        if base.simulator.dear and not isinstance(base.simulator, Trajectories):
-            break
-        points = finer(problem, shape, points, tangents / found.whitening.sd[:, None], given)
+        return rows
+
+    def look(grid: Tensor) -> Tensor:
+        return torch.nan_to_num(_in_pieces(linear, rows_of(grid), amplitudes), nan=0.0, posinf=0.0, neginf=0.0)
+
+    grid, tangents = combined(points), begin.new_zeros(0, problem.n, len(amplitudes))
+    if screened:
+        dear = base.simulator.dear and not isinstance(base.simulator, Trajectories)
+        given = [dear or problem.parameters[i].name in drivers for i in shape]
+        grid, tangents = looked_at(problem, shape, points, given, look, found.whitening.sd)
     return Candidate(
         terms=terms,
         problem=problem,
@@ -343,7 +345,7 @@ def prepare(
         own=own,
         amplitudes=amplitudes,
         neutral=torch.tensor(neutral, dtype=torch.float64),
-        shapes=rows[:, own],
+        shapes=rows_of(grid)[:, own],
         tangents=tangents,
         begin=begin,
     )

@@ -2,7 +2,7 @@
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from torchcal.simulators import Parameter
 from torchcal.terms import Term
 
 __all__ = [
-    "combined", "driver_values", "finer", "lies_anywhere", "points_of_shapes", "shape_points",
+    "combined", "driver_values", "lies_anywhere", "looked_at", "points_of_shapes", "shape_points",
 ]  # fmt: skip
 
 #: Points of a grid of shape parameters: along one, two, three and more of them.
@@ -24,9 +24,10 @@ DRIVER_POINTS = (0, 7, 3, 2)
 ANYWHERE_POINTS = (0, 6, 4, 2)
 #: Points of the grid at most, and the fraction whose multiples spread them over all.
 MOST_POINTS, GOLDEN = 256, 0.5 * (math.sqrt(5.0) - 1.0)
-#: The same of a grid that is finer in some shapes, and points of another one that are enough then; and the share of a
-#: tangent that its neighbour has, below which the grid is too coarse.
-MOST_FINE, FEWEST, SHARED = 512, 3, 0.3
+#: Share of a tangent that its neighbour has, below which a grid is too coarse; how often values between are added, not
+#: to gaps of less than this share of the range; points of other shapes that are enough then; and the size of a tangent,
+#: in that of the largest, below which it is none.
+SHARED, ROUNDS, FINEST, FEWEST, NOTHING = 0.3, 5, 0.004, 3, 1e-6
 
 
 def shape_points(parameter: Parameter, count: int) -> list[float]:
@@ -104,7 +105,7 @@ def points_of_shapes(
 def combined(points: Sequence[Sequence[float]]) -> Tensor:
     """Combinations ``(G, len(points))`` of a value of each shape."""
     number = math.prod(len(each) for each in points)
-    if number <= MOST_FINE:
+    if number <= MOST_POINTS:
         rows = list(itertools.product(*points))
     else:  # some of all, none of them alike in most
         numbers = dict.fromkeys(int(number * (k * GOLDEN % 1.0)) for k in range(2 * MOST_POINTS))
@@ -112,56 +113,87 @@ def combined(points: Sequence[Sequence[float]]) -> Tensor:
     return torch.tensor(rows, dtype=torch.float64).reshape(len(rows), len(points))
 
 
-def finer(
-    problem: Problem, shape: Sequence[int], points: Sequence[list[float]], tangents: Tensor, given: Sequence[bool]
-) -> list[list[float]] | None:
-    """Values of shapes with more of them where tangents ``(G, n, amplitudes)`` of all combinations differ so much from
-    one to the next that what lies between is not seen: of a frequency, say, of which a whole cycle more fits into the
-    recording. None where they do not, or where there are as many as there may be.
+def looked_at(
+    problem: Problem,
+    shape: Sequence[int],
+    points: Sequence[Sequence[float]],
+    given: Sequence[bool],
+    look: Callable[[Tensor], Tensor],
+    sd: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Combinations of shapes ``(G, len(points))`` and tangents there ``(G, n, amplitudes)``.
+
+    Where tangents differ so much from one value of a shape to the next that what lies between is not seen, values
+    between are looked at too: of a frequency, say, of which a whole cycle more fits into the recording.
 
     Args:
         problem: Of the candidate.
         shape: Places of the shapes.
-        points: Their values.
-        tangents: At all `combined`.
-        given: Which shapes stay as they are.
+        points: Their values to begin with.
+        given: Which of them stay as they are.
+        look: Tangents at rows of shapes.
+        sd: Of the noise, ``(n,)``.
     """
-    counts = [len(each) for each in points]
-    if math.prod(counts) != len(tangents) or not tangents.numel():
-        return None
-    whole = tangents.reshape(*counts, *tangents.shape[1:])
-    more = [
-        [] if stays else _between(problem.parameters[place], each, _shared(whole, d, each))
-        for d, (place, each, stays) in enumerate(zip(shape, points, given, strict=True))
-    ]
-    if not any(more):
-        return None
-    if math.prod(len(each) + len(new) for each, new in zip(points, more, strict=True)) > MOST_FINE:
-        points = [each if new else each[:: max(len(each) // FEWEST, 1)] for each, new in zip(points, more, strict=True)]
-    found = [*points]
-    for d, new in enumerate(more):
-        room = MOST_FINE // math.prod(len(each) for k, each in enumerate(found) if k != d) - len(found[d])
-        found[d] = found[d] + new[:: max(-(-len(new) // max(room, 1)), 1)] if room > 0 else found[d]
-    return found if any(len(each) > len(old) for each, old in zip(found, points, strict=True)) else None
+    found, stays, grown = [list(each) for each in points], list(given), [False] * len(points)
+    grid = combined(found)
+    tangents = look(grid)
+    for _ in range(ROUNDS):
+        counts = [len(each) for each in found]
+        if math.prod(counts) != len(grid) or not tangents.numel():
+            break
+        whole = (tangents / sd[:, None]).reshape(*counts, *tangents.shape[1:])
+        more = [
+            [] if stays[d] else _between(problem.parameters[place], found[d], _shared(whole, d, found[d]))
+            for d, place in enumerate(shape)
+        ]
+        grown = [so_far or bool(new) for so_far, new in zip(grown, more, strict=True)]
+        if math.prod(len(each) + len(new) for each, new in zip(found, more, strict=True)) > MOST_POINTS:
+            for d, each in enumerate(found):
+                if not (stays[d] or grown[d]):  # a few are enough of what changes less
+                    found[d], stays[d] = each[:: max(len(each) // FEWEST, 1)], True
+        for d, new in enumerate(more):
+            room = MOST_POINTS // math.prod(len(each) for k, each in enumerate(found) if k != d) - len(found[d])
+            if new and room > 0:
+                found[d] = sorted(found[d] + new[:: -(-len(new) // room)])
+        if [len(each) for each in found] == counts:
+            break
+        known = {tuple(row): k for k, row in enumerate(grid.tolist())}
+        grid = combined(found)
+        places = [known.get(tuple(row), -1) for row in grid.tolist()]
+        anew = torch.tensor([k < 0 for k in places])
+        tangents = tangents[places]
+        if bool(anew.any()):
+            tangents[anew] = look(grid[anew])
+    return grid, tangents
 
 
 def _shared(whole: Tensor, d: int, points: Sequence[float]) -> Tensor:
     """Share of the tangents at each value of shape ``d``, in ascending order, that those at the one before have,
-    ``(len(points) - 1,)``; the median over the other shapes and amplitudes."""
-    whole = whole.movedim(d, 0)[torch.tensor(points).argsort()].reshape(len(points), -1, *whole.shape[-2:])
+    ``(len(points) - 1,)``; the least of the amplitudes', and the median over the other shapes."""
+    order = torch.tensor(points, dtype=torch.float64).argsort(stable=True)
+    whole = whole.movedim(d, 0)[order].reshape(len(points), -1, *whole.shape[-2:])
+    size = whole.norm(dim=-2)
     basis = torch.linalg.qr(whole[:-1]).Q
-    share = (basis.transpose(-1, -2) @ whole[1:]).norm(dim=-2) / whole[1:].norm(dim=-2)
-    return share.nan_to_num(nan=1.0).flatten(1).median(-1).values
+    share = (basis.transpose(-1, -2) @ whole[1:]).norm(dim=-2) / size[1:]
+    # What is nothing beside the rest is rounding.
+    tiny = (size[:-1] <= NOTHING * size.max()) | (size[1:] <= NOTHING * size.max())
+    return share.masked_fill(tiny, 1.0).nan_to_num(nan=1.0).amin(-1).median(-1).values
 
 
 def _between(q: Parameter, points: Sequence[float], shared: Tensor) -> list[float]:
-    """Values of a shape between those that share too little, and beyond the outermost if these do."""
-    ends = [q.low, *sorted(points), q.high]
-    few = [bool(shared[0] < SHARED), *(shared < SHARED).tolist(), bool(shared[-1] < SHARED)] if len(shared) else []
+    """Values of a shape between those that share too little, and beyond the outermost if these do, unless they lie
+    close beside each other."""
+    if not len(shared):
+        return []
+    over, values = _over_decades(q), sorted(points)
+    ends = [values[0] if q.low is None else q.low, *values, values[-1] if q.high is None else q.high]
+    few = [bool(shared[0] < SHARED), *(shared < SHARED).tolist(), bool(shared[-1] < SHARED)]
+    scale = [math.log(value) for value in ends] if over else ends
+    least = FINEST * (scale[-1] - scale[0])
     return [
-        math.sqrt(low * high) if _over_decades(q) else 0.5 * (low + high)
-        for low, high, more in zip(ends, ends[1:], few, strict=False)
-        if more and low is not None and high is not None and low < high
+        math.sqrt(low * high) if over else 0.5 * (low + high)
+        for low, high, gap, more in zip(ends, ends[1:], itertools.pairwise(scale), few, strict=False)
+        if more and gap[1] - gap[0] > least
     ]
 
 

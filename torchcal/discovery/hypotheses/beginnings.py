@@ -268,8 +268,9 @@ def learned(other: Fitted, base: Fitted, candidate: Candidate) -> Tensor:
     low, high = problem.limits()
     row = candidate.begin.clone()
     row[_columns(base, candidate)] = row.new_tensor([known[base.problem.parameters[i].name] for i in base.free])
-    begin = row.repeat(len(candidate.shapes), 1)
-    begin[:, candidate.own] = candidate.shapes
+    shapes = candidate.shapes[:SHAPES] if problem.simulator.dear and not problem.in_time else candidate.shapes
+    begin = row.repeat(len(shapes), 1)
+    begin[:, candidate.own] = shapes
     y, slope = problem.evaluate(begin, candidate.amplitudes)[:2]
     left, effects = w.vector(problem.y - y), torch.stack([w(one) for one in slope])
     along, square = (effects * left[..., None]).sum(1), effects.square().sum(1)
