@@ -169,11 +169,15 @@ def test_what_fits_better_in_a_window_begins_there_everywhere(monkeypatch):
         numbers=(0,), window=SimpleNamespace(),
         found=SimpleNamespace(by_name={"wave.window to": 3.0, "wave.A": 2.0, "a": 1.0}),
     )  # fmt: skip
-    search = SimpleNamespace(physical_leader=lead, candidates=[candidate], prior=0.0, reweigh=lambda: None)
+    search = SimpleNamespace(
+        physical_leader=lead, candidates=[candidate], prior=0.0, reweigh=lambda: None, plain={0: object()}
+    )
     monkeypatch.setattr(windows, "improve", lambda search, wanted: asked.extend(wanted))
     windows._hand_back(search)
     assert asked[0].begin.tolist() == [[1.0, 2.0]]
     assert asked[0].candidate is candidate
+    search.plain = {}  # which the base has everywhere
+    windows._hand_back(search)
     lead.window = None
     windows._hand_back(search)
     assert len(asked) == 1

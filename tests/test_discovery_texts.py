@@ -679,6 +679,8 @@ def test_places_are_told_to_a_thousandth_of_their_extent():
     assert local.region_text("x", -math.inf, 0.031, begun) == "x near 0.031"
     assert local.region_text("x", 5.0, math.inf, begun) == "x near 5"
     assert local.region_text("x", -math.inf, 0.1, begun) == "x < 0.1"
+    decades = local.Span(0.01, 100.0, log=True)
+    assert [decades.holds(at) for at in (0.01, 0.011, 50.0, 100.0, 200.0)] == [False, True, True, False, False]
     for extent in (600.0, 3600.0, 86400.0):
         start = 1.7e9 + 0.412 * extent
         span = local.Span(1.7e9, 1.7e9 + extent, False)

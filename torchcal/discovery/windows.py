@@ -105,7 +105,7 @@ def refit_local(search: Search) -> None:
 def _hand_back(search: Search) -> None:
     """Begin the leader's term everywhere from what it has come to in a window, which may be a better minimum."""
     lead = search.physical_leader
-    if lead is None or lead.window is None or len(lead.numbers) != 1:
+    if lead is None or lead.window is None or lead.numbers[0] not in search.plain:  # what the base has everywhere
         return
     candidate, known = search.candidates[lead.numbers[0]], lead.found.by_name
     begin = torch.tensor([[known[q.name] for q in candidate.problem.parameters]], dtype=torch.float64)

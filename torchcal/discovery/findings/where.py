@@ -33,8 +33,6 @@ TIED = 4
 PART = 0.5
 #: Share of a place up to which a name hardly acts there.
 MEETS = 0.25
-#: Share of a driver's extent beside its end in which an edge is none.
-BESIDE = 1e-3
 #: Log evidence from which on a place is listed, and how many are.
 LEAST_EVIDENCE, LISTED = 2.0, 8
 
@@ -136,8 +134,9 @@ def locate(
         share, evidence, extent = removed(search, local), _evidence(search, local), _extent(drivers)
         span = (low, high)
         if local is search.unnamed:
-            inner = (float(drivers.min()) + BESIDE * extent, float(drivers.max()) - BESIDE * extent)
-            told: dict[str, Any] = {"edges": tuple(e for e in (w.low, w.high) if inner[0] < e < inner[1]), "at": w.at}
+            scale = search.spans()[w.driver]
+            ends = (end for end in (w.low, w.high) if math.isfinite(end) and scale.holds(end))
+            told: dict[str, Any] = {"edges": tuple(ends), "at": w.at}
         else:
             told = {"terms": local.names, "also": tuple(also)}
             span = _met(drivers, low, high) if _has_levels(search, w.driver) else span

@@ -69,6 +69,10 @@ class Span:
         low, high = max(low, self.low), min(high, self.high)
         return (math.log(high / low) if self.log else high - low) / self.size
 
+    def holds(self, value: float) -> bool:
+        """Whether a value lies in the range, clear of both ends."""
+        return self.share(self.low, value) > CLOSED and self.share(value, self.high) > CLOSED
+
     def edged(self, low: float, high: float) -> "Span":
         """The same with edges that leave a short window between two values open in its middle."""
         return dataclasses.replace(self, edge=min(max(NARROW * self.share(low, high), WIDTHS[0]), EDGE))
