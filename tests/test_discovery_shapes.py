@@ -167,7 +167,10 @@ def test_what_fits_better_in_a_window_begins_there_everywhere(monkeypatch):
     candidate = SimpleNamespace(problem=SimpleNamespace(parameters=parameters))
     lead = SimpleNamespace(
         numbers=(0,), window=SimpleNamespace(),
-        found=SimpleNamespace(by_name={"wave.window to": 3.0, "wave.A": 2.0, "a": 1.0}),
+        found=SimpleNamespace(
+            problem=SimpleNamespace(parameters=[tc.Parameter(name) for name in ("wave.window to", "wave.A", "a")]),
+            values=torch.tensor([3.0, 2.0, 1.0], dtype=F64),
+        ),
     )  # fmt: skip
     search = SimpleNamespace(
         physical_leader=lead, candidates=[candidate], prior=0.0, reweigh=lambda: None, plain={0: object()}

@@ -291,34 +291,29 @@ def _hidden(search: Search) -> set[int]:
 def _linear_pairs(search: Search, most: int) -> list[tuple[int, int]]:
     """Columns of two candidates, each at any of its shapes, that explain most together; the best of each two."""
     screening = search.screening
-    usable: dict[int, Tensor] = {}
-    for i in screening.owner[screening.norm > 0].unique().tolist():
-        if i not in search.gone:
-            usable[i] = ((screening.norm > 0) & (screening.owner == i)).nonzero()[:, 0]
-    found = []
-    for i, j in itertools.combinations(usable, 2):
-        gain, *pair = _best_pair(search, usable[i], usable[j])
-        if gain > 0:
-            found.append((gain, (pair[0], pair[1])))
-    return [pair for _, pair in sorted(found, key=lambda one: -one[0])[:most]]
+    sided = []  # columns of every candidate, and the sides to which they may act
+    for i, candidate in enumerate(search.candidates):
+        columns = screening.usable(i)
+        if len(columns) and i not in search.gone:
+            sided.append((columns, torch.tensor([candidate.one_sided(search.amplitude(int(k))) for k in columns])))
+    found = [_best_pair(search, *first, *second) for first, second in itertools.combinations(sided, 2)]
+    return [pair for gain, pair in sorted(found, key=lambda one: -one[0])[:most] if gain > 0]
 
 
-def _best_pair(search: Search, first: Tensor, second: Tensor) -> tuple[float, int, int]:
+def _best_pair(
+    search: Search, first: Tensor, side: Tensor, second: Tensor, other_side: Tensor
+) -> tuple[float, tuple[int, int]]:
     """What the best pair of two sets of columns explains together, with signs that physics allows, and the pair."""
     screening = search.screening
     a, b = screening.columns[:, first], screening.columns[:, second]
     za, zb, c = (a.T @ search.residual.e)[:, None], b.T @ search.residual.e, a.T @ b
     rest = (1 - c.square()).clamp_min(1e-6)
     gain = (za.square() + zb.square() - 2 * c * za * zb) / rest
-    sides = [
-        torch.tensor([search.candidates[int(screening.owner[k])].one_sided(search.amplitude(int(k))) for k in columns])
-        for columns in (first, second)
-    ]
-    allowed = (sides[0][:, None] * (za - c * zb) >= 0) & (sides[1] * (zb - c * za) >= 0) & (c.abs() < NEARLY_SAME)
+    allowed = (side[:, None] * (za - c * zb) >= 0) & (other_side * (zb - c * za) >= 0) & (c.abs() < NEARLY_SAME)
     gain = torch.where(allowed, gain, torch.zeros_like(gain))
     best = int(gain.argmax())
     one, other = divmod(best, len(second))
-    return float(gain[one, other]), int(first[one]), int(second[other])
+    return float(gain[one, other]), (int(first[one]), int(second[other]))
 
 
 def _linear_row(search: Search, candidate: Candidate, columns: tuple[int, int]) -> Tensor:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchcal.discovery.fits.candidates import prepare
+from torchcal.discovery.fits.candidates import prepare, spread_values
 from torchcal.discovery.fits.local import EDGE, ENDS, SHORT, WIDTH_OF_EDGE, WIDTHS, Span, beyond, is_window, localised
 from torchcal.discovery.hypotheses.aliases import duplicate
 from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
@@ -107,9 +107,9 @@ def _hand_back(search: Search) -> None:
     lead = search.physical_leader
     if lead is None or lead.window is None or lead.numbers[0] not in search.plain:  # what the base has everywhere
         return
-    candidate, known = search.candidates[lead.numbers[0]], lead.found.by_name
-    begin = torch.tensor([[known[q.name] for q in candidate.problem.parameters]], dtype=torch.float64)
-    improve(search, [Hypothetical(lead.numbers, candidate, begin, search.prior)])
+    candidate, names = search.candidates[lead.numbers[0]], [q.name for q in lead.found.problem.parameters]
+    begin = spread_values(candidate.problem, names, lead.found.values)
+    improve(search, [Hypothetical(lead.numbers, candidate, begin[None], search.prior)])
     search.reweigh()
 
 

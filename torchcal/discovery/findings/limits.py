@@ -132,8 +132,8 @@ def _wavers(search: Search, column: Tensor) -> float:
 def _typical(search: Search, i: int) -> int:
     """The column of a candidate's best amplitude at the shape of median effect: the best shape is that of the noise."""
     screening = search.screening
-    same = screening.amplitude == screening.amplitude[screening.best[i]]
-    places = ((screening.owner == i) & same & (screening.norm > 0)).nonzero()[:, 0]
+    usable = screening.usable(i)
+    places = usable[screening.amplitude[usable] == screening.amplitude[screening.best[i]]]
     order = screening.norm[places].argsort()
     return int(places[order[len(order) // 2]])
 

@@ -220,8 +220,7 @@ def call_once(base: Problem, term: Term, rows: Tensor) -> None:
 
 def _refused(base: Problem, term: Term, values: Tensor) -> TorchcalError | None:
     """What is raised at parameter values of the base ``(P,)`` that may be raised at any."""
-    in_steps = isinstance(base.simulator, Trajectories)
-    if base.simulator.dear and not in_steps:
+    if base.dear:
         return None
     term = sized(term, Anything(), base.recording)
     bound = extend(base.simulator, [term])
@@ -335,8 +334,7 @@ def prepare(
 
     grid, tangents = combined(points), begin.new_zeros(0, problem.n, len(amplitudes))
     if screened:
-        dear = base.simulator.dear and not isinstance(base.simulator, Trajectories)
-        given = [dear or problem.parameters[i].name in drivers for i in shape]
+        given = [base.dear or problem.parameters[i].name in drivers for i in shape]
         grid, tangents = looked_at(problem, shape, points, given, look, found.whitening.sd)
     return Candidate(
         terms=terms,

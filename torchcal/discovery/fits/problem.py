@@ -129,6 +129,11 @@ class Problem:
         return found
 
     @property
+    def dear(self) -> bool:
+        """Whether the simulator's evaluations cost what nobody can tell, as those of a program of its own do."""
+        return self.simulator.dear and not isinstance(self.simulator, Trajectories)
+
+    @property
     def in_time(self) -> bool:
         """Whether the recording is one in time."""
         return self.recording.runs is not None

@@ -154,9 +154,8 @@ def farther(
     parameters at others ``(V, P)``, effects of all sizes are held while the base follows them; the best go on.
     """
     base, problem, columns = residual.found, candidate.problem, _columns(residual.found, candidate)
-    mine = (screening.owner == number).nonzero()[:, 0]
     nothing = candidate.begin[None][:0], torch.zeros(0, dtype=torch.float64)
-    usable = mine[screening.norm[mine] > 0]
+    usable = screening.usable(number)
     if len(usable) == 0:
         return nothing
     scores = screening.columns[:, usable].T @ residual.e
@@ -268,7 +267,7 @@ def learned(other: Fitted, base: Fitted, candidate: Candidate) -> Tensor:
     low, high = problem.limits()
     row = candidate.begin.clone()
     row[_columns(base, candidate)] = row.new_tensor([known[base.problem.parameters[i].name] for i in base.free])
-    shapes = candidate.shapes[:SHAPES] if problem.simulator.dear and not problem.in_time else candidate.shapes
+    shapes = candidate.shapes[:SHAPES] if problem.dear else candidate.shapes
     begin = row.repeat(len(shapes), 1)
     begin[:, candidate.own] = shapes
     y, slope = problem.evaluate(begin, candidate.amplitudes)[:2]
@@ -303,8 +302,7 @@ def _step_along(base: Fitted, candidate: Candidate, shape: int, amplitude: int, 
 
 def _linear(residual: Residual, screening: Screening, number: int, candidate: Candidate) -> Tensor:
     """The linear estimate of a candidate at its best shapes."""
-    mine = (screening.owner == number).nonzero()[:, 0]
-    usable = mine[screening.norm[mine] > 0]
+    usable = screening.usable(number)
     if len(usable) == 0:
         return blind_rows(candidate)
     rows, used = [], set()

@@ -64,6 +64,10 @@ class Screening:
         """Largest score of a candidate."""
         return 0.0 if self.best[i] < 0 else float(self.z[self.best[i]])
 
+    def usable(self, i: int) -> Tensor:
+        """Columns of a candidate that say something new."""
+        return ((self.owner == i) & (self.norm > 0)).nonzero()[:, 0]
+
     def correlation(self, i: int, j: int) -> float:
         """Of the best tangents of two candidates."""
         if self.best[i] < 0 or self.best[j] < 0:
