@@ -13,6 +13,7 @@ from torchcal.discovery import windows
 from torchcal.discovery.fits.candidates import prepare
 from torchcal.discovery.fits.fitting import fit
 from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.fits.rhythm import rhythms
 from torchcal.discovery.fits.shapes import _between, _shared, looked_at
 from torchcal.discovery.hypotheses.beginnings import learned
 
@@ -96,7 +97,7 @@ def test_a_drive_of_unknown_frequency_is_found_in_a_rate(size):
     assert abs(found.value - 5.1) < 4 * found.sd
 
 
-def looked(points, low, high, given=False, transform=None, others=(0.0, 0.8, 1.6), also=0):
+def looked(points, low, high, given=False, transform=None, others=(0.0, 0.8, 1.6), also=0, periods=()):
     """Values that are looked at of a frequency, and of a phase beside it; and how many tangents that takes."""
     x = torch.linspace(0, 1, 200, dtype=F64)
     q = tc.Parameter("w", low=low, high=high, transform=transform)
@@ -109,7 +110,7 @@ def looked(points, low, high, given=False, transform=None, others=(0.0, 0.8, 1.6
         return torch.stack([torch.sin(2 * math.pi * rows[:, :1] * x + rows[:, 1:]), *smooth], dim=-1)
 
     sd = torch.ones(200, dtype=F64)
-    grid, tangents = looked_at(problem, [0, 1], [points, list(others)], [given, False], look, sd)
+    grid, tangents = looked_at(problem, [0, 1], [points, list(others)], [given, False], look, sd, lambda: periods)
     assert torch.equal(tangents, look(grid))
     return grid[:, 0].unique().tolist(), grid[:, 1].unique().tolist(), sum(asked[:-1])
 
@@ -130,6 +131,56 @@ def test_a_grid_is_of_bounded_size_and_spares_what_changes_less():
     frequencies, phases, _ = looked(torch.linspace(0, 200, 9).tolist(), 0.0, 200.0, others=nine)
     assert phases == nine[::3]
     assert len(frequencies) * len(phases) <= 256 < len(frequencies) * 9
+
+
+def test_a_grid_that_is_too_coarse_is_offered_periods_and_frequencies_of_what_is_left():
+    nine = torch.linspace(0, 3, 9).tolist()
+    many = torch.linspace(0, 2000, 9).tolist()
+    offered = [0.0123, 0.5]
+    frequencies, phases, _ = looked(many, 0.0, 2000.0, others=nine, periods=offered)
+    assert {*offered, 1 / 0.0123, 2 * math.pi / 0.0123} < set(frequencies)
+    assert len(frequencies) * len(phases) <= 256
+    assert 0.05 not in looked([1.0, 1.1, 1.2], 0.01, 1.3, periods=[0.05])[0]  # it is fine enough
+
+
+@pytest.mark.parametrize("period", [0.083, 0.71])
+@pytest.mark.parametrize("two", [False, True])
+def test_rhythms_are_periods_of_the_strongest_waves_of_uneven_data(period, two):
+    rng = np.random.default_rng(0)
+    x = np.sort(rng.uniform(0, 10, 300))
+    left = 2.0 * np.sin(2 * np.pi * x / period + 1.0) + np.sin(2 * np.pi * x / 0.23) + 0.3 * rng.standard_normal(300)
+    order = rng.permutation(300) if two else np.arange(300)
+    conditions = {"x": x[order]} | ({"z": rng.uniform(0, 1, 300), "k": np.arange(300.0) % 2} if two else {})
+    recording = tc.Recording(x={k: torch.as_tensor(v) for k, v in conditions.items()}, y=torch.as_tensor(left[order]))
+    problem = Problem.of(tc.Simulator(lambda x, p: p["a"] + 0 * x["x"], [tc.Parameter("a")]), recording)
+    found = rhythms(problem, problem.y)
+    assert abs(1 / found[0] - 1 / period) < 0.05  # half a cycle over all data
+    assert abs(1 / found[1] - 1 / 0.23) < 0.05
+    assert rhythms(problem, problem.y * math.nan) == []
+    few = problem.keeping(torch.arange(300) < 20)
+    assert rhythms(few, few.y) == []
+
+
+def test_a_period_of_many_decades_is_found():
+    rng = np.random.default_rng(0)
+    x = torch.as_tensor(np.sort(rng.uniform(0, 10, 300)))
+    y = 2 + 0.5 * x + 0.1 * x**2 + 0.2 * torch.sin(2 * math.pi * x / 0.083 + 1) + 0.1 * torch.as_tensor(
+        rng.standard_normal(300)
+    )
+    model = tc.Simulator(
+        lambda x, p: p["a"] + p["b"] * x + p["c"] * x**2, [tc.Parameter("a"), tc.Parameter("b"), tc.Parameter("c")]
+    )
+    fringe = tc.Term(
+        "fringe",
+        shifts={"a": lambda x, p: p["A"] * torch.sin(2 * math.pi * x / p["P"] + p["phase"])},
+        parameters=[tc.Parameter("A"), tc.Parameter("P", low=0.01, high=10.0),
+                    tc.Parameter("phase", low=0.0, high=6.2832)],
+    )  # fmt: skip
+    cubic = tc.Term("cubic", shifts={"a": lambda x, p: p["e"] * x**3}, parameters=[tc.Parameter("e")])
+    d = tc.diagnose(model, tc.Recording(x=x, y=y, noise=0.1), [fringe, cubic], seed=0, progress=False)
+    assert d.terms == ["fringe"]
+    (found,) = [e for e in d.final.estimates if e.name == "fringe.P"]
+    assert abs(found.value - 0.083) < 4 * found.sd
 
 
 def test_values_between_decades_are_their_geometric_means_and_a_jump_is_no_end_of_them():

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+import operator
 from collections.abc import Callable, Mapping, Sequence
 
 import torch
@@ -120,6 +121,7 @@ def looked_at(
     given: Sequence[bool],
     look: Callable[[Tensor], Tensor],
     sd: Tensor,
+    periods: Callable[[], Sequence[float]],
 ) -> tuple[Tensor, Tensor]:
     """Combinations of shapes ``(G, len(points))`` and tangents there ``(G, n, amplitudes)``.
 
@@ -133,6 +135,7 @@ def looked_at(
         given: Which of them stay as they are.
         look: Tangents at rows of shapes.
         sd: Of the noise, ``(n,)``.
+        periods: Of what is left of the data: a shape with too coarse a grid may be one of them, or its frequency.
     """
     found, stays, grown = [list(each) for each in points], list(given), [False] * len(points)
     grid = combined(found)
@@ -146,15 +149,21 @@ def looked_at(
             [] if stays[d] else _between(problem.parameters[place], found[d], _shared(whole, d, found[d]))
             for d, place in enumerate(shape)
         ]
+        offered = [
+            [] if grown[d] or not more[d] else _of_periods(problem.parameters[place], found[d], periods())
+            for d, place in enumerate(shape)
+        ]
         grown = [so_far or bool(new) for so_far, new in zip(grown, more, strict=True)]
-        if math.prod(len(each) + len(new) for each, new in zip(found, more, strict=True)) > MOST_POINTS:
+        if math.prod(map(len, map(operator.add, found, map(operator.add, offered, more)))) > MOST_POINTS:
             for d, each in enumerate(found):
                 if not (stays[d] or grown[d]):  # a few are enough of what changes less
                     found[d], stays[d] = each[:: max(len(each) // FEWEST, 1)], True
         for d, new in enumerate(more):
             room = MOST_POINTS // math.prod(len(each) for k, each in enumerate(found) if k != d) - len(found[d])
             if new and room > 0:
-                found[d] = sorted(found[d] + new[:: -(-len(new) // room)])
+                first = offered[d][:room]
+                rest = new[:: -(-len(new) // (room - len(first)))] if room > len(first) else []
+                found[d] = sorted({*found[d], *first, *rest})
         if [len(each) for each in found] == counts:
             break
         known = {tuple(row): k for k, row in enumerate(grid.tolist())}
@@ -165,6 +174,12 @@ def looked_at(
         if bool(anew.any()):
             tangents[anew] = look(grid[anew])
     return grid, tangents
+
+
+def _of_periods(q: Parameter, known: Sequence[float], periods: Sequence[float]) -> list[float]:
+    """Values within the bounds of a shape that may be a period, a frequency or an angular frequency; none known."""
+    values = [value for period in periods for value in (period, 1.0 / period, 2 * math.pi / period)]
+    return [v for v in values if (q.low is None or v > q.low) and (q.high is None or v < q.high) and v not in known]
 
 
 def _shared(whole: Tensor, d: int, points: Sequence[float]) -> Tensor:
