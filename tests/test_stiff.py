@@ -598,3 +598,20 @@ def test_the_base_follows_a_close_passage_with_short_explicit_steps(star, monkey
     assert base.chi2 == pytest.approx(122 - 5, abs=5 * math.sqrt(2 * 117))
     assert base.values[0] == pytest.approx(1.0, abs=0.01)
     assert base.values[1:] == pytest.approx(values[0, 1:], abs=0.02)
+
+
+@pytest.mark.parametrize("stiff", [None, False])
+def test_a_first_guess_that_fades_within_a_step_is_solved_with_steps_that_do_not_magnify_it(stiff):
+    # A rate of 1 per hour was meant, and time is in minutes: explicit steps would make 1e40 of what fades.
+    t = np.array([0.0, 10, 15, 20, 30, 45, 60, 90, 120, 180, 240, 300, 360])
+    model = tc.ODESimulator(
+        lambda t, s, p, u: {"a": -p["k"] * s["a"]}, ["a"], [tc.Parameter("k", low=0.0, high=50.0)], stiff=stiff
+    )
+    bound = model.bind(tc.Recording(runs=[run_of(t, {"a": 100.0})]))
+    allowed = torch.full((13,), 3.0, dtype=F64)
+    assert float(bound.at(bound.x)(tensor(1.0)).abs().max()) > 1e6
+    with pytest.raises(SimulatorError, match="after 2 times"):
+        settled(bound, tensor(1.0)[None], allowed, halvings=2, switch=False)
+    found = workable(bound, tensor(1.0)[None], allowed, halvings=2)
+    assert found.implicit is (stiff is None)
+    assert float((found.at(found.x)(tensor(1.0)) - 100 * torch.exp(-torch.as_tensor(t))).abs().max()) < 3.0

@@ -227,8 +227,8 @@ def _outgrown(simulator: Trajectories, values: Tensor, states: Tensor) -> Tensor
 def workable(simulator: Trajectories, values: Tensor, allowed: Tensor, *, halvings: int = HALVINGS) -> Trajectories:
     """The same with steps with which the solution at some values is finite and settled, if there are any.
 
-    Where it settles with none it is the first with a finite solution, else the simulator itself. Arguments are those of
-    `settled`.
+    Where it settles with none it is the first with a finite solution, calmed, else the simulator itself. Arguments are
+    those of `settled`.
     """
     if not may_change(simulator) or not bool(simulator.begins(values).all()):
         return simulator
@@ -240,8 +240,8 @@ def workable(simulator: Trajectories, values: Tensor, allowed: Tensor, *, halvin
         if _finite(finer, values):
             try:
                 return settled(finer, values, allowed, halvings=halvings)
-            except (SimulatorError, DomainError):
-                return finer
+            except (SimulatorError, DomainError):  # what steps that magnify it make of what fades leads any fit astray
+                return calmed(finer, values, allowed, finer.solve(values))
     return simulator
 
 

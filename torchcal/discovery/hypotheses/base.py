@@ -28,6 +28,9 @@ HALVED = 7
 WRONG, EARLY = 0.1, 2
 #: How often they are shortened where they err, when the first part of the runs has been fitted.
 FOCUSED = 4
+#: How many of the best starts go on with each run's own values from where that run fits best, and by how much that
+#: must be better: χ², and share of it.
+CROSSED, WORTH, SHARE_WORTH = 4, 1.0, 0.01
 #: Misfit of an output, in that of all, each in its spread, below which the solver need not be more exact for it.
 FAR_BELOW = 0.03
 #: Difference of χ² up to which an initial angle in another turn gives the same fit.
@@ -215,7 +218,33 @@ def _from_starts(problem: Problem, begin: Tensor, free: list[int], rough: Tensor
             order = first.ends_chi2.argsort()
             ends = torch.cat([first.ends[order[: max(4, len(order) // 2)]], guided[:4]])
             problem = _as_short(problem, first.values)
-    return fit(problem, problem.whitening(rough, outputs), ends, free)
+    found = fit(problem, problem.whitening(rough, outputs), ends, free)
+    return None if found is None else _best_of_each_run(found)
+
+
+def _best_of_each_run(found: Fitted) -> Fitted:
+    """A fit from many starts, or a better one that begins with each run's own values from where that run fitted best.
+
+    Of several runs with values of their own few starts are in the right minimum for all of them.
+    """
+    bound, ends, chi2 = found.problem.simulator, found.ends, found.ends_chi2
+    if not isinstance(bound, Trajectories) or len(bound.runs) < 2 or ends is None or chi2 is None:
+        return found
+    origin = bound.layout.origins
+    own = torch.tensor([i for i in found.free if origin[i][1] is not None], dtype=torch.long)
+    if not len(own):
+        return found
+    y = found.problem.evaluate(ends, [])[0]
+    left = found.whitening.vector(found.problem.y - y).square()
+    by_run = left.new_zeros(len(ends), len(bound.runs))
+    by_run.index_add_(1, bound.grid.run_of[found.problem.condition_of], torch.nan_to_num(left, nan=torch.inf))
+    best = by_run.argmin(0)
+    if not float(by_run.amin(0).sum()) < found.chi2 - max(WORTH, SHARE_WORTH * found.chi2):
+        return found
+    begin = ends[chi2.argsort(stable=True)[:CROSSED]].clone()
+    begin[:, own] = ends[best[torch.tensor([origin[i][1] for i in own.tolist()])], own]
+    again = fit(found.problem, found.whitening, begin, found.free)
+    return again if again is not None and again.chi2 < found.chi2 else found
 
 
 def _as_short(problem: Problem, values: Tensor) -> Problem:
