@@ -140,6 +140,39 @@ def test_a_small_output_is_no_spike():
     assert not [w for w in told if "is a spike" in str(w.message)]
 
 
+def spikes_told(simulator, y, x, **options):
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        tc.calibrate(simulator, tc.Recording(x=x, y=y), num_samples=0, seed=0, progress=False, **options)
+    return [str(w.message) for w in told if "is a spike" in str(w.message)]
+
+
+def test_a_datum_at_which_every_spread_vanishes_is_told():
+    # At x = 0 the output depends on one parameter alone, which has no spread.
+    x = np.linspace(-1, 1, 15)
+    (said,) = spikes_told(line(), 1 + 0.7 * x + 0.4 * x**2, x, likelihood="gausmarg")
+    assert "the output's sd vanishes at 1 of 15 data" in said
+
+
+@pytest.mark.parametrize("prior", [tc.priors.Flat, tc.priors.Uniform])
+def test_an_exact_model_is_told_to_be_a_spike_of_a_likelihood_without_tolerance(prior):
+    x = np.linspace(0, 1, 9)
+    (said,) = spikes_told(line(), 1 + x, x, likelihood="gausmarg", prior=prior)
+    assert "the output's sd vanishes at 9 of 9 data" in said
+
+
+def test_the_maximum_of_the_full_likelihood_is_told_to_be_a_spike():
+    x = np.array([0.0, 1.0])
+    (said,) = spikes_told(line(), 1 + x, x, likelihood="full", prior=tc.priors.Uniform)
+    assert "the full likelihood grows without limit" in said
+
+
+def test_data_that_depend_on_no_parameter_are_no_spike():
+    simulator = tc.Simulator(lambda x, p: p["a"] * x**2, [tc.Parameter("a")])
+    x, rng = np.linspace(0, 1, 15), np.random.default_rng(2)
+    assert not spikes_told(simulator, 2 * x**2 * (1 + 0.2 * rng.standard_normal(15)), x, likelihood="gausmarg")
+
+
 def test_a_jump_in_time_takes_the_most_nodes_that_there_are():
     t = np.linspace(0, 4, 30)
     simulator = tc.ODESimulator(

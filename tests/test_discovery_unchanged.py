@@ -14,7 +14,7 @@ from torchcal.discovery.fits.fitting import fit
 from torchcal.discovery.fits.local import Span
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.shapes import combined, points_of_shapes
-from torchcal.discovery.misfit.growth import growth
+from torchcal.discovery.misfit.growth import _fastest, growth
 from torchcal.discovery.misfit.noise import estimate, quantisation
 from torchcal.discovery.misfit.residual import _noise_draws
 
@@ -283,3 +283,49 @@ def test_a_jump_at_zero_is_no_instrument_that_saturates_below_all_data(seed):
 
     assert verdict(true + 0.1 * np.sign(x)).verdict != "named"
     assert verdict(true - 0.5 * np.sign(x) * np.maximum(np.abs(true) - 0.6, 0)).terms == ["saturation of y"]
+
+
+def fading(n, left, uneven=False):
+    """How noise grows with a decay over ``n`` data; what a fit leaves is a function of times, decay and white noise."""
+    t = np.linspace(0, 18, n)
+    if uneven:
+        t = np.sort(t + 0.3 * 18 / n * np.random.default_rng(1).uniform(-1, 1, n))
+    f = 1500 * np.exp(-t / 3)
+    e = np.random.default_rng(0).standard_normal(n)
+    recording = tc.Recording(x=torch.as_tensor(t), y=torch.as_tensor(f))
+    problem = Problem.of(tc.Simulator(lambda x, p: p["a"] + 0 * x, [tc.Parameter("a")]), recording)
+    one = torch.ones(n, dtype=F64)
+    return growth(problem, torch.as_tensor(left(t, f, e)), torch.ones(n, 1, dtype=F64), torch.as_tensor(f), one)
+
+
+@pytest.mark.parametrize("uneven", [False, True])
+@pytest.mark.parametrize("n", [60, 90])
+def test_a_wave_that_fades_with_the_output_is_no_noise_that_grows_with_it(n, uneven):
+    wave = fading(n, lambda t, f, e: 0.24 * f * np.sin(2 * np.pi * t / 1.9) + 12 * e, uneven)
+    assert torch.equal(wave, torch.ones(n, dtype=F64))
+    noise = fading(n, lambda t, f, e: 0.1 * f * e, uneven)
+    assert noise.max() > 30 * noise.min()
+    counts = fading(n, lambda t, f, e: np.sqrt(f) * e, uneven)
+    assert counts.max() > 5 * counts.min()
+
+
+def test_noise_that_grows_is_told_of_few_data_and_of_short_runs():
+    noise = fading(24, lambda t, f, e: 0.1 * f * e)
+    assert noise.max() > 30 * noise.min()
+
+
+def test_differences_taken_again_leave_white_noise_as_it_is_and_lose_waves():
+    n = 4000
+    t = torch.sort(torch.rand(n, dtype=F64)).values
+    problem = Problem.of(tc.Simulator(lambda x, p: p["a"] + 0 * x, [tc.Parameter("a")]), tc.Recording(x=t, y=t))
+    e = torch.randn(n, generator=torch.Generator().manual_seed(0), dtype=F64)
+    one, (places,) = torch.ones(n, dtype=F64), problem.recorded_of(0)
+    for times in (1, 3):
+        left, inside = _fastest(problem, places, e, one[:, None], one, times)
+        assert len(left) == len(e[inside]) == n - 2 * times
+        assert abs(float(left.square().mean()) - 1) < 0.15
+    even = Problem.of(tc.Simulator(lambda x, p: p["a"] + 0 * x, [tc.Parameter("a")]),
+                      tc.Recording(x=torch.arange(n, dtype=F64), y=t))  # fmt: skip
+    wave = torch.cos(2 * math.pi * torch.arange(n, dtype=F64) / 6)
+    sizes = [float(_fastest(even, places, wave, one[:, None], one, times)[0].abs().max()) for times in (1, 3)]
+    assert sizes == pytest.approx([1 / math.sqrt(6), 1 / math.sqrt(924)])  # of 1, -2, 1 and of binomials

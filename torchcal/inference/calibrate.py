@@ -190,6 +190,7 @@ def calibrate(
             again, starts=estimate.starts, agreeing=estimate.agreeing, ties=estimate.ties
         )
     propagate = problem.propagate
+    warn_of_spike(problem, estimate.alpha)  # where nothing keeps chains from it drawing may take for ever
     draws: Draws | None = None
     samples: Tensor | None = None
     if plan.samples:
@@ -210,7 +211,6 @@ def calibrate(
         warn_of_tolerance(quality, problem.likelihood, recording, prediction.map.sd)
     warn_of_box(simulator, propagate, estimate.alpha, samples)
     warn_of_bounds(problem, estimate.alpha)
-    warn_of_spike(problem, estimate.alpha)
     warn_of_chains(quality)
     mean, covariance = propagate.parameter_moments(estimate.alpha)
     warn_of_moments(propagate, mean, covariance)

@@ -44,6 +44,9 @@ __all__ = [
 AT_BOUND = 1e-4
 #: Share of what one parameter's spread gives at a datum below which all of them together have cancelled.
 SPIKE = 1e-2
+#: How many times the floor of an output's sd it may be where it has vanished; and other spreads, scaled, that show
+#: whether it could be more.
+NO_SPREAD, SOME = 10.0, (0.1, 0.2)
 #: Points of a density that a surrogate's box is held against, and the share of them outside from which on it matters: a
 #: polynomial's error grows with a power of the distance.
 LOOKED_AT, OUTSIDE = 2000, 0.01
@@ -240,25 +243,37 @@ def warn_of_moments(propagate: NISP, mean: Tensor, covariance: Tensor) -> None:
 def warn_of_spike(problem: Problem, alpha: Tensor) -> None:
     """Warn where a likelihood without noise or tolerance has found one of its spurious maxima (Fig. 6).
 
-    There the spreads of several parameters cancel each other at one datum.
+    There the spreads of several parameters cancel each other at one datum, or those of all that it depends on vanish.
     """
-    propagate, pattern = problem.propagate, problem.propagate.pattern
-    if problem.likelihood.name not in ("marginal", "gaussian_marginal") or problem.noise is not None:
+    propagate, pattern, name = problem.propagate, problem.propagate.pattern, problem.likelihood.name
+    if name not in ("marginal", "gaussian_marginal", "full") or problem.noise is not None or not pattern.num_germs:
         return
     leading, rows = pattern.leading.to(alpha.device), pattern.rows.to(alpha.device)
+    some = torch.linspace(*SOME, len(alpha), dtype=alpha.dtype, device=alpha.device)
     with torch.no_grad():
         sd = propagate(alpha)[1]
+        spread = propagate(torch.where(leading, alpha, some))[1]
         own = [propagate(torch.where(leading | (rows == i), alpha, torch.zeros_like(alpha)))[1]
                for i in range(len(pattern.names))]  # fmt: skip
     share = sd / torch.stack(own).amax(0).clamp_min(1e-300)
-    share = share if problem.observed is None else share[problem.observed]
-    if float(share.min()) < SPIKE:
-        warn(
-            f"The best density is a spike: the spreads of several parameters cancel each other at one datum, to "
-            f"{float(share.min()):.1g} of what one gives alone, and the {problem.likelihood.name} likelihood grows "
-            "without limit as the output's sd vanishes there. Give the recording's noise=, or use ABC().",
-            ConvergenceWarning,
+    least = NO_SPREAD * (propagate.sd_floor or 0.0)
+    gone = (sd <= least) & (spread > least)  # what depends on no parameter never had any
+    if problem.observed is not None:
+        share, gone = share[problem.observed], gone[problem.observed]
+    if bool(gone.any()):
+        what = f"the output's sd vanishes at {int(gone.sum())} of {len(gone)} data, and"
+    elif name != "full" and float(share.min()) < SPIKE:
+        what = (
+            "the spreads of several parameters cancel each other at one datum, to "
+            f"{float(share.min()):.1g} of what one gives alone, and"
         )
+    else:
+        return
+    warn(
+        f"The best density is a spike: {what} the {name} likelihood grows without limit as the output's sd vanishes "
+        "there. Give the recording's noise=, or use ABC().",
+        ConvergenceWarning,
+    )
 
 
 def warn_of_box(simulator: Simulator, propagate: NISP, alpha: Tensor, samples: Tensor | None) -> None:

@@ -241,8 +241,10 @@ def search_with_few_nodes(
     for number in range(min(int(same.max()) + 1, _POLISHED)):
         rows = best[same == number]
         end = minimise(of(propagate), points[rows[:1]], piece=piece, curvature=of(middle), progress=progress)
-        end = minimise(of(propagate), end.points, piece=piece, progress=progress)  # most often one step, of no gain
         points[rows], values[rows] = end.points[0], end.values[0]
+    rows = (values == values.min()).nonzero()[:, 0]
+    end = minimise(of(propagate), points[rows[:1]], piece=piece, progress=progress)  # most often one step, of no gain
+    points[rows], values[rows] = end.points[0], end.values[0]
     ends, results = points[group], torch.where(torch.isfinite(rough.values), values[group], torch.inf)
     order = results.argsort(stable=True)
     return Minima(ends[order], results[order], iterations)

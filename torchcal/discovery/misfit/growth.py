@@ -13,10 +13,14 @@ from torchcal.discovery.misfit.replicates import Replicates, replicates
 __all__ = ["growth"]
 
 #: Fewest data of an output whose noise may grow with it; the log-likelihood that this must gain; the sd at zero that
-#: are tried, in those at the largest output; the ratio of the largest sd to the smallest below which nothing is gained;
-#: and as how many independent data differences of neighbours count.
-FEWEST, GROWS, LITTLE, INDEPENDENT = 20, 3.0, 4.0, 0.6
+#: are tried, in those at the largest output; and the ratio of the largest sd to the smallest that is too little.
+FEWEST, GROWS, LITTLE = 20, 3.0, 4.0
 OFFSETS = (1e-5, 3e-5, 1e-4, 3e-4, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3)
+#: How often data are held against the line between their neighbours: once, and so often that a wave of six of them is
+#: lost too, where noise must grow as well (one that fades with the output is as large beside its neighbours as noise
+#: that grows); and as how many independent data differences count.
+FASTER = 3
+INDEPENDENT = {1: 0.6, FASTER: 0.32}
 #: How much larger the fastest part of one run's residual must be than that of another's, and may be at most (more is
 #: rounding); how much longer the usual time between its samples may be; and by how much their ratio may differ beside
 #: neighbours that are so many samples away, for runs to have noise of unlike size.
@@ -72,32 +76,52 @@ def _growing(
     """
     unit = torch.ones_like(problem.recording.y)
     used = f[problem.index[torch.cat(parts)]]
-    if replicated is not None:
-        e, told = replicated.even.abs(), float(replicated.freedom)
-        size_of = f[problem.index[replicated.places]] / used.max()
-    else:
-        left, size = [], []
-        for places in parts:
-            kept, inside = _fastest(problem, places, residual, design, before)
-            left.append(kept)
-            size.append(f[problem.index[places]][inside] / used.max())
-        e, size_of = torch.cat(left).abs(), torch.cat(size)
-        told = (INDEPENDENT if problem.order is not None else 1.0) * len(e)
-    seen = e > 0  # what is exact, a blank set to zero, is no measure of noise
-    e, size_of, told = e[seen], size_of[seen], told * float(seen.double().mean())
-    if len(e) < FEWEST or not float(used.max()) > 0 or not float(e.sum()) > 0:
+    most = float(used.max())
+    if not most > 0:
         return unit, 0.0
-    least = best = GROWS - told * math.log(float(e.sum()))
-    smallest = float(size_of.sort().values[SAY - 1])
+    if replicated is not None:
+        found = _grows(replicated.even, f[problem.index[replicated.places]] / most, float(replicated.freedom))
+    else:
+        for times in (FASTER, 1) if problem.order is not None else (1,):
+            each = [_fastest(problem, places, residual, design, before, times) for places in parts]
+            size = torch.cat([f[problem.index[p]][inside] for p, (_, inside) in zip(parts, each, strict=True)])
+            left = torch.cat([kept for kept, _ in each])
+            if times > 1 and len(left) < FEWEST:  # of short runs
+                continue
+            independent = INDEPENDENT[times] if problem.order is not None else 1.0
+            found = _grows(left, size / most, independent * len(left), GROWS if times == 1 else 0.0)
+            if found is None:
+                break
+    if found is None:
+        return unit, 0.0
+    offset, smallest, gain = found
+    return (offset + (f / most).clamp_min(smallest)) / (offset + float(used.median()) / most), gain
+
+
+def _grows(left: Tensor, size: Tensor, told: float, least: float = GROWS) -> tuple[float, float, float] | None:
+    """The likeliest sd at zero of noise ``(m,)`` that grows with sizes of data, up to 1; the least size that says how
+    noise is there; and by how much more than needed it is likelier than noise that does not grow. None where it is not.
+
+    Args:
+        left: The noise.
+        size: How large data are.
+        told: As how many independent data it counts.
+        least: By how much it must be likelier.
+    """
+    seen = left != 0  # what is exact, a blank set to zero, is no measure of noise
+    e, size, told = left[seen].abs(), size[seen], told * float(seen.double().mean())
+    if len(e) < FEWEST:
+        return None
+    best, found = least - told * math.log(float(e.sum())), None
+    none = best
     for offset in OFFSETS:
-        shape = offset + size_of
+        shape = offset + size
         if float(shape.max()) < LITTLE * float(shape.min()):
             continue
         like = -told * (math.log(float((e / shape).sum())) + float(shape.log().mean()))
         if like > best:
-            best = like
-            unit = (offset + (f / used.max()).clamp_min(smallest)) / (offset + float(used.median() / used.max()))
-    return unit, best - least
+            best, found = like, offset
+    return None if found is None else (found, float(size.sort().values[SAY - 1]), best - none)
 
 
 def _in_runs(problem: Problem, residual: Tensor, unit: Tensor, parts: list[Tensor]) -> tuple[Tensor, float]:
@@ -137,7 +161,7 @@ def _unlike(residuals: list[Tensor]) -> tuple[list[float], float]:
     ratios = [sum(_off_neighbours(r, apart) for apart in FAR) / size for r, size in zip(residuals, sizes, strict=True)]
     if max(ratios) > AGREE * min(ratios):
         return alike
-    told = [INDEPENDENT * len(r) for r in residuals]
+    told = [INDEPENDENT[1] * len(r) for r in residuals]
     pooled = sum(n * size for n, size in zip(told, sizes, strict=True)) / sum(told)
     gain = sum(n * math.log(pooled / size) for n, size in zip(told, sizes, strict=True)) - GROWS * len(sizes)
     return ([size / pooled for size in sizes], gain) if gain > 0 else alike
@@ -150,15 +174,15 @@ def _off_neighbours(r: Tensor, apart: int) -> float:
 
 
 def _fastest(
-    problem: Problem, places: Tensor, residual: Tensor, design: Tensor, unit: Tensor
+    problem: Problem, places: Tensor, residual: Tensor, design: Tensor, unit: Tensor, times: int = 1
 ) -> tuple[Tensor, slice]:
     """What a sequence has that no smooth curve has, and at which of its data.
 
-    In an order by how much data are off the line between their neighbours, which hardly any misfit moves; elsewhere
-    what is left beyond smooth curves, weighed by a unit of the noise ``(n_total,)``.
+    In an order by how much data are off the line between their neighbours, which hardly any misfit moves, and that
+    again so many ``times``; elsewhere what is left beyond smooth curves, weighed by a unit of the noise ``(n_total,)``.
     """
     r = residual[places]
-    if len(r) < 3:
+    if len(r) < 2 * times + 1:
         return r[:0], slice(0, 0)
     if problem.order is None:
         basis, size = beyond(problem, places, design, unit), unit[problem.index[places]]
@@ -166,6 +190,15 @@ def _fastest(
         return (r - size * (basis @ (basis.T @ (r / size)))) / left, slice(None)
     at = problem.order[problem.condition_of[places]]
     at = at if bool((at.diff() > 0).all()) else torch.arange(len(r), dtype=torch.float64)
-    share = (at[1:-1] - at[:-2]) / (at[2:] - at[:-2])
-    off = r[1:-1] - (1 - share) * r[:-2] - share * r[2:]
-    return off / (1 + share.square() + (1 - share).square()).sqrt(), slice(1, -1)
+    weights = torch.ones(1, len(r), dtype=torch.float64)  # of every datum, from so many before it to so many behind it
+    for _ in range(times):
+        share = (at[1:-1] - at[:-2]) / (at[2:] - at[:-2])
+        before, behind = (1 - share) * weights[:, :-2], share * weights[:, 2:]
+        weights = _beside(weights[:, 1:-1], 1) - _beside(before, 0) - _beside(behind, 2)
+        r, at = r[1:-1] - (1 - share) * r[:-2] - share * r[2:], at[1:-1]
+    return r / weights.norm(dim=0), slice(times, -times)
+
+
+def _beside(weights: Tensor, rows: int) -> Tensor:
+    """Weights ``(m, n)`` as those of so many rows farther of ``m + 2``."""
+    return torch.nn.functional.pad(weights, (0, 0, rows, 2 - rows))
