@@ -1,5 +1,6 @@
 """How the sd of unknown noise differs from datum to datum: with what was read, and from run to run."""
 
+import itertools
 import math
 
 import torch
@@ -12,9 +13,9 @@ from torchcal.discovery.misfit.replicates import Replicates, replicates
 
 __all__ = ["growth"]
 
-#: Fewest data of an output whose noise may grow with it; the log-likelihood that this must gain; the sd at zero that
-#: are tried, in those at the largest output; and the ratio of the largest sd to the smallest that is too little.
-FEWEST, GROWS, LITTLE = 20, 3.0, 4.0
+#: Fewest data of an output whose noise may grow with it; the log-likelihood that this must gain; the ratio of the
+#: largest sd to the smallest that is too little; and the powers and offsets, of the largest output, that are tried.
+FEWEST, GROWS, LITTLE, POWERS = 20, 3.0, 4.0, (1.0, 0.5)
 OFFSETS = (1e-5, 3e-5, 1e-4, 3e-4, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3)
 #: How often data are held against the line between their neighbours: once, and so often that a wave of six of them is
 #: lost too, where noise must grow as well (one that fades with the output is as large beside its neighbours as noise
@@ -70,9 +71,9 @@ def _growing(
     """An output's noise as it grows with what was read, ``(n_total,)``, and by how much that is likelier; 1 and 0 where
     it is not.
 
-    An sd of a + |f| / max |f| is taken for the best of a few a where it makes the fastest part of the residual much
-    likelier (by `GROWS`; Laplace's distribution, whose scale a few outliers move little), and no smaller than where
-    `SAY` data were looked at: of a blank nothing is known but by them.
+    An sd of a + |f| / max |f|, or its root, as that of counts, is taken for the best of a few a where it makes the
+    fastest part of the residual much likelier (by `GROWS`; Laplace's distribution, whose scale a few outliers move
+    little), and no smaller than where `SAY` data were looked at: of a blank nothing is known but by them.
     """
     unit = torch.ones_like(problem.recording.y)
     used = f[problem.index[torch.cat(parts)]]
@@ -94,13 +95,14 @@ def _growing(
                 break
     if found is None:
         return unit, 0.0
-    offset, smallest, gain = found
-    return (offset + (f / most).clamp_min(smallest)) / (offset + float(used.median()) / most), gain
+    power, offset, smallest, gain = found
+    return ((offset + (f / most).clamp_min(smallest)) / (offset + float(used.median()) / most)) ** power, gain
 
 
-def _grows(left: Tensor, size: Tensor, told: float, least: float = GROWS) -> tuple[float, float, float] | None:
-    """The likeliest sd at zero of noise ``(m,)`` that grows with sizes of data, up to 1; the least size that says how
-    noise is there; and by how much more than needed it is likelier than noise that does not grow. None where it is not.
+def _grows(left: Tensor, size: Tensor, told: float, least: float = GROWS) -> tuple[float, float, float, float] | None:
+    """The likeliest power and offset of noise ``(m,)`` that grows with sizes of data, up to 1; the least size that says
+    how noise is there; and by how much more than needed it is likelier than noise that does not grow. None where it is
+    not.
 
     Args:
         left: The noise.
@@ -114,14 +116,14 @@ def _grows(left: Tensor, size: Tensor, told: float, least: float = GROWS) -> tup
         return None
     best, found = least - told * math.log(float(e.sum())), None
     none = best
-    for offset in OFFSETS:
-        shape = offset + size
+    for power, offset in itertools.product(POWERS, OFFSETS):
+        shape = (offset + size) ** power
         if float(shape.max()) < LITTLE * float(shape.min()):
             continue
         like = -told * (math.log(float((e / shape).sum())) + float(shape.log().mean()))
         if like > best:
-            best, found = like, offset
-    return None if found is None else (found, float(size.sort().values[SAY - 1]), best - none)
+            best, found = like, (power, offset)
+    return None if found is None else (*found, float(size.sort().values[SAY - 1]), best - none)
 
 
 def _in_runs(problem: Problem, residual: Tensor, unit: Tensor, parts: list[Tensor]) -> tuple[Tensor, float]:
