@@ -252,12 +252,31 @@ def test_a_fast_misfit_is_no_slow_noise_beside_a_base_that_misses_the_data(seed)
     assert {e.name: e.value for e in found.base.estimates}["tau"] == pytest.approx(2.15, abs=0.1)
 
 
+def test_a_given_noise_is_not_larger_where_that_frees_the_base_to_miss_the_data():
+    """Of counts that fade in a wave: with slow noise of any size the base had left sixteen times what it must."""
+    t = np.linspace(0, 18, 90)
+    base = tc.Simulator(
+        lambda x, p: {"N": p["A"] * torch.exp(-x / p["tau"]) + p["b"]},
+        [tc.Parameter("A", low=0, initial=100), tc.Parameter("tau", low=0.2, high=30, initial=2.5),
+         tc.Parameter("b", low=0, initial=1)],
+    )  # fmt: skip
+    mean = (1500 * np.exp(-t / 3.0) + 1.5) * (1 + 0.12 * np.sin(2 * np.pi * t / 1.9))
+    counts = np.random.default_rng(12).poisson(mean).astype(float)
+    recording = tc.Recording(x=t, y={"N": counts}, noise=np.sqrt(np.maximum(counts, 1)))
+    found = tc.diagnose(base, recording, [tc.Term("offset", outputs={"N": lambda x, p, y: y + p["o"]},
+                                                  parameters=[tc.Parameter("o")])], seed=0, progress=False)  # fmt: skip
+    assert found.verdict == "unexplained"
+    assert found.base.estimates[0].value == pytest.approx(1500, rel=0.1)
+    assert not any("times the sd that was given" in row for row in found.symptoms)
+
+
 def test_an_output_of_few_data_runs_away_beside_one_of_many():
     noise = torch.ones(1050, dtype=torch.float64)
     output_of = (torch.arange(1050) < 50).long()
     problem = SimpleNamespace(
-        recording=SimpleNamespace(noise=noise, outputs=("many", "few")), index=torch.arange(1050), output_of=output_of
-    )
+        recording=SimpleNamespace(noise=noise, outputs=("many", "few")), index=torch.arange(1050), output_of=output_of,
+        n=1050,
+    )  # fmt: skip
     before = SimpleNamespace(problem=problem, residual=noise)
     after = SimpleNamespace(problem=problem, residual=torch.where(output_of == 1, 7.9, 1.0).double())
     assert runs_away(after, before).tolist() == [False, True]

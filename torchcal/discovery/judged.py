@@ -11,6 +11,7 @@ from torchcal.discovery.findings.symptoms import larger_than_given
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses import verify
+from torchcal.discovery.hypotheses.base import runs_away
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.own_noise import explains
 from torchcal.discovery.hypotheses.search import Search
@@ -88,6 +89,8 @@ def judged(search: Search, problem: Problem, mask: Tensor | None, confidence: fl
         return found
     if search.stop.is_set():
         return dataclasses.replace(found, cut=True)
+    if bool(runs_away(other.search.base, found.search.base).any()):
+        return found
     after = other.decision.verdict
     if after == "unexplained" or (before == "consistent" and after != before):
         return found

@@ -160,22 +160,23 @@ def _with_memory(found: Fitted, units: Tensor) -> tuple[Fitted, Noise]:
 
 
 def runs_away(found: Fitted, before: Fitted) -> Tensor:
-    """Of which outputs a fit that weighs the data with a memory leaves much more than the noise that was given, and
-    than one before, with less of it; bool ``(outputs,)``.
+    """Of which outputs a fit that weighs the data with a memory leaves much more than the noise that was given to one
+    before, with less of it, and than that leaves; bool ``(outputs,)``.
 
     Slow noise of any size is likelier than a fast misfit that is known to be none, and frees the fit to miss the data.
     """
-    problem = found.problem
+    problem = before.problem
     noise, outputs = problem.recording.noise, len(problem.recording.outputs)
     if not isinstance(noise, Tensor):
         return torch.zeros(outputs, dtype=torch.bool)
 
-    def by_output(values: Tensor) -> Tensor:
-        return torch.zeros(outputs, dtype=torch.float64).index_add_(0, problem.output_of, values)
+    def by_output(of: Problem, values: Tensor) -> Tensor:
+        return torch.zeros(outputs, dtype=torch.float64).index_add_(0, of.output_of, values)
 
-    sd = noise[problem.index]
-    left, least = (by_output((one.residual / sd).square()) for one in (found, before))
-    return left > AWAY * torch.maximum(least, by_output(torch.ones_like(sd)))
+    left, least = (
+        by_output(one.problem, (one.residual / noise[one.problem.index]).square()) for one in (found, before)
+    )
+    return left > AWAY * torch.maximum(least, by_output(problem, torch.ones(problem.n, dtype=torch.float64)))
 
 
 def _without_memory(noise: Noise, which: Tensor) -> Noise:
