@@ -97,7 +97,7 @@ def test_a_drive_of_unknown_frequency_is_found_in_a_rate(size):
     assert abs(found.value - 5.1) < 4 * found.sd
 
 
-def looked(points, low, high, given=False, transform=None, others=(0.0, 0.8, 1.6), also=0, periods=()):
+def looked(points, low, high, given=False, transform=None, others=(0.0, 0.8, 1.6), also=0, wave=0.0, periods=()):
     """Values that are looked at of a frequency, and of a phase beside it; and how many tangents that takes."""
     x = torch.linspace(0, 1, 200, dtype=F64)
     q = tc.Parameter("w", low=low, high=high, transform=transform)
@@ -109,8 +109,10 @@ def looked(points, low, high, given=False, transform=None, others=(0.0, 0.8, 1.6
         smooth = [(x**k).expand(len(rows), -1) for k in range(2, 2 + also)]
         return torch.stack([torch.sin(2 * math.pi * rows[:, :1] * x + rows[:, 1:]), *smooth], dim=-1)
 
-    sd = torch.ones(200, dtype=F64)
-    grid, tangents = looked_at(problem, [0, 1], [points, list(others)], [given, False], look, sd, lambda: periods)
+    fitted = SimpleNamespace(
+        whitening=SimpleNamespace(sd=torch.ones(200, dtype=F64)), rhythms=periods, residual=torch.sin(wave * x + 0.3)
+    )
+    grid, tangents = looked_at(problem, [0, 1], [points, list(others)], [given, False], look, fitted)
     assert torch.equal(tangents, look(grid))
     return grid[:, 0].unique().tolist(), grid[:, 1].unique().tolist(), sum(asked[:-1])
 
@@ -133,24 +135,27 @@ def test_a_grid_is_of_bounded_size_and_spares_what_changes_less():
     assert len(frequencies) * len(phases) <= 256 < len(frequencies) * 9
 
 
-def test_a_grid_that_is_too_coarse_is_offered_periods_and_frequencies_of_what_is_left():
+def test_a_grid_that_stays_too_coarse_is_offered_periods_and_frequencies_of_what_is_left():
     nine = torch.linspace(0, 3, 9).tolist()
     many = torch.linspace(0, 2000, 9).tolist()
-    offered = [0.0123, 0.5]
-    frequencies, phases, _ = looked(many, 0.0, 2000.0, others=nine, periods=offered)
-    assert {*offered, 1 / 0.0123, 2 * math.pi / 0.0123} < set(frequencies)
-    assert len(frequencies) * len(phases) <= 256
-    assert 0.05 not in looked([1.0, 1.1, 1.2], 0.01, 1.3, periods=[0.05])[0]  # it is fine enough
+    coarse, phases, _ = looked(many, 0.0, 2000.0, others=nine, wave=2 * math.pi * 81.3)
+    for period in (1 / 81.3, 81.3, 2 * math.pi / 81.3):  # it may be called by any of these names
+        found, same, _ = looked(many, 0.0, 2000.0, others=nine, wave=2 * math.pi * 81.3, periods=[0.5, period])
+        assert sorted({*found} - {*coarse}) == pytest.approx([81.3])  # nothing that takes little is added
+        assert same == phases
+    fine = looked([1.0, 1.1, 1.2], 0.01, 1.3, wave=2 * math.pi * 1.15, periods=[1.15])
+    assert fine[0] == [1.0, 1.1, 1.2]
 
 
 @pytest.mark.parametrize("period", [0.083, 0.71])
-@pytest.mark.parametrize("two", [False, True])
-def test_rhythms_are_periods_of_the_strongest_waves_of_uneven_data(period, two):
+@pytest.mark.parametrize("beside", ["nothing", "shuffled", "sorted"])
+def test_rhythms_are_periods_of_the_strongest_waves_of_uneven_data(period, beside):
     rng = np.random.default_rng(0)
     x = np.sort(rng.uniform(0, 10, 300))
     left = 2.0 * np.sin(2 * np.pi * x / period + 1.0) + np.sin(2 * np.pi * x / 0.23) + 0.3 * rng.standard_normal(300)
-    order = rng.permutation(300) if two else np.arange(300)
-    conditions = {"x": x[order]} | ({"z": rng.uniform(0, 1, 300), "k": np.arange(300.0) % 2} if two else {})
+    order = np.arange(300) if beside == "nothing" else rng.permutation(300)
+    others = {"z": np.arange(300.0) if beside == "sorted" else rng.uniform(0, 1, 300), "k": np.arange(300.0) % 2}
+    conditions = {"x": x[order]} | ({} if beside == "nothing" else others)
     recording = tc.Recording(x={k: torch.as_tensor(v) for k, v in conditions.items()}, y=torch.as_tensor(left[order]))
     problem = Problem.of(tc.Simulator(lambda x, p: p["a"] + 0 * x["x"], [tc.Parameter("a")]), recording)
     found = rhythms(problem, problem.y)
@@ -159,6 +164,14 @@ def test_rhythms_are_periods_of_the_strongest_waves_of_uneven_data(period, two):
     assert rhythms(problem, problem.y * math.nan) == []
     few = problem.keeping(torch.arange(300) < 20)
     assert rhythms(few, few.y) == []
+
+
+def test_rhythms_of_many_data_and_of_bursts_are_sought_from_the_slowest_on():
+    t = torch.linspace(0, 990, 100, dtype=F64)[:, None] + 1e-3 * torch.arange(10, dtype=F64)
+    for at in (t.flatten(), torch.linspace(0, 990, 20_000, dtype=F64)):
+        recording = tc.Recording(x=at, y=torch.sin(2 * math.pi * at / 90))
+        problem = Problem.of(tc.Simulator(lambda x, p: p["a"] + 0 * x, [tc.Parameter("a")]), recording)
+        assert rhythms(problem, problem.y)[0] == pytest.approx(90, rel=0.02)
 
 
 def test_a_period_of_many_decades_is_found():

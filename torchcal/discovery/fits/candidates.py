@@ -1,7 +1,6 @@
 """Candidates prepared for a recording: the extended simulator, which parameters are amplitudes, and their tangents."""
 
 import dataclasses
-import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +11,6 @@ from torch import Tensor
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.ranges import NOTHING, Anything, Scale, sized, with_room
-from torchcal.discovery.fits.rhythm import rhythms
 from torchcal.discovery.fits.shapes import (
     combined,
     driver_values,
@@ -337,8 +335,7 @@ def prepare(
     grid, tangents = combined(points), begin.new_zeros(0, problem.n, len(amplitudes))
     if screened:
         given = [base.dear or problem.parameters[i].name in drivers for i in shape]
-        periods = functools.cache(lambda: rhythms(found.problem, found.whitening.vector(found.residual)))
-        grid, tangents = looked_at(problem, shape, points, given, look, found.whitening.sd, periods)
+        grid, tangents = looked_at(problem, shape, points, given, look, found)
     return Candidate(
         terms=terms,
         problem=problem,

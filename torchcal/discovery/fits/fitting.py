@@ -2,11 +2,13 @@
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from torchcal.discovery.fits.problem import Problem, Whitening
+from torchcal.discovery.fits.rhythm import rhythms
 from torchcal.simulators import Solution
 
 __all__ = ["Fitted", "finished", "fit", "refit", "weighed"]
@@ -66,6 +68,11 @@ class Fitted:
     def residual(self) -> Tensor:
         """``y − f`` at the used data."""
         return self.problem.y - self.y
+
+    @cached_property
+    def rhythms(self) -> list[float]:
+        """Periods of the strongest waves in what it leaves."""
+        return rhythms(self.problem, self.whitening.vector(self.residual))
 
     @property
     def met(self) -> Tensor:

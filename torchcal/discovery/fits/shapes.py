@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import operator
 from collections.abc import Callable, Mapping, Sequence
 
 import torch
@@ -29,6 +28,8 @@ MOST_POINTS, GOLDEN = 256, 0.5 * (math.sqrt(5.0) - 1.0)
 #: to gaps of less than this share of the range; points of other shapes that are enough then; and the size of a tangent,
 #: in that of the largest, below which it is none.
 SHARED, ROUNDS, FINEST, FEWEST, NOTHING = 0.3, 5, 0.004, 3, 1e-6
+#: Share of what the best tangent takes of what is left that one at a period or a frequency of that must take.
+AS_MUCH = 0.5
 
 
 def shape_points(parameter: Parameter, count: int) -> list[float]:
@@ -120,13 +121,13 @@ def looked_at(
     points: Sequence[Sequence[float]],
     given: Sequence[bool],
     look: Callable[[Tensor], Tensor],
-    sd: Tensor,
-    periods: Callable[[], Sequence[float]],
+    fitted: Fitted,
 ) -> tuple[Tensor, Tensor]:
     """Combinations of shapes ``(G, len(points))`` and tangents there ``(G, n, amplitudes)``.
 
     Where tangents differ so much from one value of a shape to the next that what lies between is not seen, values
-    between are looked at too: of a frequency, say, of which a whole cycle more fits into the recording.
+    between are looked at too: of a frequency, say, of which a whole cycle more fits into the recording. Where they are
+    too many the shape may be the period, or the frequency, of what is left of the data.
 
     Args:
         problem: Of the candidate.
@@ -134,36 +135,35 @@ def looked_at(
         points: Their values to begin with.
         given: Which of them stay as they are.
         look: Tangents at rows of shapes.
-        sd: Of the noise, ``(n,)``.
-        periods: Of what is left of the data: a shape with too coarse a grid may be one of them, or its frequency.
+        fitted: What the tangents are taken at.
     """
+    sd = fitted.whitening.sd
     found, stays, grown = [list(each) for each in points], list(given), [False] * len(points)
     grid = combined(found)
     tangents = look(grid)
-    for _ in range(ROUNDS):
+
+    def shares() -> list[Tensor]:
         counts = [len(each) for each in found]
         if math.prod(counts) != len(grid) or not tangents.numel():
-            break
+            return [sd[:0]] * len(shape)
         whole = (tangents / sd[:, None]).reshape(*counts, *tangents.shape[1:])
+        return [sd[:0] if stays[d] else _shared(whole, d, each) for d, each in enumerate(found)]
+
+    for _ in range(ROUNDS):
+        counts = [len(each) for each in found]
         more = [
-            [] if stays[d] else _between(problem.parameters[place], found[d], _shared(whole, d, found[d]))
-            for d, place in enumerate(shape)
-        ]
-        offered = [
-            [] if grown[d] or not more[d] else _of_periods(problem.parameters[place], found[d], periods())
-            for d, place in enumerate(shape)
+            _between(problem.parameters[place], each, shared)
+            for place, each, shared in zip(shape, found, shares(), strict=True)
         ]
         grown = [so_far or bool(new) for so_far, new in zip(grown, more, strict=True)]
-        if math.prod(map(len, map(operator.add, found, map(operator.add, offered, more)))) > MOST_POINTS:
+        if math.prod(len(each) + len(new) for each, new in zip(found, more, strict=True)) > MOST_POINTS:
             for d, each in enumerate(found):
                 if not (stays[d] or grown[d]):  # a few are enough of what changes less
                     found[d], stays[d] = each[:: max(len(each) // FEWEST, 1)], True
         for d, new in enumerate(more):
             room = MOST_POINTS // math.prod(len(each) for k, each in enumerate(found) if k != d) - len(found[d])
             if new and room > 0:
-                first = offered[d][:room]
-                rest = new[:: -(-len(new) // (room - len(first)))] if room > len(first) else []
-                found[d] = sorted({*found[d], *first, *rest})
+                found[d] = sorted(found[d] + new[:: -(-len(new) // room)])
         if [len(each) for each in found] == counts:
             break
         known = {tuple(row): k for k, row in enumerate(grid.tolist())}
@@ -173,13 +173,31 @@ def looked_at(
         tangents = tangents[places]
         if bool(anew.any()):
             tangents[anew] = look(grid[anew])
+    least = AS_MUCH * _gains(tangents, fitted).max() if tangents.numel() else torch.inf
+    for d, shared in enumerate(shares()):
+        coarse = bool((shared < SHARED).any())
+        offered = _of_periods(problem.parameters[shape[d]], fitted.rhythms) if coarse else []
+        if not offered:
+            continue
+        rows = combined([offered if k == d else each for k, each in enumerate(found)])
+        seen = look(rows)
+        better = _gains(seen, fitted) > least
+        grid, tangents = torch.cat([grid, rows[better]]), torch.cat([tangents, seen[better]])
     return grid, tangents
 
 
-def _of_periods(q: Parameter, known: Sequence[float], periods: Sequence[float]) -> list[float]:
-    """Values within the bounds of a shape that may be a period, a frequency or an angular frequency; none known."""
+def _of_periods(q: Parameter, periods: Sequence[float]) -> list[float]:
+    """Values within the bounds of a shape that may be a period, a frequency or an angular frequency."""
     values = [value for period in periods for value in (period, 1.0 / period, 2 * math.pi / period)]
-    return [v for v in values if (q.low is None or v > q.low) and (q.high is None or v < q.high) and v not in known]
+    return [v for v in values if (q.low is None or v > q.low) and (q.high is None or v < q.high)]
+
+
+def _gains(tangents: Tensor, fitted: Fitted) -> Tensor:
+    """How much of what is left of the data a tangent of each row takes, the best of its amplitudes', ``(G,)``."""
+    sd = fitted.whitening.sd
+    along = torch.einsum("gna,n->ga", tangents / sd[:, None], fitted.residual / sd)
+    size = (tangents / sd[:, None]).square().sum(1)
+    return (along.square() / size.clamp_min(1e-300)).amax(1)
 
 
 def _shared(whole: Tensor, d: int, points: Sequence[float]) -> Tensor:

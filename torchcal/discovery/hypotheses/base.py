@@ -30,7 +30,7 @@ WRONG, EARLY = 0.1, 2
 FOCUSED = 4
 #: How many of the best starts go on with each run's own values from where that run fits best, and by how much that
 #: must be better: χ², and share of it.
-CROSSED, WORTH, SHARE_WORTH = 4, 1.0, 0.01
+CROSSED, WORTH, SHARE_WORTH = 4, 1.0, 0.1
 #: Misfit of an output, in that of all, each in its spread, below which the solver need not be more exact for it.
 FAR_BELOW = 0.03
 #: Difference of χ² up to which an initial angle in another turn gives the same fit.
@@ -244,8 +244,10 @@ def _best_of_each_run(found: Fitted) -> Fitted:
         return found
     begin = ends[chi2.argsort(stable=True)[:CROSSED]].clone()
     begin[:, own] = ends[best[torch.tensor([origin[i][1] for i in own.tolist()])], own]
-    again = fit(found.problem, found.whitening, begin, found.free)
-    return again if again is not None and again.chi2 < found.chi2 else found
+    again = fit(found.problem, found.whitening, begin.unique(dim=0), found.free)
+    if again is None or again.chi2 >= found.chi2:
+        return found
+    return dataclasses.replace(again, agreeing=found.agreeing)
 
 
 def _as_short(problem: Problem, values: Tensor) -> Problem:
