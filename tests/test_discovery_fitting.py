@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import warnings
 from types import SimpleNamespace
 
 import numpy as np
@@ -701,3 +702,20 @@ def test_runs_are_crossed_from_two_starts_that_are_each_wrong_in_one_of_them():
     again = base._best_of_each_run(found)
     assert again.chi2 < 100
     assert torch.allclose(again.values[:4], torch.tensor([0.058, 0.047, 0.036, 0.02], dtype=F64), rtol=0.1)
+
+
+@pytest.mark.parametrize(("w", "alike"), [(17.0, False), (0.9, True)])
+def test_more_starts_are_tried_and_told_where_few_come_to_the_best_fit(w, alike):
+    x = torch.linspace(0, 3, 60, dtype=F64)
+    y = 1.3 * torch.sin(w * x + 0.4) + 0.02 * draws(60)
+    model = tc.Simulator(
+        lambda x, p: p["a"] * torch.sin(p["w"] * x + p["phase"]),
+        [tc.Parameter("a", low=0.0, high=5.0), tc.Parameter("w", low=0.1, high=2.0 if alike else 60.0),
+         tc.Parameter("phase", low=-3.2, high=3.2)],
+    )  # fmt: skip
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        d = tc.diagnose(model, tc.Recording(x=x, y=y, noise=0.02), [], seed=0, progress=False)
+    assert d.verdict == "consistent"
+    assert d.base.estimates[1].value == pytest.approx(w, rel=0.02)
+    assert any("of the base's starting values came to the best fit" in str(one.message) for one in told) is not alike

@@ -27,6 +27,7 @@ from torchcal.discovery.findings.symptoms import (
 from torchcal.discovery.findings.where import locate, missing_rate, needed_shifts, sharpened
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.hypotheses import verify
+from torchcal.discovery.hypotheses.base import FEW_AGREE
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.own_noise import beside
 from torchcal.discovery.hypotheses.search import Search
@@ -237,7 +238,7 @@ def _improved(simulator: Simulator, best: Model) -> Simulator:
 
 
 def _warn(search: Search, lost: bool) -> None:
-    if search.base.agreeing < 0.2:
+    if search.base.agreeing < FEW_AGREE:
         warn(
             f"Only {search.base.agreeing:.0%} of the base's starting values came to the best fit. Give initial= or "
             "bounds to its parameters, or more num_starts.",

@@ -71,7 +71,8 @@ def diagnose(
         confidence: 1 minus the probability of calling noise a mismatch: above 0.5, and at most 0.998, as a thousand
             simulated residuals tell no more.
         max_terms: Terms that may be missing together: 1, 2 or 3; more is taken for 3.
-        num_starts: Starting values of the base's calibration.
+        num_starts: Starting values of the base's calibration; four times as many more where fewer than one in five of
+            them come to the best fit, of which a warning tells.
         feasible: Ranges ``{name: (low, high)}`` in which new experiments can be made, None for an open end: of
             conditions, or in time of initial states, inputs and the clock, ``"t"``. What is not named may be anything
             in the experiment that `Diagnosis.experiment` proposes.

@@ -329,7 +329,9 @@ def refit(found: Fitted, whitening: Whitening, problem: Problem | None = None, a
     """
     problem = found.problem if problem is None else problem
     again = fit(problem, whitening, found.values[None], found.free, warm=found.warm, aim=aim)
-    return dataclasses.replace(found, problem=problem, whitening=whitening) if again is None else again
+    if again is None:
+        return dataclasses.replace(found, problem=problem, whitening=whitening)
+    return dataclasses.replace(again, agreeing=found.agreeing)
 
 
 def weighed(found: Fitted, whitening: Whitening) -> Fitted:

@@ -19,7 +19,7 @@ from torchcal.discovery.misfit.outliers import spikes
 from torchcal.errors import ConvergenceError, DomainError, SimulatorError
 from torchcal.simulators import Trajectories, focused, may_change, step_errors, workable
 
-__all__ = ["calibrate_base", "growing", "runs_away"]
+__all__ = ["FEW_AGREE", "calibrate_base", "growing", "runs_away"]
 
 #: How often steps are chosen anew at most.
 HALVED = 7
@@ -28,6 +28,9 @@ HALVED = 7
 WRONG, EARLY = 0.1, 2
 #: How often they are shortened where they err, when the first part of the runs has been fitted.
 FOCUSED = 4
+#: Share of the starts that come to the best fit below which that may not be the best, and how many times as many are
+#: tried then.
+FEW_AGREE, MORE = 0.2, 4
 #: How many of the best starts go on with each run's own values from where that run fits best, and by how much that
 #: must be better: χ², and share of it.
 CROSSED, WORTH, SHARE_WORTH = 4, 1.0, 0.1
@@ -82,6 +85,10 @@ def calibrate_base(
     problem = _steady(problem, begin[:1])
     if anew:
         found = _from_starts(problem, begin, free, rough, outputs)
+        if found is not None and found.agreeing < FEW_AGREE and not problem.dear:
+            others = starts(problem, MORE * num_starts, seed + 1, held)
+            other = _from_starts(problem, others, free, rough, outputs)
+            found = found if other is None or other.chi2 > found.chi2 else other
     else:
         found = fit(problem, problem.whitening(rough, outputs), begin, free)
     if found is None:
