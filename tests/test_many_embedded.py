@@ -57,6 +57,7 @@ def followed(monkeypatch):
     return results
 
 
+@pytest.mark.filterwarnings("ignore:The best density is a spike")  # that of the marginal likelihood is
 @pytest.mark.parametrize(
     ("names", "embedding", "likelihood"),
     [
