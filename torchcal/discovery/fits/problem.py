@@ -128,6 +128,12 @@ class Problem:
             found[places[1:]] = places[:-1]
         return found
 
+    def by_run(self, values: Tensor) -> Tensor:
+        """Sums of values of the used data ``(*batch, n)`` over those of each run, ``(*batch, R)``."""
+        run_of = self.recording.x["run"][self.condition_of].long()  # type: ignore[index]
+        found = values.new_zeros(*values.shape[:-1], len(self.recording.runs or ()))
+        return found.index_add(-1, run_of, values)
+
     @property
     def dear(self) -> bool:
         """Whether the simulator's evaluations cost what nobody can tell, as those of a program of its own do."""

@@ -173,7 +173,9 @@ def looked_at(
         tangents = tangents[places]
         if bool(anew.any()):
             tangents[anew] = look(grid[anew])
-    least = AS_MUCH * _gains(tangents, fitted).max() if tangents.numel() else torch.inf
+    if not any(grown):  # no grid was too coarse
+        return grid, tangents
+    least = AS_MUCH * _gains(tangents, fitted).max()
     for d, shared in enumerate(shares()):
         coarse = bool((shared < SHARED).any())
         offered = _of_periods(problem.parameters[shape[d]], fitted.rhythms) if coarse else []

@@ -244,8 +244,7 @@ def _best_of_each_run(found: Fitted) -> Fitted:
         return found
     y = found.problem.evaluate(ends, [])[0]
     left = found.whitening.vector(found.problem.y - y).square()
-    by_run = left.new_zeros(len(ends), len(bound.runs))
-    by_run.index_add_(1, bound.grid.run_of[found.problem.condition_of], torch.nan_to_num(left, nan=torch.inf))
+    by_run = found.problem.by_run(torch.nan_to_num(left, nan=torch.inf))
     best = by_run.argmin(0)
     if not float(by_run.amin(0).sum()) < found.chi2 - max(WORTH, SHARE_WORTH * found.chi2):
         return found

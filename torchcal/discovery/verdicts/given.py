@@ -228,10 +228,7 @@ def _far(run: Run) -> list[str]:
 
 def _by_run(found: Fitted) -> Tensor:
     """What every run adds to χ²."""
-    problem = found.problem
-    square = found.whitening.vector(found.residual).square()
-    runs = problem.recording.x["run"][problem.condition_of].long()  # type: ignore[index]
-    return torch.zeros(len(problem.recording.runs or ()), dtype=torch.float64).index_add_(0, runs, square)
+    return found.problem.by_run(found.whitening.vector(found.residual).square())
 
 
 def _held(search: Search, part: Fitted, which: Sequence[bool]) -> Fitted | None:
