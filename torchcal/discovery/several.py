@@ -11,7 +11,7 @@ from torch import Tensor
 from torchcal.discovery.fits.candidates import Candidate, prepare, replaces
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.ranges import drivers_scale
-from torchcal.discovery.hypotheses.aliases import merge
+from torchcal.discovery.hypotheses.aliases import copies, merge
 from torchcal.discovery.hypotheses.beginnings import BENT, blind_rows, is_far, make_up
 from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.hypotheses.refitting import BETTER, improve, refit_together
@@ -47,6 +47,8 @@ FAR_BEHIND, TURNED, ANOTHER = 30.0, 6, 1.0
 #: Correlation of two tangents from which on a candidate is tried in the other's place beside the leading pair's; and
 #: what of a tangent may be its own where the base is off, for the candidate to be tried in any place.
 ALIKE, HIDDEN = 0.9, 0.1
+#: Difference of two scores up to which merged candidates are the same beside another term.
+SAME_SCORE = 0.1
 
 
 def refit_several(search: Search) -> None:
@@ -268,10 +270,10 @@ def _swapped(search: Search, lead: Model) -> list[tuple[int, ...]]:
     what the base's parameters nearly make up for, of which a linear search from a base that is off sees little."""
     found: dict[tuple[int, ...], float] = {}
     hidden = _hidden(search) if search.base.chi2 > BENT * search.base.problem.n else set()
-    columns, owner = search.screening.columns, search.screening.owner
+    columns, owner, gone = search.screening.columns, search.screening.owner, search.gone - _apart(search)
     for i in lead.numbers:
         (kept,) = set(lead.numbers) - {i}
-        for j in set(range(len(search.candidates))) - {*lead.numbers, *search.gone}:
+        for j in set(range(len(search.candidates))) - {*lead.numbers, *gone}:
             alike = (columns[:, owner == i].T @ columns[:, owner == j]).abs()
             if alike.numel() and (float(alike.max()) >= ALIKE or j in hidden):
                 found[tuple(sorted((kept, j)))] = float(alike.max())
@@ -350,9 +352,9 @@ def scores_beside(
 ) -> list[tuple[float, int]]:
     """Scores and numbers of the candidates that are not in a model, at a fit of it."""
     scale = drivers_scale(found.problem, found)
-    scores = []
+    scores, gone = [], search.gone - _apart(search)
     for j, other in enumerate(search.candidates):
-        if j in numbers or j in search.gone:
+        if j in numbers or j in gone:
             continue
         search.tick(f"screen {other.name} after {', '.join(search.candidates[i].name for i in numbers)}")
         try:
@@ -362,7 +364,19 @@ def scores_beside(
         seen = screen(residual, [prepared])
         if seen.best[0] >= 0:
             scores.append((seen.score(0), j))
-    return scores
+    return _told(search, scores)
+
+
+def _apart(search: Search) -> set[int]:
+    """Merged candidates that may be told apart beside another term: where the base is bent, its tangents tell less."""
+    return search.gone - copies(search) if search.base.chi2 > BENT * search.problem.n else set()
+
+
+def _told(search: Search, scores: list[tuple[float, int]]) -> list[tuple[float, int]]:
+    """The scores without those of merged candidates that are those of what they are merged with."""
+    known = {j: z for z, j in scores}
+    return [(z, j) for z, j in scores
+            if j not in search.gone or abs(z - known.get(search.twins[j], 0.0)) > SAME_SCORE]  # fmt: skip
 
 
 def _refit_sets(

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchcal.discovery.fits.candidates import prepare, spread_values
 from torchcal.discovery.fits.local import EDGE, ENDS, SHORT, WIDTH_OF_EDGE, WIDTHS, Span, beyond, is_window, localised
-from torchcal.discovery.hypotheses.aliases import duplicate
+from torchcal.discovery.hypotheses.aliases import copies
 from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.hypotheses.refitting import improve, refit_together
 from torchcal.discovery.hypotheses.screen import Window, windows_of
@@ -66,7 +66,7 @@ def refit_local(search: Search) -> None:
         return
     gains = {model.numbers[0]: 2 * model.log_evidence + math.log(search.problem.n) for model in search.models}
     highest = 2 * max((model.log_evidence for model in search.models if model.physical), default=0.0)
-    same = {i for i in search.gone if duplicate(search, search.twins[i], i)}
+    same = copies(search)
     promising: dict[int, list[Window]] = {}
     for w in sorted(search.local, key=lambda w: -w.z):
         plain = max(gains.get(w.candidate, 0.0), search.screening.score(w.candidate) ** 2)

@@ -3,7 +3,7 @@
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.search import Search
 
-__all__ = ["duplicate", "merge"]
+__all__ = ["copies", "duplicate", "merge"]
 
 
 def merge(search: Search) -> None:
@@ -20,7 +20,8 @@ def merge(search: Search) -> None:
         search.aliases.setdefault(k, []).append(i)
         search.merged |= {i: own} if own is not None else {}
     search.gone = {i for alike in search.aliases.values() for i in alike}
-    search.models = [m for m in search.models if not search.gone & set(m.numbers)]
+    same, alone = copies(search), {id(model) for i, model in plain.items() if i in search.gone}
+    search.models = [m for m in search.models if id(m) not in alone and not same & set(m.numbers)]
 
 
 def _follows(search: Search, i: int, k: int, model: Model | None) -> bool:
@@ -33,6 +34,12 @@ def _follows(search: Search, i: int, k: int, model: Model | None) -> bool:
     place = other.amplitudes[0]
     size = float(model.found.values[place]) - other.neutral_at(place)
     return side * search.screening.correlation(i, k) * size >= 0
+
+
+def copies(search: Search) -> set[int]:
+    """Merged candidates that do the same whatever is calibrated beside them: others may be told apart beside another
+    term, or where they act in a range."""
+    return {i for i in search.gone if duplicate(search, search.twins[i], i)}
 
 
 def duplicate(search: Search, i: int, j: int) -> bool:

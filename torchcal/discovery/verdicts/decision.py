@@ -91,12 +91,16 @@ def certain(ranked: Sequence[Model], model: Model) -> bool:
 def other_names(search: Search, model: Model) -> list[tuple[int, str, str]]:
     """Names that the model could as well have: for each the candidate's number, its name, and the one it replaces.
 
-    A model of a window goes by another name only where that does the same everywhere.
+    A model of a window goes by another name only where that does the same everywhere; one of several terms where what
+    it is called after has not been refitted beside the others.
     """
     found = []
+    several = {frozenset(m.numbers) for m in search.models if len(m.numbers) > 1 and m.window is None}
     for i in model.numbers:
         own = search.candidates[i].name
         for j in search.aliases.get(i, []):
+            if frozenset({*model.numbers, j} - {i}) in several:
+                continue
             if model.window is None or duplicate(search, i, j):
                 found.append((j, search.candidates[j].name, own))
     return found
