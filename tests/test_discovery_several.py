@@ -13,8 +13,10 @@ from torchcal.discovery import several
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.aliases import merge
 from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.hypotheses.sets import distinct, refit_sets
+from torchcal.discovery.rivals import _swapped, one_fewer
 from torchcal.discovery.rounds import settle
-from torchcal.discovery.several import _one_fewer, _refit_sets, _swapped, refit_several
+from torchcal.discovery.several import refit_several
 from torchcal.discovery.windows import _rivals
 
 F64 = torch.float64
@@ -83,9 +85,9 @@ def test_second_terms_are_sought_beside_what_acts_everywhere_too(monkeypatch):
         return []
 
     monkeypatch.setattr(several, "_enough", lambda search: False)
-    monkeypatch.setattr(several, "_linear_pairs", lambda search, most: [])
-    monkeypatch.setattr(several, "_next_terms", next_terms)
-    monkeypatch.setattr(several, "_refit_sets", refit_sets)
+    monkeypatch.setattr(several, "linear_pairs", lambda search, most: [])
+    monkeypatch.setattr(several, "next_terms", next_terms)
+    monkeypatch.setattr(several, "refit_sets", refit_sets)
     refit_several(search)
     assert asked == [(i, False) for i in order[1:]] + [(i, True) for i in order[:3]]
     assert len(wanted) == 6  # the first of all with the others, and then what is left
@@ -218,13 +220,13 @@ def test_a_third_term_that_does_nothing_gives_way_to_the_pair():
     search = Search(problem, [term(name) for name in ("square", "wave", "root")], {}, 0, 3, 3, lambda text: None)
     search.calibrate_base()
     search, _ = settle(search, problem, 0.99)
-    right, three = (_refit_sets(search, [(numbers, None)], -4.0)[0] for numbers in ((0, 1), (0, 1, 2)))
+    right, three = (refit_sets(search, [(numbers, None)], -4.0)[0] for numbers in ((0, 1), (0, 1, 2)))
     search.models = [dataclasses.replace(right, log_evidence=right.log_evidence - 100), three]
-    _one_fewer(search, three, -4.0)
+    one_fewer(search, three, -4.0)
     (again,) = [model for model in search.models if model.numbers == (0, 1)]
     assert abs(again.weight - right.weight) < 0.01
     assert again.weight > three.weight
-    _one_fewer(search, three, -4.0)  # once is enough
+    one_fewer(search, three, -4.0)  # once is enough
     assert [model for model in search.models if model.numbers == (0, 1)] == [again]
 
 
@@ -396,6 +398,6 @@ def test_sets_that_add_the_same_are_one():
         failed=set(),
     )
     sets = [(0, 1), (0, 3), (1, 3), (0, 4), (2, 4), (2, 3)]
-    assert several._distinct(search, sets) == [(1, 3), (0, 4), (2, 3)]
+    assert distinct(search, sets) == [(1, 3), (0, 4), (2, 3)]
     search.failed = {2}
-    assert several._distinct(search, sets)[0] == (0, 1)  # of what could not be fitted another set is tried
+    assert distinct(search, sets)[0] == (0, 1)  # of what could not be fitted another set is tried

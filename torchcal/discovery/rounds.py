@@ -11,6 +11,7 @@ from torchcal.discovery.fits.candidates import spread_values
 from torchcal.discovery.fits.fitting import refit
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.base import MOST
+from torchcal.discovery.hypotheses.beside import scores_beside
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.own_noise import (
     EXPLAINED,
@@ -31,7 +32,7 @@ from torchcal.discovery.hypotheses.singles import refit_singles
 from torchcal.discovery.misfit.likeliest import log_normal
 from torchcal.discovery.misfit.noise import Noise
 from torchcal.discovery.misfit.residual import Residual
-from torchcal.discovery.several import refit_several, scores_beside
+from torchcal.discovery.several import refit_several
 from torchcal.discovery.verdicts.verdict import WHITE, base_alone
 from torchcal.discovery.windows import refit_local
 from torchcal.errors import SimulatorError

@@ -18,6 +18,7 @@ from torchcal.simulators import Solution
 
 __all__ = [
     "BENT",
+    "STRONG",
     "beginnings",
     "blind_rows",
     "farther",
@@ -32,9 +33,9 @@ __all__ = [
 
 #: Shapes that a refit begins at, by their tangents; the same where the base is far off.
 SHAPES, SHAPES_FAR = 3, 8
-#: χ² a datum from which on a base is far off, whatever the data vary by; from which on it is bent; and the share of the
-#: data's spread that it then misses where it is far off too.
-FAR, BENT, LOST = 30.0, 5.0, 0.5
+#: χ² a datum from which on a base is far off, whatever the data vary by; from which on it is bent; the share of the
+#: data's spread that it then misses where it is far off too; and from which on what its tangents tell may not be all.
+FAR, BENT, LOST, STRONG = 30.0, 5.0, 0.5, 2.0
 #: Amplitudes tried from first guesses, as shares of the range or of the largest linear estimate; the last of them are
 #: also how far on the way to a bound larger effects are tried.
 GUESSED = (0.1, 0.4, 0.9)

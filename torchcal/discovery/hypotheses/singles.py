@@ -5,6 +5,7 @@ import torch
 from torchcal.discovery.hypotheses.aliases import merge
 from torchcal.discovery.hypotheses.beginnings import (
     BENT,
+    STRONG,
     beginnings,
     farther,
     first_guess,
@@ -27,10 +28,9 @@ FEW, CHANCE = 6, 0.2
 #: Share of the misfit of a bent base that the best term leaves at most, and the probability of as much structure in
 #: noise below which it leaves something, for others to be tried from its base.
 MOSTLY, PLAINLY = 0.5, 0.01
-#: χ² a datum of the base from which on terms are also tried farther away than tangents tell; by how much χ² must fall
-#: below that of a term's fit for it to begin there; and how far from where it plays a part it may still be then, as a
-#: share of the way from the base.
-STRONG, LOWER, NEARLY = 2.0, 2.0, 0.1
+#: By how much χ² must fall below that of a term's fit for it to begin farther away; and how far from where it plays a
+#: part it may still be then, as a share of the way from the base.
+LOWER, NEARLY = 2.0, 0.1
 
 
 def refit_singles(search: Search, *, detected: bool = True) -> None:
