@@ -14,7 +14,7 @@ from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.aliases import merge
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.hypotheses.sets import distinct, refit_sets
-from torchcal.discovery.rivals import _swapped, one_fewer
+from torchcal.discovery.rivals import _swapped, one_fewer, with_stand_ins
 from torchcal.discovery.rounds import settle
 from torchcal.discovery.several import refit_several
 from torchcal.discovery.windows import _rivals
@@ -228,6 +228,58 @@ def test_a_third_term_that_does_nothing_gives_way_to_the_pair():
     assert again.weight > three.weight
     one_fewer(search, three, -4.0)  # once is enough
     assert [model for model in search.models if model.numbers == (0, 1)] == [again]
+
+
+def test_pairs_begin_again_where_the_leading_one_stands():
+    """The right pair had got stuck; a wrong one leads that shares a term with it, and then it does."""
+    noise = 0.02 * torch.randn(60, generator=torch.Generator().manual_seed(3), dtype=F64)
+    y = 2 * X + 0.3 * X**2 + 0.4 * (2 * X).sin() + noise
+    base = tc.Simulator(lambda x, p: {"y": p["m"] * x["x"]}, [tc.Parameter("m")])
+    problem = Problem.of(base, tc.Recording(x={"x": X}, y={"y": y}, noise=0.02))
+    search = Search(problem, [term(name) for name in ("square", "wave", "cube")], {}, 0, 3, 2, lambda text: None)
+    search.calibrate_base()
+    search, _ = settle(search, problem, 0.99)
+    right, wrong = refit_sets(search, [((0, 1), None), ((1, 2), None)], -4.0)
+    assert right.weight > wrong.weight + 2
+    begun = right.candidate.begin
+    far = dataclasses.replace(right.found, values=begun, y=right.candidate.problem.evaluate(begun[None], [])[0][0])
+    singles = [model for model in search.models if model.window is None]
+    stuck = dataclasses.replace(right, found=far, log_evidence=wrong.log_evidence - 1000)
+    search.models = [*singles, stuck, wrong]
+    found = with_stand_ins(search, -4.0)
+    (again,) = [model for model in search.models if model.numbers == (0, 1)]
+    assert again in found
+    assert abs(again.weight - right.weight) < 0.01
+    search.models = [model for model in search.models if model is not again]  # where it had not been tried at all
+    assert any(abs(model.weight - right.weight) < 0.01 for model in with_stand_ins(search, -4.0))
+    search.base = dataclasses.replace(search.base, chi2=1.9 * problem.n)  # from a base that is hardly bent none is
+    search.models = [*singles, stuck, wrong]
+    assert with_stand_ins(search, -4.0) == []
+    assert stuck in search.models
+
+
+def test_what_the_base_makes_one_of_two_is_told_apart_beside_a_third():
+    """A bend of what is shown, and one of what the base alone gives and a share of it: at the base they are one."""
+    x = torch.linspace(0, 3, 80, dtype=F64)
+    base = tc.Simulator(
+        lambda x, p: {"y": p["a"] * (-p["k"] * x["x"]).exp()},
+        [tc.Parameter("a", initial=1.0, low=0.1, high=10.0), tc.Parameter("k", initial=1.0, low=0.1, high=5.0)],
+    )
+
+    def seen(name, function):
+        return tc.Term(name, outputs={"y": function}, parameters=[tc.Parameter("q", neutral=0.0)])
+
+    terms = [
+        seen("bend of the base", lambda x, p, y: y + p["q"] * (
+            p["a"] ** 2 * (-2 * p["k"] * x["x"]).exp() + 0.5 * p["a"] * (-p["k"] * x["x"]).exp())),
+        seen("wave", lambda x, p, y: y + p["q"] * (2 * x["x"]).sin()),
+        seen("bend of what is shown", lambda x, p, y: y + p["q"] * y**2),
+    ]  # fmt: skip
+    true = 2 * (-0.8 * x).exp() + 0.5 * (2 * x).sin()
+    y = true + 0.15 * true**2 + 0.01 * torch.randn(80, generator=torch.Generator().manual_seed(1), dtype=F64)
+    d = tc.diagnose(base, tc.Recording(x={"x": x}, y={"y": y}, noise=0.01), terms, progress=False)
+    assert d.verdict == "named", d.tied
+    assert set(d.terms) == {"wave", "bend of what is shown"}
 
 
 def test_an_instrument_shows_the_physics_in_whatever_order_the_two_are_listed():

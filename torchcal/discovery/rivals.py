@@ -109,7 +109,10 @@ def _in_its_place(search: Search, lead: Model, prior: float) -> list[Model]:
     wanted: dict[tuple[int, ...], Hypothetical] = {}
     for kept in lead.numbers:
         (other,) = set(lead.numbers) - {kept}
-        there = _without(search, lead, kept)
+        try:
+            there = _without(search, lead, kept)
+        except (SimulatorError, DomainError):  # one without the other may lead where nothing works
+            continue
         residual = Residual(there, search.noise, draws=10)
         every = screened_beside(search, there, residual, (kept,))
         scores = {j: seen.score(0) for j, (_, seen) in every.items()}
