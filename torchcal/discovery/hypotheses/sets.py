@@ -36,7 +36,7 @@ def hypothetical(
     except (SimulatorError, DomainError):
         return None
     names = [q.name for q in candidate.problem.parameters]
-    rows, plain = [], search.plain
+    rows, plain = [], search.merged | search.plain
     for lead in numbers:
         single = plain.get(lead)
         row = candidate.begin.clone()
