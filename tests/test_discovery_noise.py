@@ -843,6 +843,33 @@ def test_white_noise_goes_on_along_no_condition():
     assert told <= most(300, 2 * 5e-4)
 
 
+def test_white_noise_goes_on_along_no_condition_at_one_value_of_another():
+    told = 0
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        x = {"a": rng.uniform(0, 1, 60), "level": rng.choice([1.0, 2.0, 4.0, 8.0], 60)}
+        problem = Problem.of(LINE, tc.Recording(x=x, y=rng.standard_normal(60), noise=1.0))
+        told += bool(goes_on_along(problem, problem.y))
+    assert told <= most(300, 2 * 5e-4)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_what_goes_on_at_each_level_of_another_condition_is_no_larger_noise(seed):
+    """A ripple along one condition whose phase differs from level to level of another: over all levels it is none."""
+    rng = np.random.default_rng(seed)
+    a, level = rng.uniform(0, 10, 80), rng.choice([0.1, 0.3, 0.6, 1.0, 1.5, 2.0], 80)
+    ripple = 0.3 * np.sin(0.9 * a + 7.0 * level)
+    problem = Problem.of(LINE, tc.Recording(x={"a": a, "level": level}, y=ripple, noise=0.05))
+    assert goes_on_along(problem, problem.y) == [("y", "a at each level")]
+    y = 2 * np.exp(-0.2 * a) + ripple + 0.05 * rng.standard_normal(80)
+    fade = tc.Simulator(
+        lambda x, p: p["top"] * torch.exp(-p["k"] * x["a"]),
+        [tc.Parameter("top", low=0.0, initial=1.0), tc.Parameter("k", low=0.0, initial=0.1)],
+    )
+    d = tc.diagnose(fade, tc.Recording(x={"a": a, "level": level}, y=y, noise=0.05), [], progress=False)
+    assert (d.verdict, d.noise.source) == ("unexplained", "given")
+
+
 def test_a_given_noise_is_kept_where_an_output_has_too_few_data_to_tell_another():
     x = torch.linspace(0, 2, 60, dtype=F64)
     w = torch.full_like(x, math.nan)
@@ -1025,3 +1052,21 @@ def test_noise_does_not_grow_because_one_of_two_terms_was_missing_when_it_was_es
     assert "growing" not in str(found)
     (size,) = [e for e in found.final.estimates if e.name == "ends.z"]
     assert abs(size.value - 0.4) < 3 * size.sd < 0.04
+
+
+def test_a_sudden_change_taken_out_under_one_noise_is_credited_no_more_than_it_removes_under_another():
+    """A friction and a spring, of which smooth curves follow neither: they leave noise of unknown size alone."""
+    phase, amplitude = torch.linspace(0, 6 * math.pi, 110, dtype=F64), torch.tensor([0.3, 0.8], dtype=F64)
+    amplitude = amplitude.repeat_interleave(55)
+    v, x, warmth = 2 * amplitude * phase.cos(), amplitude * phase.sin(), torch.linspace(20, 70, 110, dtype=F64)
+    y = 4 * v + x + 0.8 * torch.tanh(v / 0.05) + draw(110, 0.2, 900)
+    damper = tc.Simulator(lambda x, p: p["c"] * x["v"], [tc.Parameter("c", low=0.0, initial=3.0)])
+    terms = [
+        tc.Term("spring", outputs={"y": lambda x, p, y: y + p["k"] * x["x"]}, parameters=[tc.Parameter("k", low=0.0)]),
+        tc.Term("friction", outputs={"y": lambda x, p, y: y + p["f"] * torch.tanh(x["v"] / 0.05)},
+                parameters=[tc.Parameter("f", low=0.0)]),
+    ]  # fmt: skip
+    d = tc.diagnose(damper, tc.Recording(x={"v": v, "x": x, "T": warmth}, y=y), terms, progress=False)
+    assert d.verdict == "named"
+    assert set(d.terms) == {"spring", "friction"}
+    assert float(d.noise.sd["y"]) == pytest.approx(0.2, rel=0.25)

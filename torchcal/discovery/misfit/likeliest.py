@@ -200,7 +200,10 @@ def with_unknown(
                 residuals = [Residual(weighed(one, w), tried, draws=0) for one in peeled]
                 seen, rough = evidences(residuals[-1], looks, available, sudden)
                 gain = max(seen) - math.log(len(seen)) if seen else -math.inf
-                gain += sum(one.evidence(residual) for one, residual in zip(taken, residuals, strict=False))
+                gain += sum(
+                    _credit(one, before, after)
+                    for one, (before, after) in zip(taken, itertools.pairwise(residuals), strict=True)
+                )
                 gain -= len(taken) * math.log(2 * len(places))  # a wave or a sudden change of any output
                 like = _log_density(w, residuals[0].e, tried, tangents, problem)
                 found[at] = tried, like + gain, rough
@@ -230,6 +233,12 @@ def with_unknown(
             break
         noise, evidence = fresh, more
     return noise, evidence
+
+
+def _credit(one: Rough, before: Residual, after: Residual) -> float:
+    """Log evidence of a wave or a sudden change under some noise, at most what it removes there as it was taken out
+    under another one: beside that, what is left is judged."""
+    return min(one.evidence(before), 0.5 * float(before.e.square().sum() - after.e.square().sum()))
 
 
 def _with(at: _Places, k: int, rho: int, factor: int) -> _Places:

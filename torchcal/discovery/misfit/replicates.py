@@ -18,8 +18,9 @@ FEWEST, MOST = 3, 1024
 #: of its square that is shared from value to value up to which it is in no order; its probability by chance; and
 #: points at which the tail of that is taken.
 GROUPS, LARGER, SLOW, SHARED, TAIL = 8, 1.5, 0.4, 0.005, 2001
-#: Correlation of neighbours along a condition, in sd, from which on they go on.
-TOGETHER = 3.3
+#: Correlation of neighbours along a condition, in sd, from which on they go on; and data at each value of another one
+#: at least, on average, for those to be looked at one by one.
+TOGETHER, EACH = 3.3, 5
 
 
 @dataclass(frozen=True)
@@ -140,22 +141,41 @@ def in_common_at(problem: Problem, standard: Tensor) -> list[tuple[str, str, flo
 
 def goes_on_along(problem: Problem, standard: Tensor) -> list[tuple[str, str]]:
     """Outputs, and conditions of several along which residuals ``(n,)`` go on from each value to the next, whatever the
-    other conditions are. Noise of each datum does not."""
+    other conditions are, or at each of the few values of another one. Noise of each datum does not."""
     conditions, outputs = problem.recording.x, problem.recording.outputs
     if problem.in_time or not isinstance(conditions, dict) or len(conditions) < 2:
         return []
     found = []
     for number, name in enumerate(outputs):
         mine = (problem.output_of == number).nonzero()[:, 0]
-        for condition, values in conditions.items():
-            _, which, count = values[problem.condition_of[mine]].unique(return_inverse=True, return_counts=True)
-            if len(count) < GROUPS:
+        e, n = standard[mine], len(mine)
+        columns = {each: values[problem.condition_of[mine]].unique(return_inverse=True)[1]
+                   for each, values in conditions.items()}  # fmt: skip
+        count = {each: int(which.max()) + 1 if n else 0 for each, which in columns.items()}
+        for along, which in columns.items():
+            if count[along] < GROUPS:
                 continue
-            e = torch.zeros(len(count), dtype=torch.float64).index_add_(0, which, standard[mine]) / count.sqrt()
-            together = float(e[1:] @ e[:-1]) / max(float(e @ e), 1e-300) * math.sqrt(len(e))
-            if together > TOGETHER:
-                found.append((name, condition))
+            if _goes_on(e, which):
+                found.append((name, along))
+                continue
+            few = [other for other in columns if other != along and 1 < count[other] <= n / EACH]
+            found += [(name, f"{along} at each {other}") for other in few if _goes_on(e, which, columns[other])][:1]
     return found
+
+
+def _goes_on(e: Tensor, which: Tensor, group: Tensor | None = None) -> bool:
+    """Whether residuals ``(n,)`` go on from each of their numbered values to the next; in each group, off its mean,
+    where there are some."""
+    left, values, at = e, int(which.max()) + 1, which
+    if group is not None:
+        sums = torch.zeros(int(group.max()) + 1, dtype=torch.float64).index_add_(0, group, e)
+        left, at = e - (sums / torch.bincount(group))[group], group * values + which
+    places, place = at.unique(return_inverse=True)
+    mean = torch.zeros(len(places), dtype=torch.float64).index_add_(0, place, left) / torch.bincount(place).sqrt()
+    beside = places[1:] // values == places[:-1] // values
+    size = float(mean.square().sum()) + ROUNDING * float(e.square().sum())
+    together = float((mean[1:] * mean[:-1])[beside].sum()) / max(size, 1e-300)
+    return int(beside.sum()) >= GROUPS - 1 and together * len(places) / math.sqrt(int(beside.sum()) + 1) > TOGETHER
 
 
 def _by_chance(share: float, one: int, other: int) -> float:
