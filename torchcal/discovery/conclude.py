@@ -207,6 +207,8 @@ def _told_noise(search: Search, decision: Decision, alpha: float) -> Noise:
 def _in_order(search: Search, best: Model) -> list[str]:
     """Names of the accepted terms, the one with the most evidence of its own first."""
     alone = {m.names[0]: m.log_evidence for m in search.models if len(m.names) == 1}
+    for i, j in search.twins.items():
+        alone.setdefault(search.candidates[i].name, alone.get(search.candidates[j].name, -math.inf))
     return sorted(best.names, key=lambda name: -alone.get(name, -math.inf))
 
 

@@ -1,5 +1,5 @@
-"""Rivals of the leading pair of terms: others in the place of one of its terms, and its terms the other way round, or
-alone, begun where it stands. From the base, which a large effect bends, a fit may have got stuck."""
+"""Rivals of the leading pair of terms: others in the place of one of its terms, its terms the other way round, and each
+of them alone. From the base, which a large effect bends, a fit may have got stuck: some begin where the pair stands."""
 
 import dataclasses
 import itertools
@@ -10,11 +10,12 @@ from torch import Tensor
 
 from torchcal.discovery.fits.candidates import Candidate
 from torchcal.discovery.fits.fitting import Fitted
-from torchcal.discovery.hypotheses.aliases import merge
+from torchcal.discovery.hypotheses.aliases import merge, merge_sets
 from torchcal.discovery.hypotheses.beginnings import BENT, STRONG, beginnings
-from torchcal.discovery.hypotheses.beside import screened_beside, told_apart
+from torchcal.discovery.hypotheses.beside import screened_beside
 from torchcal.discovery.hypotheses.model import Hypothetical, Model
 from torchcal.discovery.hypotheses.refitting import BETTER, improve, refit_together
+from torchcal.discovery.hypotheses.screen import Screening
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.hypotheses.sets import acting_order, distinct, hypothetical, refit_sets, refitted
 from torchcal.discovery.misfit.residual import Residual
@@ -25,8 +26,8 @@ from torchcal.terms import extend
 
 __all__ = ["alone_again", "either_way", "leading_pairs", "one_fewer", "with_look_alikes", "with_stand_ins"]
 
-#: Log weight behind the leading pair down to which that is tried, and for how many pairs; and how many are tried at
-#: most in place of the leading ones.
+#: Log weight behind the leading pair down to which that is tried, and for how many pairs; and how many look-alikes are
+#: tried at most in place of one's terms, and in all.
 CLOSE, AGAIN, MOST = 5.0, 3, 20
 #: Log weight behind a leading pair that leaves noise, down to which pairs are tried the other way round; how many at
 #: most; and the change of χ² from which on that is another model.
@@ -46,21 +47,21 @@ def leading_pairs(search: Search) -> list[Model]:
     return sorted((m for m in pairs if m.weight > best - CLOSE), key=lambda m: -m.weight)[:AGAIN]
 
 
-def with_look_alikes(search: Search, tried: set[tuple[int, ...]], prior: float) -> list[Model]:
+def with_look_alikes(search: Search, tried: set[tuple[int, ...]], prior: float) -> None:
     """Pairs with another candidate in place of a leading one's that does nearly the same: first of the best, then of
     those that lead with it, until there are no more or `MOST` of them."""
-    fitted: list[Model] = []
+    count = 0
     done: set[tuple[int, ...]] = set()
     leading = leading_pairs(search)[:1]
-    while leading and len(fitted) < MOST:
+    while leading and count < MOST:
         done |= {m.numbers for m in leading}
         wanted = dict.fromkeys(pair for lead in leading for pair in _swapped(search, lead) if pair not in tried)
-        pairs = distinct(search, wanted)[: MOST - len(fitted)]
+        pairs = distinct(search, wanted)[: MOST - count]
         tried.update(pairs)
         search.models += (twins := refit_sets(search, [(pair, None) for pair in pairs], prior))
-        fitted += either_way(search, twins)
+        count += len(twins)
+        either_way(search, twins)
         leading = [m for m in leading_pairs(search) if m.numbers not in done]
-    return fitted
 
 
 def _swapped(search: Search, lead: Model) -> list[tuple[int, ...]]:
@@ -68,10 +69,10 @@ def _swapped(search: Search, lead: Model) -> list[tuple[int, ...]]:
     what the base's parameters nearly make up for, of which a linear search from a base that is off sees little."""
     found: dict[tuple[int, ...], float] = {}
     hidden = _hidden(search) if search.base.chi2 > BENT * search.base.problem.n else set()
-    columns, owner, gone = search.screening.columns, search.screening.owner, search.gone - told_apart(search)
+    columns, owner = search.screening.columns, search.screening.owner
     for i in lead.numbers:
         (kept,) = set(lead.numbers) - {i}
-        for j in set(range(len(search.candidates))) - {*lead.numbers, *gone}:
+        for j in set(range(len(search.candidates))) - {*lead.numbers, *search.gone}:
             alike = (columns[:, owner == i].T @ columns[:, owner == j]).abs()
             if alike.numel() and (float(alike.max()) >= ALIKE or j in hidden):
                 found[tuple(sorted((kept, j)))] = float(alike.max())
@@ -88,25 +89,23 @@ def _hidden(search: Search) -> set[int]:
     return {i for i, share in shares.items() if share < HIDDEN}
 
 
-def with_stand_ins(search: Search, prior: float) -> list[Model]:
+def with_stand_ins(search: Search, prior: float) -> None:
     """Pairs with other candidates in place of one of the leading pair's terms, begun where that stands; then of the
     pair that leads with it."""
-    fitted: list[Model] = []
     done: set[frozenset[int]] = set()
-    while search.base.chi2 > STRONG * search.problem.n and len(done) < IN_TURN:
+    while search.base.chi2 > STRONG * search.problem.n and len(done) < IN_TURN and not search.stop.is_set():
         lead = leading_pairs(search)[0]
         if frozenset(lead.numbers) in done:
             break
         done.add(frozenset(lead.numbers))
-        fitted += _in_its_place(search, lead, prior)
-    return fitted
+        _in_its_place(search, lead, prior)
 
 
-def _in_its_place(search: Search, lead: Model, prior: float) -> list[Model]:
+def _in_its_place(search: Search, lead: Model, prior: float) -> None:
     """Pairs of one of a pair's terms with those that explain nearly as much beside it as the other; each as it is found
     from there, where it had not been as good."""
     known = {frozenset(m.numbers): m for m in search.models if len(m.numbers) == 2 and m.window is None}
-    wanted: dict[tuple[int, ...], Hypothetical] = {}
+    begun: dict[tuple[int, ...], tuple[Residual, Candidate, Screening]] = {}
     for kept in lead.numbers:
         (other,) = set(lead.numbers) - {kept}
         try:
@@ -118,35 +117,43 @@ def _in_its_place(search: Search, lead: Model, prior: float) -> list[Model]:
         scores = {j: seen.score(0) for j, (_, seen) in every.items()}
         able = [j for j in scores if j != other and scores[j] > STANDS_IN * scores.get(other, math.inf)]
         for j in sorted(able, key=lambda j: -scores[j])[:STAND_INS]:
-            pair = tuple(sorted((kept, j)))
-            old = known.get(frozenset(pair))
-            if (old is not None and old.weight > lead.weight - BETTER) or not (old or distinct(search, [pair])):
-                continue
-            one = hypothetical(search, pair, prior, None)
-            if one is not None:
-                prepared, seen = every[j]
-                begin = _reordered(beginnings(residual, seen, 0, prepared, None), prepared, one.candidate)
-                wanted[pair] = dataclasses.replace(one, begin=begin)
+            old = known.get(frozenset((kept, j)))
+            if old is None or old.weight <= lead.weight - BETTER:
+                begun.setdefault(tuple(sorted((kept, j))), (residual, *every[j]))
+    fresh = distinct(search, [pair for pair in begun if frozenset(pair) not in known])
+    wanted = []
+    for pair, (residual, prepared, seen) in begun.items():
+        one = hypothetical(search, pair, prior, None) if frozenset(pair) in known or pair in fresh else None
+        if one is not None:
+            begin = _reordered(beginnings(residual, seen, 0, prepared, None), prepared, one.candidate)
+            wanted.append(dataclasses.replace(one, begin=begin))
     fitted = []
-    for model in refitted(search, list(wanted.values())):
+    for model in refitted(search, wanted):
         old = known.get(frozenset(model.numbers))
-        if old is None or model.weight > old.weight + BETTER:
+        if old is None or (model.weight > old.weight + BETTER and model.physical >= old.physical):
             search.models = [m for m in search.models if m is not old] + [model]
             fitted.append(model)
-    return either_way(search, fitted)
+    either_way(search, fitted)
 
 
 def _without(search: Search, lead: Model, kept: int) -> Fitted:
     """One term of a pair as the pair has it, the base too, without the other term."""
-    candidate, known = search.candidates[kept], lead.found.by_name
-    names, row = [q.name for q in candidate.problem.parameters], candidate.begin.clone()
-    for k in candidate.free:
-        row[k] = known[names[k]]
+    candidate = search.candidates[kept]
+    row = _standing(candidate, lead)
     y, jacobian, warm = candidate.problem.evaluate(row[None], candidate.free)
     return dataclasses.replace(
         lead.found, problem=candidate.problem, values=row, free=candidate.free, y=y[0], jacobian=jacobian[0],
         at_bound=torch.zeros(len(candidate.free), dtype=torch.bool), warm=warm, ends=None, ends_chi2=None,
     )  # fmt: skip
+
+
+def _standing(candidate: Candidate, model: Model) -> Tensor:
+    """A candidate's values ``(P,)`` where a model that holds it stands; what only others of its terms free is neutral.
+    """
+    known, row = model.found.by_name, candidate.begin.clone()
+    for k in candidate.free:
+        row[k] = known[candidate.problem.parameters[k].name]
+    return row
 
 
 def _reordered(rows: Tensor, candidate: Candidate, other: Candidate) -> Tensor:
@@ -155,8 +162,8 @@ def _reordered(rows: Tensor, candidate: Candidate, other: Candidate) -> Tensor:
     return rows[:, [names.index(q.name) for q in other.problem.parameters]]
 
 
-def either_way(search: Search, pairs: list[Model]) -> list[Model]:
-    """Pairs, the leading ones with their terms the other way round where that is another model that does better.
+def either_way(search: Search, pairs: list[Model]) -> None:
+    """The leading ones of some pairs with their terms the other way round, where that is a model that does better.
 
     An instrument shows what the physics gives; which of two others on one output comes first, as of a shunt and what
     the leads drop, nobody says. Where the best leaves more than noise, pairs are tried however far they are behind, and
@@ -164,7 +171,7 @@ def either_way(search: Search, pairs: list[Model]) -> list[Model]:
     """
     every = [m for m in search.models if len(m.numbers) == 2 and m.window is None]
     if not every:
-        return pairs
+        return
     best = max(every, key=lambda m: m.weight)
     whole = search.examine(best).p_value >= PLAINLY_WHITE
     least = best.weight - FAR_BEHIND if whole else -math.inf
@@ -191,7 +198,7 @@ def either_way(search: Search, pairs: list[Model]) -> list[Model]:
         if other is not None and other.physical >= pair.physical and other.weight > pair.weight + BETTER
     }
     search.models = [better.get(id(m), m) for m in search.models]
-    return [better.get(id(m), m) for m in pairs]
+    merge_sets(search)
 
 
 def _turned(search: Search, pair: Model) -> tuple[dict[str, float], Tensor]:
@@ -210,34 +217,18 @@ def _share(pair: Model) -> bool:
 
 def alone_again(search: Search, pair: Model) -> None:
     """The terms of a pair, each refitted alone from where the pair ended: from the base it may have got stuck."""
-    known = pair.found.by_name
-    numbers = [i for i in pair.numbers if i not in search.gone]
-    wanted = []
-    for i in numbers:
-        candidate = search.candidates[i]
-        names = [q.name for q in candidate.problem.parameters]
-        row = candidate.begin.clone()
-        for k in candidate.free:  # what the other term frees stays neutral here
-            row[k] = known[names[k]]
-        wanted.append(Hypothetical((i,), candidate, row[None], search.prior))
-    improve(search, wanted)
+    alone = {i: search.candidates[i] for i in pair.numbers if i not in search.gone}
+    improve(search, [Hypothetical((i,), one, _standing(one, pair)[None], search.prior) for i, one in alone.items()])
     merge(search)
 
 
 def one_fewer(search: Search, three: Model, prior: float) -> None:
     """The pairs of three terms, each refitted from where the three ended: from the base it may have got stuck."""
-    known = three.found.by_name
-    wanted = []
-    for numbers in itertools.combinations(three.numbers, 2):
-        pair = hypothetical(search, numbers, prior, None)
-        if pair is not None:
-            names = [q.name for q in pair.candidate.problem.parameters]
-            row = pair.candidate.begin.clone()
-            for k in pair.candidate.free:  # what the third term frees stays neutral here
-                row[k] = known[names[k]]
-            wanted.append(dataclasses.replace(pair, begin=row[None]))
-    for model in refit_together(search, wanted):
-        if model is not None:
-            old = [m for m in search.models if m.numbers == model.numbers and m.window is None]
-            if all(model.weight > m.weight + BETTER for m in old):
-                search.models = [m for m in search.models if m not in old] + [model]
+    pairs = [hypothetical(search, numbers, prior, None) for numbers in itertools.combinations(three.numbers, 2)]
+    wanted = [
+        dataclasses.replace(one, begin=_standing(one.candidate, three)[None]) for one in pairs if one is not None
+    ]
+    for model in refitted(search, wanted):
+        old = [m for m in search.models if m.numbers == model.numbers and m.window is None]
+        if all(model.weight > m.weight + BETTER for m in old):
+            search.models = [m for m in search.models if m not in old] + [model]

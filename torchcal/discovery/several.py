@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
+from torchcal.discovery.hypotheses.aliases import merge_sets
 from torchcal.discovery.hypotheses.beginnings import is_far
 from torchcal.discovery.hypotheses.beside import next_terms
 from torchcal.discovery.hypotheses.linear_pairs import linear_pairs
@@ -54,18 +55,20 @@ def refit_several(search: Search) -> None:
     prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))
     search.models += (fitted := refit_sets(search, list(wanted.items()), prior))
     if not enough:
-        fitted = either_way(search, fitted)
+        either_way(search, fitted)
+    merge_sets(search)
     best = search.physical_leader
     if best is not None and len(best.numbers) == 2:
-        fitted += with_look_alikes(search, set(wanted), prior)
-        fitted += with_stand_ins(search, prior)
+        with_look_alikes(search, set(wanted), prior)
+        with_stand_ins(search, prior)
         for pair in leading_pairs(search):
             alone_again(search, pair)
     if isinstance(search.problem.recording.noise, Tensor):  # else a smaller noise makes physics of any small misfit
         search.reweigh()
-    if search.max_terms < 3 or not fitted:
+    pairs = [m for m in search.models if len(m.numbers) == 2 and m.window is None]
+    if search.max_terms < 3 or not pairs:
         return
-    best = max(fitted, key=lambda m: m.weight)
+    best = max(pairs, key=lambda m: m.weight)
     if search.examine(best).p_value < 0.01 or search.exact:
         third = math.log(0.2 * PRIOR["several"] / (count * (count - 1) * max(count - 2, 1) / 6))
         more = distinct(search, [(*best.numbers, j) for j in next_terms(search, best, THIRD)])
@@ -73,6 +76,7 @@ def refit_several(search: Search) -> None:
         leader = search.physical_leader
         if leader is not None and len(leader.numbers) == 3:
             one_fewer(search, leader, prior)
+        merge_sets(search)
 
 
 def _pairs_to_try(
@@ -89,7 +93,7 @@ def _pairs_to_try(
         wanted[tuple(int(search.screening.owner[k]) for k in columns)] = columns
     leads: dict[int, Model] = {}
     for model in single:
-        lead = model.numbers[0]  # in a window merged ones may differ, beside others not
+        lead = model.numbers[0]  # in a window merged ones may differ
         leads.setdefault(search.twins[lead] if lead in search.gone else lead, model)
     ahead = list(itertools.islice(leads.items(), 1 if enough else LEADS))
     beside = [_pairs_with(search, lead, model) for lead, model in ahead]

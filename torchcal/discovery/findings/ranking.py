@@ -103,6 +103,7 @@ def _refitted(search: Search, model: Model, share: float, others: list[int], hel
 def _alias(search: Search, i: int, model: Model, share: float) -> Hypothesis:
     """A candidate that these data cannot tell from the one of another model."""
     own_fit = search.merged.get(i)
+    beside = any(i in m.numbers for m in search.models if len(m.numbers) > 1)  # others may tell them apart
     return Hypothesis(
         (search.candidates[i].name,),
         model.log_evidence,
@@ -112,7 +113,7 @@ def _alias(search: Search, i: int, model: Model, share: float) -> Hypothesis:
         misfit_removed=explain.removed(search, model),
         score=search.screening.score(i),
         refitted=own_fit is not None,
-        note=f"the same as {model.names[0]} here",
+        note=f"the same as {model.names[0]} {'alone' if beside else 'here'}",
     )
 
 

@@ -3,7 +3,10 @@
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.search import Search
 
-__all__ = ["copies", "duplicate", "merge"]
+__all__ = ["copies", "duplicate", "merge", "merge_sets"]
+
+#: χ² up to which two fits of one size are one.
+SAME_FIT = 0.5
 
 
 def merge(search: Search) -> None:
@@ -15,13 +18,31 @@ def merge(search: Search) -> None:
         own = a or before.get(i)  # once merged it is refitted no more, so that its fit says nothing against it
         if i in search.failed or (own is not None and b is None) or (own is None and not _follows(search, i, k, b)):
             continue
-        if a is not None and b is not None and (a.physical != b.physical or abs(a.found.chi2 - b.found.chi2) > 0.5):
+        if a is not None and b is not None and not _same_fit(a, b):
             continue
         search.aliases.setdefault(k, []).append(i)
         search.merged |= {i: own} if own is not None else {}
     search.gone = {i for alike in search.aliases.values() for i in alike}
     same, alone = copies(search), {id(model) for i, model in plain.items() if i in search.gone}
     search.models = [m for m in search.models if id(m) not in alone and not same & set(m.numbers)]
+    merge_sets(search)
+
+
+def merge_sets(search: Search) -> None:
+    """Several terms with one that is merged become those with the other, where the rest does not tell them apart."""
+    found: dict[frozenset[int], list[Model]] = {}
+    for model in sorted(search.models, key=lambda m: len(search.gone & set(m.numbers))):
+        if len(model.numbers) > 1 and model.window is None:
+            first = frozenset(search.twins[i] if i in search.gone else i for i in model.numbers)
+            alike = found.setdefault(first if len(first) == len(model.numbers) else frozenset(model.numbers), [])
+            if not any(_same_fit(model, other) for other in alike):
+                alike.append(model)
+    kept = {id(model) for alike in found.values() for model in alike}
+    search.models = [m for m in search.models if len(m.numbers) == 1 or m.window is not None or id(m) in kept]
+
+
+def _same_fit(a: Model, b: Model) -> bool:
+    return a.physical == b.physical and abs(a.found.chi2 - b.found.chi2) <= SAME_FIT
 
 
 def _follows(search: Search, i: int, k: int, model: Model | None) -> bool:
@@ -37,8 +58,8 @@ def _follows(search: Search, i: int, k: int, model: Model | None) -> bool:
 
 
 def copies(search: Search) -> set[int]:
-    """Merged candidates that do the same whatever is calibrated beside them: others may be told apart beside another
-    term, or where they act in a range."""
+    """Merged candidates that do the same whatever is calibrated beside them, to first order: of the others some may be
+    told apart beside another term, or where they act in a range."""
     return {i for i in search.gone if duplicate(search, search.twins[i], i)}
 
 

@@ -13,7 +13,7 @@ from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.residual import Residual
 from torchcal.errors import DomainError, SimulatorError
 
-__all__ = ["next_terms", "scores_beside", "screened_beside", "told_apart"]
+__all__ = ["next_terms", "scores_beside", "screened_beside"]
 
 #: How many more candidates are tried beside a model whose tangents vanish.
 UNSEEN = 3
@@ -23,7 +23,9 @@ SAME_SCORE = 0.1
 
 def next_terms(search: Search, model: Model, most: int) -> list[int]:
     """The best other candidates by their score at a model's fit, and some that only large effects show."""
-    residual = model.residual or Residual(model.found, search.noise, seed=search.seed, draws=10)
+    residual = model.residual
+    if residual is None or residual.found is not model.found:
+        residual = Residual(model.found, search.noise, seed=search.seed, draws=10)
     scores = scores_beside(search, model.found, residual, model.numbers)
     scored = [j for _, j in sorted(scores, key=lambda one: (-one[0], one[1]))]
     # What no tangent shows may be seen beside another that none shows, or that has taken its part.
@@ -35,18 +37,20 @@ def scores_beside(
     search: Search, found: Fitted, residual: Residual, numbers: Sequence[int]
 ) -> list[tuple[float, int]]:
     """Scores and numbers of the candidates that are not in a model, at a fit of it."""
-    every = screened_beside(search, found, residual, numbers)
-    known = {j: seen.score(0) for j, (_, seen) in every.items() if seen.best[0] >= 0}
-    alike = {j for j in known if j in search.gone and abs(known[j] - known.get(search.twins[j], 0.0)) <= SAME_SCORE}
-    return [(z, j) for j, z in known.items() if j not in alike]
+    return [(seen.score(0), j) for j, (_, seen) in screened_beside(search, found, residual, numbers).items()]
 
 
 def screened_beside(
     search: Search, found: Fitted, residual: Residual, numbers: Sequence[int]
 ) -> dict[int, tuple[Candidate, Screening]]:
-    """The candidates that are not in a model, by their numbers, as prepared and screened at a fit of it."""
+    """The candidates that are not in a model and say something new at a fit of it, by their numbers, as prepared and
+    screened there.
+
+    Merged ones are among them where the base is bent, whose tangents tell less, and their score is another one there.
+    """
     scale = drivers_scale(found.problem, found)
-    every, gone = {}, search.gone - told_apart(search)
+    gone = copies(search) if search.base.chi2 > STRONG * search.problem.n else search.gone
+    every: dict[int, tuple[Candidate, Screening]] = {}
     for j, other in enumerate(search.candidates):
         if j in numbers or j in gone:
             continue
@@ -55,10 +59,9 @@ def screened_beside(
             prepared = prepare(found.problem, found, other.terms, search.fixed, scale)
         except (SimulatorError, DomainError):
             continue
-        every[j] = prepared, screen(residual, [prepared])
-    return every
-
-
-def told_apart(search: Search) -> set[int]:
-    """Merged candidates that may be told apart beside another term: where the base is bent, its tangents tell less."""
-    return search.gone - copies(search) if search.base.chi2 > STRONG * search.problem.n else set()
+        seen = screen(residual, [prepared])
+        if seen.best[0] >= 0:
+            every[j] = prepared, seen
+    known = {j: seen.score(0) for j, (_, seen) in every.items()}
+    same = {j for j in known if j in search.gone and abs(known[j] - known.get(search.twins[j], 0.0)) <= SAME_SCORE}
+    return {j: one for j, one in every.items() if j not in same}

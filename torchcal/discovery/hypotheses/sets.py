@@ -25,7 +25,8 @@ def hypothetical(
     *,
     order: Sequence[int] = (),
 ) -> Hypothetical | None:
-    """Some candidates together, each begun at its fit alone and, if not as they are listed, acting in an order."""
+    """Some candidates together, begun at the fit of each alone where it has one, and acting in an order, if not as they
+    are listed."""
     terms = [term for i in order or numbers for term in search.candidates[i].terms]
     terms.sort(key=lambda term: not replaces(search.base.problem, search.base.values, term))  # else others are lost
     try:

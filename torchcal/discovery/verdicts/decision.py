@@ -99,7 +99,7 @@ def other_names(search: Search, model: Model) -> list[tuple[int, str, str]]:
     for i in model.numbers:
         own = search.candidates[i].name
         for j in search.aliases.get(i, []):
-            if frozenset({*model.numbers, j} - {i}) in several:
+            if j in model.numbers or frozenset({*model.numbers, j} - {i}) in several:
                 continue
             if model.window is None or duplicate(search, i, j):
                 found.append((j, search.candidates[j].name, own))

@@ -402,7 +402,11 @@ def other_minima(search: Search, model: Model) -> list[str]:
 
 
 def _told_apart(search: Search, i: int, j: int) -> bool:
-    """Whether refits of two candidates differ by far, whatever their tangents say."""
+    """Whether refits of two candidates differ by far, whatever their tangents say; or a merged one has stood apart from
+    the other beside a third."""
+    gone = {i, j} & search.gone
+    if any(gone & set(m.numbers) for m in search.models if len(m.numbers) > 1 and m.window is None):
+        return True
     a, b = (search.plain.get(k) for k in (i, j))
     return a is not None and b is not None and abs(a.log_evidence - b.log_evidence) > APART
 
