@@ -39,11 +39,15 @@ def term(name):
     )
 
 
-def searched(names):
-    y = 2 * X + 0.03 * X**2 + 0.02 * torch.randn(60, generator=torch.Generator().manual_seed(3), dtype=F64)
+def noisy(y):
+    return y + 0.02 * torch.randn(60, generator=torch.Generator().manual_seed(3), dtype=F64)
+
+
+def searched(names, y=None, *, noise=None, max_terms=2):
+    y = noisy(2 * X + 0.03 * X**2) if y is None else y
     base = tc.Simulator(lambda x, p: {"y": p["m"] * x["x"]}, [tc.Parameter("m")])
-    problem = Problem.of(base, tc.Recording(x={"x": X}, y={"y": y}, noise=None))
-    search = Search(problem, [term(name) for name in names], {}, 0, 3, 2, lambda text: None)
+    problem = Problem.of(base, tc.Recording(x={"x": X}, y={"y": y}, noise=noise))
+    search = Search(problem, [term(name) for name in names], {}, 0, 3, max_terms, lambda text: None)
     search.calibrate_base()
     search, detected = settle(search, problem, 0.99)
     assert detected
@@ -214,13 +218,8 @@ def test_a_pair_is_tried_beside_three_different_terms():
 
 def test_a_third_term_that_does_nothing_gives_way_to_the_pair():
     """Three terms, of which two do it all, and whose pair had got stuck."""
-    noise = 0.02 * torch.randn(60, generator=torch.Generator().manual_seed(3), dtype=F64)
-    y = 2 * X + 0.3 * X**2 + 0.4 * (2 * X).sin() + noise
-    base = tc.Simulator(lambda x, p: {"y": p["m"] * x["x"]}, [tc.Parameter("m")])
-    problem = Problem.of(base, tc.Recording(x={"x": X}, y={"y": y}, noise=0.02))
-    search = Search(problem, [term(name) for name in ("square", "wave", "root")], {}, 0, 3, 3, lambda text: None)
-    search.calibrate_base()
-    search, _ = settle(search, problem, 0.99)
+    y = noisy(2 * X + 0.3 * X**2 + 0.4 * (2 * X).sin())
+    search = searched(["square", "wave", "root"], y, noise=0.02, max_terms=3)
     right, three = (refit_sets(search, [(numbers, None)], -4.0)[0] for numbers in ((0, 1), (0, 1, 2)))
     search.models = [dataclasses.replace(right, log_evidence=right.log_evidence - 100), three]
     one_fewer(search, three, -4.0)
@@ -233,13 +232,8 @@ def test_a_third_term_that_does_nothing_gives_way_to_the_pair():
 
 def test_pairs_begin_again_where_the_leading_one_stands():
     """The right pair had got stuck; a wrong one leads that shares a term with it, and then it does."""
-    noise = 0.02 * torch.randn(60, generator=torch.Generator().manual_seed(3), dtype=F64)
-    y = 2 * X + 0.3 * X**2 + 0.4 * (2 * X).sin() + noise
-    base = tc.Simulator(lambda x, p: {"y": p["m"] * x["x"]}, [tc.Parameter("m")])
-    problem = Problem.of(base, tc.Recording(x={"x": X}, y={"y": y}, noise=0.02))
-    search = Search(problem, [term(name) for name in ("square", "wave", "cube")], {}, 0, 3, 2, lambda text: None)
-    search.calibrate_base()
-    search, _ = settle(search, problem, 0.99)
+    y = noisy(2 * X + 0.3 * X**2 + 0.4 * (2 * X).sin())
+    search = searched(["square", "wave", "cube"], y, noise=0.02)
     right, wrong = refit_sets(search, [((0, 1), None), ((1, 2), None)], -4.0)
     assert right.weight > wrong.weight + 2
     begun = right.candidate.begin
@@ -253,7 +247,7 @@ def test_pairs_begin_again_where_the_leading_one_stands():
     search.models = [model for model in search.models if model is not again]  # where it had not been tried at all
     with_stand_ins(search, -4.0)
     assert any(abs(model.weight - right.weight) < 0.01 for model in search.models)
-    search.base = dataclasses.replace(search.base, chi2=1.9 * problem.n)  # from a base that is hardly bent none is
+    search.base = dataclasses.replace(search.base, chi2=1.9 * search.problem.n)  # from one that is hardly bent none is
     search.models = [*singles, stuck, wrong]
     with_stand_ins(search, -4.0)
     assert search.models == [*singles, stuck, wrong]

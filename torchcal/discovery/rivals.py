@@ -92,19 +92,21 @@ def _hidden(search: Search) -> set[int]:
 def with_stand_ins(search: Search, prior: float) -> None:
     """Pairs with other candidates in place of one of the leading pair's terms, begun where that stands; then of the
     pair that leads with it."""
-    done: set[frozenset[int]] = set()
+    done: set[tuple[int, ...]] = set()
     while search.base.chi2 > STRONG * search.problem.n and len(done) < IN_TURN and not search.stop.is_set():
         lead = leading_pairs(search)[0]
-        if frozenset(lead.numbers) in done:
+        if lead.numbers in done:
             break
-        done.add(frozenset(lead.numbers))
+        done.add(lead.numbers)
         _in_its_place(search, lead, prior)
 
 
 def _in_its_place(search: Search, lead: Model, prior: float) -> None:
     """Pairs of one of a pair's terms with those that explain nearly as much beside it as the other; each as it is found
     from there, where it had not been as good."""
-    known = {frozenset(m.numbers): m for m in search.models if len(m.numbers) == 2 and m.window is None}
+    known: dict[tuple[int, ...], Model] = {
+        m.numbers: m for m in search.models if len(m.numbers) == 2 and m.window is None
+    }
     begun: dict[tuple[int, ...], tuple[Residual, Candidate, Screening]] = {}
     for kept in lead.numbers:
         (other,) = set(lead.numbers) - {kept}
@@ -117,19 +119,19 @@ def _in_its_place(search: Search, lead: Model, prior: float) -> None:
         scores = {j: seen.score(0) for j, (_, seen) in every.items()}
         able = [j for j in scores if j != other and scores[j] > STANDS_IN * scores.get(other, math.inf)]
         for j in sorted(able, key=lambda j: -scores[j])[:STAND_INS]:
-            old = known.get(frozenset((kept, j)))
-            if old is None or old.weight <= lead.weight - BETTER:
-                begun.setdefault(tuple(sorted((kept, j))), (residual, *every[j]))
-    fresh = distinct(search, [pair for pair in begun if frozenset(pair) not in known])
+            pair = tuple(sorted((kept, j)))
+            if pair not in known or known[pair].weight <= lead.weight - BETTER:
+                begun[pair] = residual, *every[j]
+    fresh = distinct(search, [pair for pair in begun if pair not in known])
     wanted = []
     for pair, (residual, prepared, seen) in begun.items():
-        one = hypothetical(search, pair, prior, None) if frozenset(pair) in known or pair in fresh else None
+        one = hypothetical(search, pair, prior, None) if pair in known or pair in fresh else None
         if one is not None:
             begin = _reordered(beginnings(residual, seen, 0, prepared, None), prepared, one.candidate)
             wanted.append(dataclasses.replace(one, begin=begin))
     fitted = []
     for model in refitted(search, wanted):
-        old = known.get(frozenset(model.numbers))
+        old = known.get(model.numbers)
         if old is None or (model.weight > old.weight + BETTER and model.physical >= old.physical):
             search.models = [m for m in search.models if m is not old] + [model]
             fitted.append(model)
