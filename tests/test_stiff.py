@@ -338,6 +338,31 @@ def test_an_enzyme_by_its_full_mechanism_uses_up_its_substrate(stiff):
     assert np.abs(found.at(found.x)(values).reshape(2, -1).numpy() - exact).max() < 1e-3
 
 
+@pytest.mark.parametrize("subdivide", [2, 3, 4, 8])
+def test_no_step_goes_past_a_pole(subdivide):
+    """A substrate that is used up: its rate has a pole at S = -K, and steps that end behind it solve their equations
+    too. Exact is S = K w, w + log w = log(S0 / K) + (S0 - V t) / K (Schnell & Mendoza 1997, J. Theor. Biol. 187, 207).
+    """
+    t, begin = np.linspace(0.0, 20.0, 22), [1.0, 3.0, 8.0, 20.0]
+    simulator = tc.ODESimulator(
+        lambda t, s, p, u: {"S": -p["V"] * s["S"] / (p["K"] + s["S"])},
+        ["S"],
+        [tc.Parameter("V"), tc.Parameter("K")],
+        observe=("S",),
+    )
+    recording = tc.Recording(runs=[run_of(t, {"S": s}, ("S",)) for s in begin], noise=0.05)
+    bound = Trajectories(simulator, recording, subdivide=subdivide, implicit=True)
+    values = tensor([0.4, 0.01], [0.41, 0.02], [0.5, 0.01], [0.6, 0.05])
+    for row in [*values.split(1), values]:
+        y = bound.outputs_of(row, bound.solve(row))
+        for (v, k), found in zip(row.tolist(), y, strict=True):
+            z = np.concatenate([np.log(s / k) + (s - v * t) / k for s in begin])
+            log = np.where(z > 1, np.log(np.maximum(z, 1)), z)  # of w, by Newton's method for w + log w = z
+            for _ in range(30):
+                log -= (np.exp(log) + log - z) / (np.exp(log) + 1)
+            assert (found - torch.from_numpy(k * np.exp(log))).abs().max() < 1e-3
+
+
 @pytest.mark.parametrize("k", [100.0, 1e3, 1e5])
 def test_a_state_that_comes_to_rest_stays_finite(k):
     """There the velocity is rounding, as is every correction of it."""

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchcal.simulators.layout import Values
 from torchcal.simulators.shooting import Pass
-from torchcal.simulators.steps import COPIED, SPAN, Steps
+from torchcal.simulators.steps import COPIED, SPAN, Steps, inputs_between
 
 __all__ = ["ImplicitSteps"]
 
@@ -26,6 +26,12 @@ STAGES = len(NODES)
 #: Newton passes for the stages; corrections, relative to the state, after which the next would be rounding, and up to
 #: which a state is one where rounding keeps them from becoming smaller.
 PASSES, SMALL, ROUNDED = 12, 1e-7, 1e-5
+#: Slopes, at the beginning of a step of length 1, of the polynomials that are 1 at one stage and 0 there and at the
+#: others.
+BEGUN = ((13 + 7 * _ROOT) / 3, (13 - 7 * _ROOT) / 3, 1 / 3)
+#: Share of a step's way by which its beginning and its stages may disagree until it is solved again, with how many
+#: halvings at most; and by which it then ends elsewhere.
+ASTRAY, HALVINGS, ELSEWHERE = 0.5, 3, 0.1
 #: Share of a state's largest value below which it counts as that large; and of the terms that a gap is the difference
 #: of up to which it is rounding, whatever the states at rest are that it would correct.
 SMALLEST, ROUNDING = 1e-9, 1e-13
@@ -43,9 +49,20 @@ class ImplicitSteps(Steps):
     order = 6
     solved_for = True
 
-    def step(self, s: Tensor, t: Tensor, h: Tensor, p: Values, u: dict[str, Tensor]) -> Tensor:
-        """As `Steps.step`."""
-        return self._stages(s, t, h, p, u)[:, -1]
+    def step(
+        self, s: Tensor, t: Tensor, h: Tensor, p: Values, u: dict[str, Tensor], halvings: int = HALVINGS
+    ) -> Tensor:
+        """As `Steps.step`. One that may not go on from where it begins is solved again, towards where two of half its
+        length end, and these the same so often at most."""
+        stages = self._stages(s, t, h, p, u)
+        if halvings and len(at := self._doubtful(s, stages, t, h, p, u)[0]):
+            s, t, half, p = s[:, at], t[at], 0.5 * h[at], _tiled(p, at, 1, 1)
+            first, middle, last = ({name: table[i, at] for name, table in u.items()} for i in range(3))
+            between = self.step(s, t, half, p, inputs_between(first, middle), halvings - 1)
+            end = self.step(between, t + half, half, p, inputs_between(middle, last), halvings - 1)
+            found = self._stages(s, t, 2 * half, p, {name: table[:, at] for name, table in u.items()}, end)
+            stages[:, :, at] = torch.where(found.isfinite().all(1, keepdim=True), found, stages[:, :, at])
+        return stages[:, -1]
 
     def difference(self, values: Tensor) -> float:
         """As `Steps.difference`, of the rates: equations of stages may have several solutions."""
@@ -114,6 +131,44 @@ class ImplicitSteps(Steps):
         stages = stages + change
         off = _share(_largest(begin), stages, change, gap, slopes, h).amax(-1)
         return stages[:, -1].reshape(states[:, :, 1:].shape), stages, off
+
+    def astray(self, values: Tensor, states: Tensor, stages: Tensor) -> Tensor:
+        """As `Steps.astray`: equations of stages may have another solution, as past a pole of the rates."""
+        begin = _points(states[:, :, :-1])
+        t, h, u = self.grid.flat
+        at, way = self._doubtful(begin, stages, t, h, self.layout.by_name(values, self.grid.step_run), u)
+        if not len(at):
+            return torch.zeros(len(values), dtype=torch.bool)
+        p = self.layout.by_name(values, self.grid.step_run[at])
+        again = self.step(begin[:, at], t[at], h[at], p, {name: table[:, at] for name, table in u.items()}, 1)
+        return ((again - stages[:, -1, at]).abs() > ELSEWHERE * way[:, at]).any(-1).any(-1)  # not where it is NaN
+
+    def _doubtful(
+        self, s: Tensor, stages: Tensor, t: Tensor, h: Tensor, p: Values, u: dict[str, Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Which steps may not go on from where they begin, and how far all of them come at most, ``(H, M, S)``.
+
+        The rate where such a step begins, which has no part in its equations, is not the slope that its stages begin
+        with, and that is not for what fades at once, by the slopes of the rates there.
+        """
+        moved = stages - s.unsqueeze(1)
+        way = torch.maximum(moved.abs().amax(1), SMALL * _largest(s))
+        first = {name: table[0] for name, table in u.items()}
+        weights = torch.tensor(BEGUN, dtype=s.dtype)
+        off = torch.einsum("i,hims->hms", weights, moved) - h[:, None] * self.rates(t, s, p, first)
+        at = (off.abs() > ASTRAY * way).any(-1).any(0).nonzero()[:, 0]
+        if len(at):
+            with torch.enable_grad():
+                leaf = s[:, at].detach().requires_grad_(True)
+                rates = self.rates(t[at], leaf, _tiled(p, at, 1, 1), {name: table[at] for name, table in first.items()})
+                slopes = self.layout.derivatives(rates, leaf, {}, t[at], ())[0]
+            push = torch.tensor(NODES, dtype=s.dtype)[:, None] * (h[at, None] * rates.detach()).unsqueeze(2)
+            matrix = _matrix(slopes.unsqueeze(1).expand(-1, STAGES, -1, -1, -1), h[at])
+            line = torch.linalg.solve_ex(matrix, push.flatten(2).unsqueeze(-1))[0].squeeze(-1)
+            bent = moved[:, :, at] - line.unflatten(2, (STAGES, -1)).transpose(1, 2)
+            off = torch.einsum("i,hims->hms", weights, bent)
+            at = at[(off.abs() > ASTRAY * way[:, at]).any(-1).any(0)]
+        return at, way
 
     def derivatives(self, values: Tensor, states: Tensor, columns: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
         """As `Steps.derivatives`."""
@@ -253,9 +308,9 @@ def _inputs(u: dict[str, Tensor]) -> dict[str, Tensor]:
     }
 
 
-def _tiled(p: Values, at: Tensor, copies: int) -> Values:
+def _tiled(p: Values, at: Tensor, copies: int, stages: int = STAGES) -> Values:
     """Parameters of points as those of the stages of some of them, so many times."""
-    start = p.start[at].repeat(STAGES) if isinstance(p.start, Tensor) else p.start
-    tiled = {name: (v[..., at].repeat(copies, STAGES) if v.shape[-1] > 1 else v.repeat(copies, 1))
+    start = p.start[at].repeat(stages) if isinstance(p.start, Tensor) else p.start
+    tiled = {name: (v[..., at].repeat(copies, stages) if v.shape[-1] > 1 else v.repeat(copies, 1))
              for name, v in p.items()}  # fmt: skip
     return Values(tiled, p.first, start)

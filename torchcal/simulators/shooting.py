@@ -72,15 +72,23 @@ class Closed(NamedTuple):
         states: ``(H, R, K + 1, S)``.
         settled: Whether that is a trajectory, ``(H,)``.
         tangents: ∂ states / ∂ some parameters where it is, ``(H, R, K + 1, S, C)``.
+        astray: Whether it is none though Newton's method settled, ``(H,)``: see `Steps.astray`.
     """
 
     states: Tensor
     settled: Tensor
     tangents: Tensor
+    astray: Tensor
 
 
 def close_gaps(
-    steps: "Steps", values: Tensor, guess: Tensor, columns: Sequence[int] = (), largest: Tensor | None = None
+    steps: "Steps",
+    values: Tensor,
+    guess: Tensor,
+    columns: Sequence[int] = (),
+    largest: Tensor | None = None,
+    *,
+    patient: bool = True,
 ) -> Closed:
     """Trajectories from their first states on, and their derivatives by some parameters.
 
@@ -93,12 +101,12 @@ def close_gaps(
         guess: States, ``(H, R, K + 1, S)``, of which the first are right.
         columns: Places of the parameters to derive by.
         largest: Where the trajectory goes on from an earlier one, its largest states, ``(H, 1, 1, S)``.
+        patient: Whether to solve the stages anew in every pass where all together does not settle.
     """
     found = _closed(steps, values, guess, columns, largest, nested=False)
-    left = ~found.settled
-    if not steps.solved_for or not bool(left.any()):
+    left = ~(found.settled | found.astray)
+    if not (steps.solved_for and patient and bool(left.any())):
         return found
-    # Where both together do not settle, the stages are solved anew in every pass of the states.
     most = None if largest is None else largest[left]
     for whole, part in zip(found, _closed(steps, values[left], guess[left], columns, most, nested=True), strict=True):
         whole[left] = part
@@ -112,7 +120,7 @@ def _closed(
     states = guess.clone()
     tangents = states.new_full((*states.shape, len(columns)), math.inf)
     begin = steps.first_slopes(values, columns)
-    settled = torch.zeros(len(values), dtype=torch.bool)
+    settled, astray = (torch.zeros(len(values), dtype=torch.bool) for _ in range(2))
     active = torch.isfinite(states).flatten(1).all(-1)
     last = torch.full((len(values),), math.inf, dtype=torch.float64)
     before = states.new_full((len(values), 1, 1, 1), 1e-300) if largest is None else largest.clamp_min(1e-300)
@@ -150,11 +158,14 @@ def _closed(
                 near = (_share_around(change[at], moved[at]) < NEAR) & (here.off[at] < NEAR)
                 ended[at] = small & near if columns else small
         states[rows] = torch.where(good[:, None, None, None], moved, now)
-        settled[rows] = good & ended
         active[rows] = good & ~ended
         done = (good & ended).nonzero()[:, 0]
         tangents[rows[done]] = torch.cat([begin[rows[done]].unsqueeze(2), tangent[done]], dim=2)
-    return Closed(states, settled, tangents)
+        settled[rows[done]] = True
+    done = settled.nonzero()[:, 0]
+    if steps.solved_for and len(done):
+        astray[done] = steps.astray(values[done], states[done], stages[done])
+    return Closed(states, settled & ~astray, tangents, astray)
 
 
 def begun(flow: Tensor, forcing: Tensor, begin: Tensor) -> Tensor:

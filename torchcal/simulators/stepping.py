@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcal.errors import DomainError, SimulatorError
+from torchcal.simulators.steps import inputs_between
 from torchcal.simulators.trajectories import Trajectories
 
 __all__ = [
@@ -337,13 +338,10 @@ def step_errors(simulator: Trajectories, values: Tensor, states: Tensor) -> Tens
     t, h, u = simulator.grid.flat
     first, middle, last = ({name: table[i] for name, table in u.items()} for i in range(3))
 
-    def inputs(a: dict[str, Tensor], b: dict[str, Tensor]) -> dict[str, Tensor]:
-        return {name: torch.stack([a[name], 0.5 * (a[name] + b[name]), b[name]]) for name in a}
-
     p = simulator.layout.by_name(values[None], simulator.grid.step_run)
     begin = states[:, :, :-1].reshape(1, -1, size)
-    half = steps.step(begin, t, 0.5 * h, p, inputs(first, middle))
-    twice = steps.step(half, t + 0.5 * h, 0.5 * h, p, inputs(middle, last))
+    half = steps.step(begin, t, 0.5 * h, p, inputs_between(first, middle))
+    twice = steps.step(half, t + 0.5 * h, 0.5 * h, p, inputs_between(middle, last))
     once = steps.step(begin, t, h, p, u)
     scale = states[0].abs().amax(dim=(0, 1)).clamp_min(1e-300)
     return ((twice - once)[0].abs() / scale).amax(-1).reshape(runs, -1)

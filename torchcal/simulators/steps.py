@@ -25,7 +25,7 @@ from torchcal.simulators.static import asks_for_numbers
 if TYPE_CHECKING:
     from torchcal.simulators.ode import ODESimulator
 
-__all__ = ["COPIED", "POINTS", "SPAN", "Steps"]
+__all__ = ["COPIED", "POINTS", "SPAN", "Steps", "inputs_between"]
 
 #: Points whose derivatives are computed at once: about what a processor's cache holds.
 POINTS = 2**15
@@ -112,6 +112,10 @@ class Steps:
         found = self.step(begin, t, h, self.layout.by_name(values, self.grid.step_run), u)
         return found.reshape(hyper, runs, -1, size), stages, values.new_zeros(hyper)
 
+    def astray(self, values: Tensor, states: Tensor, stages: Tensor) -> Tensor:
+        """Where a step solves its equations but does not go on from where it begins, ``(H,)``."""
+        return torch.zeros(len(values), dtype=torch.bool)
+
     def derivatives(self, values: Tensor, states: Tensor, columns: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Ends of all steps begun at ``states``, and their derivatives by the states and by some parameters.
 
@@ -136,11 +140,18 @@ class Steps:
         size = states.shape[-1]
         return torch.diag_embed(self.grid.h[..., None].expand(len(states), *self.grid.h.shape, size))
 
-    def slopes_at(self, values: Tensor, states: Tensor, t: Tensor, u: dict[str, Tensor]) -> Tensor:
-        """∂ rates / ∂ states ``(H, M, S, S)`` at one state for each step, ``(H, R, K, S)``; t, u ``(M,)``."""
-        run_of = self.grid.step_run
+    def slopes_at(
+        self, values: Tensor, states: Tensor, t: Tensor, u: dict[str, Tensor], at: Tensor | None = None
+    ) -> Tensor:
+        """∂ rates / ∂ states ``(H, M, S, S)`` at one state for each step, ``(H, R, K, S)``; t, u ``(M,)``.
+
+        Of all steps, or of those ``at`` some places.
+        """
+        run_of, points = self.grid.step_run, states.flatten(1, 2)
+        if at is not None:
+            run_of, points, t, u = run_of[at], points[:, at], t[at], {name: table[at] for name, table in u.items()}
         with torch.enable_grad():
-            leaf = states.flatten(1, 2).detach().requires_grad_(True)
+            leaf = points.detach().requires_grad_(True)
             rates = self.rates(t, leaf, self.layout.by_name(values, run_of), u)
             return self.layout.derivatives(rates, leaf, {}, run_of, ())[0]
 
@@ -188,8 +199,8 @@ class Steps:
             return states, torch.cat([self.sensitivities(v, s, columns) for v, s in pieces])
         begin = torch.cat([self.layout.start(values).unsqueeze(2), guess[:, :, 1:]], dim=2)
         pieces = zip(values.split(size), begin.split(size), strict=True)
-        found = [close_gaps(self, v, s, columns) for v, s in pieces]
-        states, settled, tangents = (torch.cat(parts) for parts in zip(*found, strict=True))
+        found = [close_gaps(self, v, s, columns, patient=other is None) for v, s in pieces]
+        states, settled, tangents, _ = (torch.cat(parts) for parts in zip(*found, strict=True))
         if other is not None and not bool(settled.all()):
             left = ~settled
             states[left], tangents[left] = self.solve(values[left], other[left], columns, march=march)
@@ -226,7 +237,7 @@ class Steps:
         while first < self.grid.num_steps:
             part = replace(self, grid=self.grid.part(first, first + span))
             still = begin.unsqueeze(2).expand(-1, -1, part.grid.num_steps + 1, -1)
-            states, settled, _ = close_gaps(part, values, still, largest=largest)
+            states, settled, *_ = close_gaps(part, values, still, largest=largest)
             if bool(settled.all()):
                 longest = min(longest + longest // 8, most)  # what has failed is tried again after a while
                 span, on_foot = min(2 * span, longest), SPAN // 2
@@ -254,6 +265,11 @@ class Steps:
             u = {name: table[:, :, k] for name, table in self.grid.u.items()}
             found.append(self.step(found[-1], self.grid.t[:, k], self.grid.h[:, k], p, u))
         return torch.stack(found, dim=-2)
+
+
+def inputs_between(first: dict[str, Tensor], last: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Inputs at the beginning, middle and end of a step ``(3, M)``, on lines between two of these."""
+    return {name: torch.stack([a, 0.5 * (a + last[name]), last[name]]) for name, a in first.items()}
 
 
 def _advice(error: Exception, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> str:
