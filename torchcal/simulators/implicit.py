@@ -30,8 +30,8 @@ PASSES, SMALL, ROUNDED = 12, 1e-7, 1e-5
 #: others.
 BEGUN = ((13 + 7 * _ROOT) / 3, (13 - 7 * _ROOT) / 3, 1 / 3)
 #: Share of a step's way by which its beginning and its stages may disagree until it is solved again, with how many
-#: halvings at most; and by which it then ends elsewhere.
-ASTRAY, HALVINGS, ELSEWHERE = 0.5, 3, 0.1
+#: halvings at most; by which it then ends elsewhere; and the share of all steps up to which such are looked at.
+ASTRAY, HALVINGS, ELSEWHERE, FEW = 0.5, 3, 0.1, 1 / 8
 #: Share of a state's largest value below which it counts as that large; and of the terms that a gap is the difference
 #: of up to which it is rounding, whatever the states at rest are that it would correct.
 SMALLEST, ROUNDING = 1e-9, 1e-13
@@ -55,7 +55,7 @@ class ImplicitSteps(Steps):
         """As `Steps.step`. One that may not go on from where it begins is solved again, towards where two of half its
         length end, and these the same so often at most."""
         stages = self._stages(s, t, h, p, u)
-        if halvings and len(at := self._doubtful(s, stages, t, h, p, u)[0]):
+        if halvings and len(at := self._doubtful(s, stages, t, h, p, u, most=len(t))[0]):
             s, t, half, p = s[:, at], t[at], 0.5 * h[at], _tiled(p, at, 1, 1)
             first, middle, last = ({name: table[i, at] for name, table in u.items()} for i in range(3))
             between = self.step(s, t, half, p, inputs_between(first, middle), halvings - 1)
@@ -136,7 +136,8 @@ class ImplicitSteps(Steps):
         """As `Steps.astray`: equations of stages may have another solution, as past a pole of the rates."""
         begin = _points(states[:, :, :-1])
         t, h, u = self.grid.flat
-        at, way = self._doubtful(begin, stages, t, h, self.layout.by_name(values, self.grid.step_run), u)
+        p = self.layout.by_name(values, self.grid.step_run)
+        at, way = self._doubtful(begin, stages, t, h, p, u, most=int(FEW * len(t)))
         if not len(at):
             return torch.zeros(len(values), dtype=torch.bool)
         p = self.layout.by_name(values, self.grid.step_run[at])
@@ -144,12 +145,13 @@ class ImplicitSteps(Steps):
         return ((again - stages[:, -1, at]).abs() > ELSEWHERE * way[:, at]).any(-1).any(-1)  # not where it is NaN
 
     def _doubtful(
-        self, s: Tensor, stages: Tensor, t: Tensor, h: Tensor, p: Values, u: dict[str, Tensor]
+        self, s: Tensor, stages: Tensor, t: Tensor, h: Tensor, p: Values, u: dict[str, Tensor], *, most: int
     ) -> tuple[Tensor, Tensor]:
         """Which steps may not go on from where they begin, and how far all of them come at most, ``(H, M, S)``.
 
         The rate where such a step begins, which has no part in its equations, is not the slope that its stages begin
-        with, and that is not for what fades at once, by the slopes of the rates there.
+        with, and that is not for what fades at once, by the slopes of the rates there. Where it is so for more than
+        ``most`` of them none is: all is fast there.
         """
         moved = stages - s.unsqueeze(1)
         way = torch.maximum(moved.abs().amax(1), SMALL * _largest(s))
@@ -157,7 +159,9 @@ class ImplicitSteps(Steps):
         weights = torch.tensor(BEGUN, dtype=s.dtype)
         off = torch.einsum("i,hims->hms", weights, moved) - h[:, None] * self.rates(t, s, p, first)
         at = (off.abs() > ASTRAY * way).any(-1).any(0).nonzero()[:, 0]
-        if len(at):
+        if len(at) > most:
+            at = at[:0]
+        elif len(at):
             with torch.enable_grad():
                 leaf = s[:, at].detach().requires_grad_(True)
                 rates = self.rates(t[at], leaf, _tiled(p, at, 1, 1), {name: table[at] for name, table in first.items()})
