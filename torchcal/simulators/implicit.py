@@ -140,8 +140,8 @@ class ImplicitSteps(Steps):
         at, way = self._doubtful(begin, stages, t, h, p, u, most=int(FEW * len(t)))
         if not len(at):
             return torch.zeros(len(values), dtype=torch.bool)
-        p = self.layout.by_name(values, self.grid.step_run[at])
-        again = self.step(begin[:, at], t[at], h[at], p, {name: table[:, at] for name, table in u.items()}, 1)
+        some = {name: table[:, at] for name, table in u.items()}
+        again = self.step(begin[:, at], t[at], h[at], _tiled(p, at, 1, 1), some, 1)
         return ((again - stages[:, -1, at]).abs() > ELSEWHERE * way[:, at]).any(-1).any(-1)  # not where it is NaN
 
     def _doubtful(
@@ -162,11 +162,8 @@ class ImplicitSteps(Steps):
         if len(at) > most:
             at = at[:0]
         elif len(at):
-            with torch.enable_grad():
-                leaf = s[:, at].detach().requires_grad_(True)
-                rates = self.rates(t[at], leaf, _tiled(p, at, 1, 1), {name: table[at] for name, table in first.items()})
-                slopes = self.layout.derivatives(rates, leaf, {}, t[at], ())[0]
-            push = torch.tensor(NODES, dtype=s.dtype)[:, None] * (h[at, None] * rates.detach()).unsqueeze(2)
+            rates, slopes = self.sloped(t[at], s[:, at], _tiled(p, at, 1, 1), {n: v[at] for n, v in first.items()})
+            push = torch.tensor(NODES, dtype=s.dtype)[:, None] * (h[at, None] * rates).unsqueeze(2)
             matrix = _matrix(slopes.unsqueeze(1).expand(-1, STAGES, -1, -1, -1), h[at])
             line = torch.linalg.solve_ex(matrix, push.flatten(2).unsqueeze(-1))[0].squeeze(-1)
             bent = moved[:, :, at] - line.unflatten(2, (STAGES, -1)).transpose(1, 2)

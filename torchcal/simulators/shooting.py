@@ -163,7 +163,7 @@ def _closed(
         tangents[rows[done]] = torch.cat([begin[rows[done]].unsqueeze(2), tangent[done]], dim=2)
         settled[rows[done]] = True
     done = settled.nonzero()[:, 0]
-    if steps.solved_for and len(done):
+    if len(done):
         astray[done] = steps.astray(values[done], states[done], stages[done])
     return Closed(states, settled & ~astray, tangents, astray)
 

@@ -140,20 +140,16 @@ class Steps:
         size = states.shape[-1]
         return torch.diag_embed(self.grid.h[..., None].expand(len(states), *self.grid.h.shape, size))
 
-    def slopes_at(
-        self, values: Tensor, states: Tensor, t: Tensor, u: dict[str, Tensor], at: Tensor | None = None
-    ) -> Tensor:
-        """∂ rates / ∂ states ``(H, M, S, S)`` at one state for each step, ``(H, R, K, S)``; t, u ``(M,)``.
+    def slopes_at(self, values: Tensor, states: Tensor, t: Tensor, u: dict[str, Tensor]) -> Tensor:
+        """∂ rates / ∂ states ``(H, M, S, S)`` at one state for each step, ``(H, R, K, S)``; t, u ``(M,)``."""
+        return self.sloped(t, states.flatten(1, 2), self.layout.by_name(values, self.grid.step_run), u)[1]
 
-        Of all steps, or of those ``at`` some places.
-        """
-        run_of, points = self.grid.step_run, states.flatten(1, 2)
-        if at is not None:
-            run_of, points, t, u = run_of[at], points[:, at], t[at], {name: table[at] for name, table in u.items()}
+    def sloped(self, t: Tensor, s: Tensor, p: dict[str, Tensor], u: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Rates ``(H, M, S)`` at states ``(H, M, S)`` and their derivatives by these, ``(H, M, S, S)``."""
         with torch.enable_grad():
-            leaf = points.detach().requires_grad_(True)
-            rates = self.rates(t, leaf, self.layout.by_name(values, run_of), u)
-            return self.layout.derivatives(rates, leaf, {}, run_of, ())[0]
+            leaf = s.detach().requires_grad_(True)
+            rates = self.rates(t, leaf, p, u)
+            return rates.detach(), self.layout.derivatives(rates, leaf, {}, t, ())[0]
 
     def difference(self, values: Tensor) -> float:
         """Largest difference between the first steps taken one after another and all at once, relative to the states'.
