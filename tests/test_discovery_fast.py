@@ -12,14 +12,16 @@ from scipy.integrate import solve_ivp
 import torchcal as tc
 from torchcal.discovery.fits import sharpen as sharpening
 from torchcal.discovery.fits.candidates import prepare
+from torchcal.discovery.fits.fitting import fit
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.ranges import drivers_scale
-from torchcal.discovery.fits.sharpen import accurate, sharpen
+from torchcal.discovery.fits.sharpen import accurate, halved, sharpen
 from torchcal.discovery.hypotheses import refitting
 from torchcal.discovery.hypotheses.base import calibrate_base
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.verdicts.decision import Decision
 from torchcal.discovery.verdicts.verdict import _shares
+from torchcal.simulators import focused
 from torchcal.simulators.steps import Steps
 
 F64 = torch.float64
@@ -104,6 +106,67 @@ def test_steps_are_chosen_anew_until_halving_them_changes_nothing():
     assert left > 0  # it says by how much
 
 
+@pytest.fixture
+def in_short_steps():
+    """A calibrated base in steps eight times as short as it needs, of two starts that came to it of three, and what it
+    may err by."""
+    search = Search(Problem.of(heated(), recorded(0.3 * END / (COUNT - 1))), [], {}, 0, 4, 1, lambda text: None, None)
+    search.calibrate_base()
+    base = search.base
+    problem = base.problem.with_simulator(base.problem.simulator.refined(8))
+    found = dataclasses.replace(fit(problem, base.whitening, base.values[None], base.free), agreeing=2 / 3)
+    return found, 0.05 * search.noise.sd[base.problem.index]
+
+
+def test_steps_that_are_much_shorter_than_a_fit_needs_become_longer(in_short_steps):
+    found, allowed = in_short_steps
+    lean, left = sharpen(found, lambda now: allowed, rounds=3)
+    assert left == 0.0
+    assert lean.problem.simulator.num_steps <= 0.6 * found.problem.simulator.num_steps
+    assert ((halved(lean) - lean.y).abs() <= allowed).all()
+    assert ((lean.y - found.y).abs() <= allowed).all()
+    assert lean.agreeing == found.agreeing
+    assert sharpen(lean, lambda now: allowed, rounds=3)[0] is lean
+
+
+def test_steps_that_were_chosen_for_another_orbit_are_not_kept_for_this_one():
+    """The passages of the one are where the other is far away."""
+    problem = Problem.of(orbit(), passages(1.0))
+    grown = problem.with_simulator(problem.simulator)
+    for speed in (0.45, 0.5, 0.55):  # as a search passes by others
+        values = torch.tensor([1.0, speed], dtype=F64)
+        simulator = grown.simulator
+        grown = grown.with_simulator(focused(simulator, values, simulator.solve(values[None]), 1e5))
+    allowed = torch.full((problem.n,), 1e-4, dtype=F64)
+    whitening = problem.whitening(torch.full((problem.n,), 1e-3, dtype=F64), torch.zeros(1, dtype=F64))
+    found = fit(grown, whitening, torch.tensor([[1.0, 0.8]], dtype=F64), [0, 1])
+    lean, left = sharpen(found, lambda now: allowed, rounds=3)
+    assert left == 0.0
+    assert lean.problem.simulator.num_steps <= 0.6 * found.problem.simulator.num_steps
+    assert ((lean.y - problem.y).abs() <= 2 * allowed).all()
+
+
+@pytest.mark.parametrize("why", ["magnified", "wrong", "as many", "lost"])
+def test_steps_stay_short_where_longer_ones_would_not_do(in_short_steps, why, monkeypatch):
+    found, allowed = in_short_steps
+    simulator = found.problem.simulator
+    if why == "magnified":
+        monkeypatch.setattr(sharpening, "magnified", lambda other, *given: other is not simulator)
+    if why == "wrong":
+        right = sharpening._in_steps_of
+
+        def wrong(*given):
+            again = right(*given)
+            return dataclasses.replace(again, y=again.y + 3 * allowed)
+
+        monkeypatch.setattr(sharpening, "_in_steps_of", wrong)
+    if why == "as many":
+        monkeypatch.setattr(sharpening, "spared", lambda *given: simulator)
+    if why == "lost":
+        monkeypatch.setattr(sharpening, "fit", lambda *given: None)
+    assert sharpen(found, lambda now: allowed, rounds=3)[0] is found
+
+
 def test_implicit_steps_that_cannot_be_repeated_are_none(monkeypatch):
     search = Search(Problem.of(heated(), recorded(0.3)), [], {}, 0, 4, 1, lambda text: None, None)
     search.calibrate_base()
@@ -113,6 +176,31 @@ def test_implicit_steps_that_cannot_be_repeated_are_none(monkeypatch):
     lost = dataclasses.replace(base, values=torch.full_like(base.values, math.nan))
     monkeypatch.setattr(sharpening, "fit", lambda *given: lost)  # it met a solution that no other start comes to
     assert sharpening._implicit(base, base.y.abs(), 1) is None
+
+
+def orbit() -> tc.ODESimulator:
+    """A planet of which one coordinate is seen."""
+
+    def rates(t, s, p, u):
+        pull = p["mu"] / (s["x"] ** 2 + s["y"] ** 2) ** 1.5
+        return {"x": s["vx"], "y": s["vy"], "vx": -pull * s["x"], "vy": -pull * s["y"]}
+
+    body = [tc.Parameter("mu", low=0.5, high=2.0, initial=1.0)]
+    return tc.ODESimulator(rates, {"x": "1", "y": "1", "vx": "1", "vy": "1"}, body, observe=("x",))
+
+
+def passages(mu: float, speed: float = 0.8) -> tc.Recording:
+    """Of that, without noise."""
+
+    def rates(t, s):
+        pull = mu / np.hypot(s[0], s[1]) ** 3
+        return [s[2], s[3], -pull * s[0], -pull * s[1]]
+
+    t = np.linspace(0, 12, 61)
+    x = solve_ivp(rates, (0, 12), [1.0, 0.0, 0.0, speed], t_eval=t, rtol=1e-10, atol=1e-12).y[0]
+    at = {"x": 1.0, "y": 0.0, "vx": 0.0}
+    run = tc.Run(time=torch.tensor(t), outputs={"x": torch.tensor(x)}, initial=at)
+    return tc.Recording(runs=[run], noise=0.001)
 
 
 def shares(**given: float) -> tuple[Decision, list]:

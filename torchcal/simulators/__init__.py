@@ -27,6 +27,7 @@ from torchcal.simulators.stepping import (
     outgrown,
     settled,
     settled_implicitly,
+    spared,
     step_errors,
     workable,
 )
@@ -64,6 +65,7 @@ __all__ = [
     "outgrown",
     "settled",
     "settled_implicitly",
+    "spared",
     "step_errors",
     "unknown_name",
     "workable",

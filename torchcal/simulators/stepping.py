@@ -20,6 +20,7 @@ __all__ = [
     "outgrown",
     "settled",
     "settled_implicitly",
+    "spared",
     "step_errors",
     "workable",
 ]
@@ -359,6 +360,41 @@ def focused(simulator: Trajectories, values: Tensor, states: Tensor, excess: flo
         states: Their trajectory, ``(1, R, nodes, S)``.
         excess: By what the error must fall.
     """
+    wanted = _wanted(simulator, values, states, excess)
+    if wanted is None:
+        return simulator.refined(2)
+    factors = [factor.ceil().clamp(1, MOST_DENSER).long() for factor in wanted]
+    if all(bool((factor == 1).all()) for factor in factors):
+        return simulator.refined(2)
+    old = _denser(simulator)
+    return simulator.with_steps(simulator.subdivide, tuple(a * b for a, b in zip(old, factors, strict=True)))
+
+
+def spared(simulator: Trajectories, values: Tensor, states: Tensor, excess: float) -> Trajectories:
+    """The same with longer steps where they err less than others, for an error that is larger by some factor at most.
+
+    Steps that were shortened for one solution may be too short for another. Arguments are those of `focused`; the error
+    may grow to its ``1 / excess``.
+    """
+    wanted = _wanted(simulator, values, states, excess)
+    if wanted is None:
+        return simulator
+    old = [simulator.subdivide * each for each in _denser(simulator)]
+    fewer = tuple((a * b).ceil().long().clamp_min(1).minimum(a) for a, b in zip(old, wanted, strict=True))
+    return simulator.with_steps(1, fewer)
+
+
+def _denser(simulator: Trajectories) -> tuple[Tensor, ...]:
+    """How many times more steps there are in each gap of each run than `Trajectories.subdivide` alone gives."""
+    if simulator.denser is not None:
+        return simulator.denser
+    runs = range(len(simulator.runs))
+    return tuple(torch.ones_like(simulator.grid.steps_between(r)) for r in runs)
+
+
+def _wanted(simulator: Trajectories, values: Tensor, states: Tensor, excess: float) -> list[Tensor] | None:
+    """Factors by which the number of steps in each gap of each run is best changed; None where that cannot be told.
+    Arguments are those of `focused`."""
     runs, error = len(simulator.runs), step_errors(simulator, values, states)
     number = [simulator.grid.steps_between(r) for r in range(runs)]
     gaps = []
@@ -367,15 +403,8 @@ def focused(simulator: Trajectories, values: Tensor, states: Tensor, excess: flo
         gaps.append(torch.zeros(len(counts), dtype=error.dtype).index_add_(0, place, error[r, : len(place)]))
     every = torch.cat(gaps)
     if not bool(torch.isfinite(every).all()) or not float(every.sum()) > 0:
-        return simulator.refined(2)
+        return None
     share = 1.0 / simulator.steps.order
     spread = every.pow(share) * torch.cat(number).double().pow(1.0 - share)
     level = (every.sum() / excess / spread.sum()).pow(1.0 / (1.0 - share))
-    factors = [
-        (gap / (count * level)).pow(share).ceil().clamp(1, MOST_DENSER).long()
-        for gap, count in zip(gaps, number, strict=True)
-    ]
-    if all(bool((factor == 1).all()) for factor in factors):
-        return simulator.refined(2)
-    old = simulator.denser or tuple(torch.ones_like(factor) for factor in factors)
-    return simulator.with_steps(simulator.subdivide, tuple(a * b for a, b in zip(old, factors, strict=True)))
+    return [(gap / (count * level)).pow(share) for gap, count in zip(gaps, number, strict=True)]

@@ -17,6 +17,7 @@ from torchcal.simulators import (
     may_change,
     outgrown,
     settled_implicitly,
+    spared,
     step_errors,
 )
 
@@ -28,6 +29,9 @@ SOLVER_SHARE = 0.05
 ROUNDS = 8
 #: Factor by which the error must become smaller when steps are chosen anew.
 CONVERGING = 4.0
+#: Share of the error that is allowed up to which steps are made longer, lest those of a model with one more term err,
+#: and of their number that must be enough.
+ROOM, FEWER = 0.1, 0.6
 
 
 def accurate(found: Fitted, sd: Tensor) -> bool:
@@ -95,7 +99,8 @@ def sharpen(
         states = simulator.solve(found.values[None], found.warm)
         branch = outgrown(simulator, found.values[None], states)  # of the solution may be another one
         if bool((error <= most).all()) and not branch:
-            return _calm(found, most, states, ROUNDS if patient else 1), 0.0
+            lean = _spared(found, y, most, states)
+            return lean or _calm(found, most, states, ROUNDS if patient else 1), 0.0
         before, share = share, float((error / most).nan_to_num(nan=math.inf).max())
         slow = branch or (number > 0 and not share < before / CONVERGING)
         if slow and (simulator.implicit or fading(simulator, found.values[None], states)):
@@ -109,15 +114,44 @@ def sharpen(
             finer = focused(simulator, found.values, states, 2.0 * share) if finite else simulator.refined(2)
         except DomainError:  # more steps than anyone can take
             break
-        problem = dataclasses.replace(found.problem, simulator=finer)
-        again = fit(problem, found.whitening, found.values[None], found.free)
-        found = found if again is None else again
+        found = _in_steps_of(finer, found) or found
     return found, float(error.max())
+
+
+def _spared(found: Fitted, half: Tensor, allowed: Tensor, states: Tensor) -> Fitted | None:
+    """The fit in longer steps, where those at hand are much shorter than it needs: chosen for a solution that the fit
+    has left, or as short everywhere as in one place. None where they are not.
+
+    Args:
+        found: The fit, whose steps do.
+        half: What it shows with steps half as long, ``(n,)``.
+        allowed: The largest error of every datum, ``(n,)``.
+        states: Its trajectory.
+    """
+    problem, simulator = found.problem, found.problem.simulator
+    error = float(((half - found.y).abs() / allowed).max())
+    if not isinstance(simulator, Trajectories) or simulator.implicit or not 0 < error < ROOM:
+        return None
+    fewer = spared(simulator, found.values, states, error / ROOM)
+    if fewer.num_steps > FEWER * simulator.num_steps:
+        return None
+    again = _in_steps_of(fewer, found)
+    if again is None or magnified(fewer, again.values[None], fewer.solve(again.values[None], again.warm)):
+        return None
+    # Against the shorter steps at hand: where the fit has moved, these may err too.
+    finer = simulator.outputs_of(again.values[None], simulator.solve(again.values[None]))[0, problem.index]
+    return again if bool(((finer - again.y).abs() <= 2 * ROOM * allowed).all()) else None
+
+
+def _in_steps_of(simulator: Trajectories, found: Fitted) -> Fitted | None:
+    """The fit again in other steps; None where these give none."""
+    again = fit(found.problem.with_simulator(simulator), found.whitening, found.values[None], found.free)
+    return None if again is None else dataclasses.replace(again, agreeing=found.agreeing)
 
 
 def _calm(found: Fitted, allowed: Tensor, states: Tensor, rounds: int) -> Fitted:
     """The fit with steps that do not magnify what fades, where there are any: what a term would do there is wrong."""
-    problem, simulator = found.problem, found.problem.simulator
+    simulator = found.problem.simulator
     if not isinstance(simulator, Trajectories) or not magnified(simulator, found.values[None], states):
         return found
     if (again := _implicit(found, allowed, rounds)) is not None:
@@ -125,8 +159,7 @@ def _calm(found: Fitted, allowed: Tensor, states: Tensor, rounds: int) -> Fitted
     calm = calmed(simulator, found.values[None], allowed, states, switch=False)
     if calm is simulator:
         return found
-    again = fit(problem.with_simulator(calm), found.whitening, found.values[None], found.free)
-    return found if again is None else again
+    return _in_steps_of(calm, found) or found
 
 
 def _implicit(found: Fitted, allowed: Tensor, rounds: int) -> Fitted | None:
@@ -139,7 +172,7 @@ def _implicit(found: Fitted, allowed: Tensor, rounds: int) -> Fitted | None:
     other = settled_implicitly(simulator, found.values[None], most, rounds=rounds)
     if other is None:
         return None
-    again = fit(problem.with_simulator(other), found.whitening, found.values[None], found.free)
+    again = _in_steps_of(other, found)
     if again is None or not bool(again.problem.evaluate(again.values[None], [], again.warm)[0].isfinite().all()):
         return None
     return again
