@@ -498,6 +498,7 @@ def test_an_effect_outside_the_library_is_unexplained(among):
     assert d.remaining > 0.2
     assert isinstance(d.missing, MissingRate)
     assert bool((d.missing.values.diff() >= 0).all())
+    assert 0 < d.missing.share <= 1
     assert d.missing.rate.shape == d.missing.sd.shape == d.missing.values.shape
     assert d.where[0].share > 0.3
     assert "not in this library" in str(d).splitlines()[0]

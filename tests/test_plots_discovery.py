@@ -1,6 +1,7 @@
 """Figures of a diagnosis: what is drawn equals what was given, and nothing hides anything else."""
 
 import itertools
+import dataclasses
 import math
 import re
 from types import SimpleNamespace
@@ -588,6 +589,17 @@ def test_panels_of_one_diagnosis_tell_of_one_place_where_they_can():
     d.shifts = [other, first]
     assert drawn(d, "residuals").get_xlabel() == "v [m/s]"  # nothing is known of the other driver
     assert drawn(d, "shift").get_ylabel() == "needed shift of c [1/s], ±1 sd"
+
+
+def test_two_estimates_of_what_is_missing_say_how_much_each_explains():
+    """They may be of different places, and one wave where the other is any curve."""
+    d = oscillator()
+    d.shifts = [dataclasses.replace(d.shifts[0], share=0.99)]
+    d.missing = dataclasses.replace(d.missing, share=0.914)
+    assert drawn(d, "shift").get_title(loc="left") == "removes 99 % of the misfit"
+    assert drawn(d, "missing").get_legend().get_title().get_text() == "removes 91 % of the misfit"
+    d.missing = dataclasses.replace(d.missing, share=math.nan)
+    assert drawn(d, "missing").get_legend().get_title().get_text() == ""
 
 
 def test_an_output_that_changes_with_its_own_size_has_an_axis_with_its_unit():

@@ -324,6 +324,7 @@ class NeededShift:
         shift: Needed shift there, ``(m,)``.
         sd: Its standard deviation, ``(m,)``.
         correlation: Rank correlation of shift and driver.
+        share: Share of the misfit beyond noise that it removes, beside what the base's own parameters do.
     """
 
     parameter: str
@@ -333,6 +334,7 @@ class NeededShift:
     shift: Tensor
     sd: Tensor
     correlation: float
+    share: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,6 +355,7 @@ class MissingRate:
             recording for a static one.
         along: Estimate along that grid, ``(T,)``.
         run: Of a change in one run of several alone, which, counted from 0; the grid is that run's then.
+        share: Share of the misfit beyond noise that it removes, beside what the base's own parameters do.
     """
 
     kind: str
@@ -365,6 +368,7 @@ class MissingRate:
     time: Tensor
     along: Tensor
     run: int | None = None
+    share: float = math.nan
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,7 @@ def needed_shift(
         ax.set_ylim(low - room, high + room)
     unit = f" [{plain(needed.unit)}]" if needed.unit else ""
     name = look.shown(needed.parameter)
-    finish(ax, look.axis(needed.driver), f"needed shift of {name}{unit}, ±1 sd", "")
+    finish(ax, look.axis(needed.driver), f"needed shift of {name}{unit}, ±1 sd", _removes(needed))
     if math.isfinite(finite(needed.correlation, math.nan)):
         ax.set_title(f"rank correlation {needed.correlation:+.2f}".replace("-", "−"), fontsize="small", loc="right")
     return ax
@@ -134,10 +134,17 @@ def missing_rate(
         ax.plot(at, height, color=color, ls=dashes, lw=1.5, label=name, zorder=3)
     target = look.shown(missing.target)
     what = f"missing rate of d{target}/dt" if missing.kind == "equation" else f"missing shift of {target}"
-    finish(ax, look.axis(missing.driver), what + (f" [{plain(missing.unit)}]" if missing.unit else ""), "")
+    unit = f" [{plain(missing.unit)}]" if missing.unit else ""
+    finish(ax, look.axis(missing.driver), what + unit, _removes(missing))
     if legend:
         draw_key(ax)
     return ax
+
+
+def _removes(found: Any) -> str:
+    """How much of the misfit it explains, which tells two estimates apart that are not of one place."""
+    share = finite(getattr(found, "share", math.nan), math.nan)
+    return f"removes {100 * share:.0f} % of the misfit" if math.isfinite(share) else ""
 
 
 def _between_runs(times: np.ndarray) -> list[float]:
