@@ -1,7 +1,7 @@
 """Figures of a diagnosis: what is drawn equals what was given, and nothing hides anything else."""
 
-import itertools
 import dataclasses
+import itertools
 import math
 import re
 from types import SimpleNamespace

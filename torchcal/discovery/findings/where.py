@@ -319,7 +319,8 @@ def needed_shifts(found: Sequence[Place]) -> list[NeededShift]:
         a, b = values[pick], place.profile[pick]
         ranks = torch.stack([_ranks(a), _ranks(b)])
         correlation = float(torch.corrcoef(ranks)[0, 1].nan_to_num()) if len(pick) > 2 else 0.0
-        result.append(NeededShift(name, place.channel.unit, place.driver, a, b, place.sd[pick], correlation, place.share))
+        unit, sd = place.channel.unit, place.sd[pick]
+        result.append(NeededShift(name, unit, place.driver, a, b, sd, correlation, place.share))
     return result[:6]
 
 
@@ -397,6 +398,7 @@ def missing_rate(search: Search, found: Sequence[Place]) -> MissingRate | None:
         values, rate, sd = channel.drivers[place.driver], place.profile * size, place.sd * size.abs()
         order = values.argsort(stable=True)
         return MissingRate(
-            kind, target, place.driver, values[order], rate[order], sd[order], unit, channel.time, rate, place.run, place.share
-        )
+            kind, target, place.driver, values[order], rate[order], sd[order], unit, channel.time, rate,
+            run=place.run, share=place.share,
+        )  # fmt: skip
     return None
