@@ -3,13 +3,14 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from torchcal.simulators.layout import Values
+from torchcal.simulators.layout import Values, stacked
 from torchcal.simulators.shooting import Pass
-from torchcal.simulators.steps import COPIED, SPAN, Steps, inputs_between
+from torchcal.simulators.steps import SPAN, Steps, inputs_between
 
 __all__ = ["ImplicitSteps"]
 
@@ -56,7 +57,7 @@ class ImplicitSteps(Steps):
         length end, and these the same so often at most."""
         stages = self._stages(s, t, h, p, u)
         if halvings and len(at := self._doubtful(s, stages, t, h, p, u, most=len(t))[0]):
-            s, t, half, p = s[:, at], t[at], 0.5 * h[at], _tiled(p, at, 1, 1)
+            s, t, half, p = s[:, at], t[at], 0.5 * h[at], _tiled(p, at, 1)
             first, middle, last = ({name: table[i, at] for name, table in u.items()} for i in range(3))
             between = self.step(s, t, half, p, inputs_between(first, middle), halvings - 1)
             end = self.step(between, t + half, half, p, inputs_between(middle, last), halvings - 1)
@@ -121,10 +122,10 @@ class ImplicitSteps(Steps):
     def corrected(self, values: Tensor, states: Tensor, stages: Tensor, here: Pass) -> tuple[Tensor, Tensor, Tensor]:
         """As `Steps.corrected`."""
         begin = _points(states[:, :, :-1])
-        t, h, u = self.grid.flat
+        (t, u), h = self.stage_inputs, self.grid.flat[1]
         lu, pivots, slopes = here.factors
-        p = _tiled(self.layout.by_name(values, self.grid.step_run), torch.arange(len(t)), 1)
-        f = self.rates(_times(t, h), stages.flatten(1, 2), p, _inputs(u)).unflatten(1, (STAGES, -1))
+        p = _tiled(self.layout.by_name(values, self.grid.step_run), torch.arange(len(h)))
+        f = self.rates(t, stages.flatten(1, 2), p, u).unflatten(1, (STAGES, -1))
         gap = _gap(begin, stages, f, h)
         right = gap.transpose(1, 2).flatten(2, 3).unsqueeze(-1)
         change = torch.linalg.lu_solve(lu, pivots, right).squeeze(-1).unflatten(2, (STAGES, -1)).transpose(1, 2)
@@ -141,7 +142,7 @@ class ImplicitSteps(Steps):
         if not len(at):
             return torch.zeros(len(values), dtype=torch.bool)
         some = {name: table[:, at] for name, table in u.items()}
-        again = self.step(begin[:, at], t[at], h[at], _tiled(p, at, 1, 1), some, 1)
+        again = self.step(begin[:, at], t[at], h[at], _tiled(p, at, 1), some, 1)
         return ((again - stages[:, -1, at]).abs() > ELSEWHERE * way[:, at]).any(-1).any(-1)  # not where it is NaN
 
     def _doubtful(
@@ -162,7 +163,7 @@ class ImplicitSteps(Steps):
         if len(at) > most:
             at = at[:0]
         elif len(at):
-            rates, slopes = self.sloped(t[at], s[:, at], _tiled(p, at, 1, 1), {n: v[at] for n, v in first.items()})
+            rates, slopes = self.sloped(t[at], s[:, at], _tiled(p, at, 1), {n: v[at] for n, v in first.items()})
             push = torch.tensor(NODES, dtype=s.dtype)[:, None] * (h[at, None] * rates).unsqueeze(2)
             matrix = _matrix(slopes.unsqueeze(1).expand(-1, STAGES, -1, -1, -1), h[at])
             line = torch.linalg.solve_ex(matrix, push.flatten(2).unsqueeze(-1))[0].squeeze(-1)
@@ -205,16 +206,15 @@ class ImplicitSteps(Steps):
     def _at_stages(self, values: Tensor, stages: Tensor, columns: Sequence[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Rates ``(H, 3, M, S)`` at stages of all steps, and their derivatives by state and by some parameters."""
         size = stages.shape[-1]
+        rates, slopes = self.at_stages(values, stages.permute(3, 0, 1, 2).contiguous(), columns)
+        found = stacked(slopes, rates[0])
+        return torch.stack(rates, dim=-1), found[..., :size], found[..., size:]
+
+    @cached_property
+    def stage_inputs(self) -> tuple[Tensor, dict[str, Tensor]]:
+        """As `Steps.stage_inputs`."""
         t, h, u = self.grid.flat
-        every, flat = self.grid.step_run.repeat(STAGES), stages.flatten(1, 2)
-        with torch.enable_grad():
-            copies = size if flat.numel() <= COPIED else 1
-            leaf = flat.repeat(copies, 1, 1).requires_grad_(True)
-            leaves = self.layout.leaves(values.repeat(copies, 1), every, columns)
-            rates = self.rates(_times(t, h), leaf, leaves, _inputs(u))
-            slopes, pushes = self.layout.derivatives(rates, leaf, leaves, every, columns, copied=copies > 1)
-        found = (rates[: len(flat)].detach(), slopes, pushes)
-        return tuple(part.unflatten(1, (STAGES, -1)) for part in found)  # type: ignore[return-value]
+        return _times(t, h), _inputs(u)
 
     def _stages(
         self, s: Tensor, t: Tensor, h: Tensor, p: Values, u: dict[str, Tensor], guess: Tensor | None = None
@@ -227,22 +227,18 @@ class ImplicitSteps(Steps):
         at = torch.arange(s.shape[1])  # the points that are not settled, in one row at least
         for _ in range(PASSES):
             now, step = stages[:, :, at], h[at]
-            copies = size if now.numel() <= COPIED else 1
-            times = _times(t[at], step)
-            with torch.enable_grad():
-                leaf = now.flatten(1, 2).repeat(copies, 1, 1).requires_grad_(True)
-                rates = self.rates(times, leaf, _tiled(p, at, copies), _inputs({n: v[:, at] for n, v in u.items()}))
-                slopes, _ = self.layout.derivatives(rates, leaf, {}, times, (), copied=copies > 1)
-            f, slopes = rates[: len(s)].detach().unflatten(1, (STAGES, -1)), slopes.unflatten(1, (STAGES, -1))
+            inputs = _inputs({name: table[:, at] for name, table in u.items()})
+            found = self.sloped(_times(t[at], step), now.flatten(1, 2), _tiled(p, at), inputs)
+            f, slopes = (part.unflatten(1, (STAGES, -1)) for part in found)
             gap = _gap(s[:, at], now, f, step)
             right = gap.transpose(1, 2).flatten(2, 3).unsqueeze(-1)
             change = torch.linalg.solve_ex(_matrix(slopes, step), right)[0]
             change = change.squeeze(-1).unflatten(2, (STAGES, size)).transpose(1, 2)
             stages[:, :, at] = now + change
-            found = _share(largest, stages[:, :, at], change, gap, slopes, step)
-            settled = (found < SMALL) | ((found < ROUNDED) & (found > 0.5 * share[:, at]))
-            share[:, at] = found
-            at = at[(~settled & found.isfinite()).any(0)]
+            now_share = _share(largest, stages[:, :, at], change, gap, slopes, step)
+            settled = (now_share < SMALL) | ((now_share < ROUNDED) & (now_share > 0.5 * share[:, at]))
+            share[:, at] = now_share
+            at = at[(~settled & now_share.isfinite()).any(0)]
             if not len(at):
                 break
         return stages.masked_fill(~(share < ROUNDED)[:, None, :, None], math.nan)
@@ -309,9 +305,8 @@ def _inputs(u: dict[str, Tensor]) -> dict[str, Tensor]:
     }
 
 
-def _tiled(p: Values, at: Tensor, copies: int, stages: int = STAGES) -> Values:
-    """Parameters of points as those of the stages of some of them, so many times."""
+def _tiled(p: Values, at: Tensor, stages: int = STAGES) -> Values:
+    """Parameters of points as those of the stages of some of them."""
     start = p.start[at].repeat(stages) if isinstance(p.start, Tensor) else p.start
-    tiled = {name: (v[..., at].repeat(copies, stages) if v.shape[-1] > 1 else v.repeat(copies, 1))
-             for name, v in p.items()}  # fmt: skip
+    tiled = {name: v[..., at].repeat(1, stages) if v.shape[-1] > 1 else v for name, v in p.items()}
     return Values(tiled, p.first, start)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -17,7 +17,7 @@ from torchcal.simulators.parameter import Parameter, in_run
 if TYPE_CHECKING:
     from torchcal.simulators.ode import ODESimulator
 
-__all__ = ["Layout", "Values", "initial_name"]
+__all__ = ["Layout", "Values", "initial_name", "spread", "stacked"]
 
 
 class Values(dict[str, Any]):
@@ -137,45 +137,41 @@ class Layout:
         found = self._values(run_of)
         for name, places in self._places.items():
             block = values[..., places]
-            spread = block.expand(-1, len(run_of)) if len(places) == 1 else block[..., run_of]
+            every = block.expand(-1, len(run_of)) if len(places) == 1 else block[..., run_of]
             if wanted & set(places):
-                found[name] = spread.clone().requires_grad_(True)
+                found[name] = every.clone().requires_grad_(True)
             else:
-                found[name] = block if len(places) == 1 else spread
+                found[name] = block if len(places) == 1 else every
         return found
 
     def derivatives(
         self,
-        result: Tensor,
-        begin: Tensor,
-        leaves: dict[str, Tensor],
+        results: Sequence[Tensor],
+        begin: Sequence[Tensor],
+        leaves: Mapping[str, Tensor],
         run_of: Tensor,
         columns: Sequence[int],
-        *,
-        copied: bool = False,
-    ) -> tuple[Tensor, Tensor]:
-        """Derivatives of pointwise results ``(H, M, O)`` by states ``(H, M, O, S)`` and columns ``(H, M, O, C)``.
+    ) -> list[list[Tensor | None]]:
+        """Derivatives of pointwise results ``(H, M)``: of each those by the states, one after another, and by columns,
+        every one ``(H, M)``, or None where the result does not depend on it.
 
-        Every point depends on its own state and parameters alone, so that one backward pass for each component of the
-        result gives the derivatives at all points. Where everything is ``copied``, ``(O H, M)``, as many times as the
-        result has components, each copy takes one of them, and a single pass gives all.
+        Every point depends on its own state and parameters alone, so that one backward pass for each result gives the
+        derivatives at all points.
         """
         names = [name for name, leaf in leaves.items() if leaf.requires_grad]
-        by_state, by_column = [], []
-        inputs = [begin, *(leaves[name] for name in names)]
-        for part, grads in (_from_copies if copied else _one_by_one)(result, inputs):
-            by_state.append(begin.new_zeros(*part.shape, begin.shape[-1]) if grads[0] is None else grads[0])
-            own = dict(zip(names, grads[1:], strict=True))
-            rows = []
+        inputs, found = [*begin, *(leaves[name] for name in names)], []
+        for k, part in enumerate(results):
+            grads: Sequence[Tensor | None] = [None] * len(inputs)
+            if part.requires_grad:
+                grads = torch.autograd.grad(part.sum(), inputs, retain_graph=k + 1 < len(results), allow_unused=True)
+            own = dict(zip(names, grads[len(begin) :], strict=True))
+            row = list(grads[: len(begin)])
             for column in columns:
                 name, run = self.origins[column]
                 grad = own.get(name) if column < self._own else None  # initial states act on no rate
-                if grad is None:
-                    rows.append(torch.zeros_like(part))
-                else:
-                    rows.append(grad if run is None else grad * (run_of == run))
-            by_column.append(torch.stack(rows, dim=-1) if rows else part.new_zeros(*part.shape, 0))
-        return torch.stack(by_state, dim=-2), torch.stack(by_column, dim=-2)
+                row.append(grad if grad is None or run is None else grad * (run_of == run))
+            found.append(row)
+        return found
 
     def start(self, values: Tensor) -> Tensor:
         """Initial states ``(H, R, S)``."""
@@ -230,29 +226,20 @@ class Layout:
         return torch.stack(rows, dim=1).unflatten(1, start.shape[1:])
 
 
-_Component = tuple[Tensor, Sequence[Tensor | None]]
-"""Of a result, ``(H, M)``, and its slopes along some inputs, None where it does not depend on one."""
+def stacked(rows: Sequence[Sequence[Tensor | None]], like: Tensor) -> Tensor:
+    """Derivatives as of `Layout.derivatives`, each of the shape of one, ``like``, in one tensor ``(..., results, states
+    and columns)``."""
+    if not rows[0]:
+        return like.new_zeros(*like.shape, len(rows), 0)
+    zero = torch.zeros_like(like)
+    every = torch.stack([zero if one is None else one for row in rows for one in row])
+    return every.unflatten(0, (len(rows), -1)).movedim((0, 1), (-2, -1)).contiguous()
 
 
-def _one_by_one(result: Tensor, inputs: Sequence[Tensor]) -> Iterator[_Component]:
-    """Components of a result ``(H, M, O)``, a backward pass for each."""
-    count = result.shape[-1]
-    for k, part in enumerate(result.unbind(-1)):
-        grads: Sequence[Tensor | None] = [None] * len(inputs)
-        if part.requires_grad:
-            grads = torch.autograd.grad(part.sum(), inputs, retain_graph=k + 1 < count, allow_unused=True)
-        yield part, grads
-
-
-def _from_copies(result: Tensor, inputs: Sequence[Tensor]) -> Iterator[_Component]:
-    """The same of O copies ``(O H, M, O)``, in one pass."""
-    count = result.shape[-1]
-    parts = result.unflatten(0, (count, -1)).diagonal(dim1=0, dim2=-1)  # (H, M, O)
-    grads: Sequence[Tensor | None] = [None] * len(inputs)
-    if parts.requires_grad:
-        grads = torch.autograd.grad(parts.sum(), inputs, allow_unused=True)
-    for k, part in enumerate(parts.unbind(-1)):
-        yield part, [None if grad is None else grad.unflatten(0, (count, -1))[k] for grad in grads]
+def spread(states: Tensor) -> list[Tensor]:
+    """Each of some states ``(..., S)`` by itself, as a leaf of a graph."""
+    own = states.detach().movedim(-1, 0).clone(memory_format=torch.contiguous_format)
+    return [one.requires_grad_(True) for one in own.unbind(0)]
 
 
 def initial_name(state: str, run: int, runs: int) -> str:

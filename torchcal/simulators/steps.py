@@ -7,6 +7,7 @@ by step.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -16,7 +17,7 @@ from torchcal.display import raised
 from torchcal.errors import SimulatorError, TorchcalError
 from torchcal.simulators.careful import careful, real, unknown_name
 from torchcal.simulators.grid import Grid
-from torchcal.simulators.layout import Layout, Values
+from torchcal.simulators.layout import Layout, Values, spread, stacked
 from torchcal.simulators.parameter import spans
 from torchcal.simulators.recurrence import recur
 from torchcal.simulators.shooting import Pass, begun, close_gaps
@@ -25,13 +26,13 @@ from torchcal.simulators.static import asks_for_numbers
 if TYPE_CHECKING:
     from torchcal.simulators.ode import ODESimulator
 
-__all__ = ["COPIED", "POINTS", "SPAN", "Steps", "inputs_between"]
+__all__ = ["POINTS", "SPAN", "Steps", "inputs_between"]
 
 #: Points whose derivatives are computed at once: about what a processor's cache holds.
 POINTS = 2**15
-#: Numbers up to which an operation costs its call and little more: copies of all points, one for each state, up to this
-#: take less time than a backward pass for each.
-COPIED = 2**13
+#: Where the stages of a step lie, as shares of it, each by the rates at the one before; which of the inputs at its
+#: beginning, middle and end act there; and what their rates weigh.
+SHARES, INPUTS, WEIGHTS = (0.0, 0.5, 0.5, 1.0), (0, 1, 1, 2), (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 #: Steps of the first span that is tried where there is no guess.
 SPAN = 64
 #: Trajectories times the derivatives that a pass needs of each, above which a step costs less than its share of passes.
@@ -58,8 +59,15 @@ class Steps:
 
     def rates(self, t: Tensor, s: Tensor, p: dict[str, Tensor], u: dict[str, Tensor]) -> Tensor:
         """Rates ``(H, M, states)`` at states ``(H, M, states)``."""
+        return torch.stack(self.rates_of(t, s.unbind(-1), p, u), dim=-1)
+
+    def rates_of(
+        self, t: Tensor, s: Sequence[Tensor], p: dict[str, Tensor], u: dict[str, Tensor]
+    ) -> list[Tensor]:
+        """The same of each state by itself, ``(H, M)``."""
         names = tuple(self.ode.states)
-        named = {name: s[..., i] for i, name in enumerate(names)}
+        named = dict(zip(names, s, strict=True))
+        shape = s[0].shape  # (batch, runs)
         try:
             rates = careful(self.ode.seen, "rates(t, s, p, u)", self.ode.rates, t=t, s=named, p=p.copy(), u=u)
         except TorchcalError:  # a term's, which says what to do
@@ -67,14 +75,13 @@ class Steps:
         except Exception as error:
             raise SimulatorError(
                 f"Expected rates(t, s, p, u) to return the rates by state. It raised {raised(error)}. "
-                f"It was called with states of shape {tuple(s.shape[:-1])} ({spans(named)}) and parameters "
+                f"It was called with states of shape {tuple(shape)} ({spans(named)}) and parameters "
                 f"of shape {tuple(next(iter(p.values())).shape)} ({spans(p)}).{_advice(error, named, p, u)}"
             ) from error
         if not isinstance(rates, Mapping) or set(rates) != set(names):
             got = list(rates) if isinstance(rates, Mapping) else type(rates).__name__
             raise SimulatorError(f"Expected the rates of {list(names)} as a dict. Got {got}.")
-        shape = s.shape[:-1]  # (batch, runs)
-        return torch.stack([real(rates[name], s, shape, f"the rate of {name!r}") for name in names], dim=-1)
+        return [real(rates[name], s[0], shape, f"the rate of {name!r}") for name in names]
 
     def step(self, s: Tensor, t: Tensor, h: Tensor, p: Values, u: dict[str, Tensor]) -> Tensor:
         """One Runge–Kutta step of every point ``(H, M, states)``; t, h ``(M,)``, u ``(3, M)``."""
@@ -122,18 +129,65 @@ class Steps:
         Returns ends ``(H, R, K, S)``, flow ``(H, R, K, S, S)`` and forcing ``(H, R, K, S, len(columns))``.
         """
         hyper, runs, _, size = states.shape
-        steps = self.grid.num_steps
-        run_of = self.grid.step_run
+        h = self.grid.flat[1]
+        stages = self._staged(values, states)
+        rates, slopes = self.at_stages(values, stages, columns)
+        weights = h * torch.tensor(WEIGHTS, dtype=h.dtype)[:, None]
+        ends = stages[:, :, 0] + (torch.stack(rates) * weights).sum(2)
+        # What a change of each state or parameter makes of a stage, by way of the one before.
+        before = h.new_zeros(size, size + len(columns), hyper, len(h))
+        moved = torch.zeros_like(before)
+        for k, (share, weight) in enumerate(zip(SHARES, WEIGHTS, strict=True)):
+            now = torch.zeros_like(moved)
+            for i, row in enumerate(slopes):
+                for j, slope in enumerate(row):
+                    if slope is None:
+                        continue
+                    own = h * slope[:, k]
+                    now[i, j] += own
+                    if share and j < size:
+                        now[i].addcmul_(own, before[j], value=share)
+            moved.add_(now, alpha=weight)
+            before = now
+        moved.diagonal().add_(1.0)
+        shape = (hyper, runs, self.grid.num_steps, size)
+        moved = moved.permute(2, 3, 0, 1).reshape(*shape, -1)
+        return ends.permute(1, 2, 0).reshape(shape), moved[..., :size], moved[..., size:]
+
+    def _staged(self, values: Tensor, states: Tensor) -> Tensor:
+        """Where a step from each state looks at its rates, ``(S, H, 4, M)``."""
         t, h, u = self.grid.flat
-        copies = size if hyper * runs * steps * size <= COPIED else 1
+        p = self.layout.by_name(values, self.grid.step_run)
+        begin = states[:, :, :-1].flatten(1, 2).movedim(-1, 0).contiguous()
+        stages = [begin]
+        for k, share in enumerate(SHARES[1:]):
+            now = {name: table[INPUTS[k]] for name, table in u.items()}
+            rates = self.rates_of(t + SHARES[k] * h, stages[-1].unbind(0), p, now)
+            stages.append(begin + share * h * torch.stack(rates))
+        return torch.stack(stages, dim=2)
+
+    def at_stages(
+        self, values: Tensor, stages: Tensor, columns: Sequence[int]
+    ) -> tuple[list[Tensor], list[list[Tensor | None]]]:
+        """Rates at the stages ``(S, H, N, M)`` of all steps, each ``(H, N, M)``, and their derivatives by every state
+        and by some parameters, as of `Layout.derivatives`."""
+        shape = stages.shape[2:]
+        every = self.grid.step_run.repeat(shape[0])
+        t, u = self.stage_inputs
         with torch.enable_grad():
-            begin = states[:, :, :-1].reshape(hyper, runs * steps, size).detach()
-            begin = begin.repeat(copies, 1, 1).requires_grad_(True)
-            leaves = self.layout.leaves(values.repeat(copies, 1), run_of, columns)
-            ends = self.step(begin, t, h, leaves, u)
-            flow, forcing = self.layout.derivatives(ends, begin, leaves, run_of, columns, copied=copies > 1)
-        shape = (hyper, runs, steps, size)
-        return ends[:hyper].detach().reshape(shape), flow.reshape(*shape, size), forcing.reshape(*shape, len(columns))
+            begin = [one.flatten(1).requires_grad_(True) for one in stages.detach().unbind(0)]
+            leaves = self.layout.leaves(values, every, columns)
+            rates = self.rates_of(t, begin, leaves, u)
+            slopes = self.layout.derivatives(rates, begin, leaves, every, columns)
+        found = [[None if one is None else one.unflatten(1, shape) for one in row] for row in slopes]
+        return [one.detach().unflatten(1, shape) for one in rates], found
+
+    @cached_property
+    def stage_inputs(self) -> tuple[Tensor, dict[str, Tensor]]:
+        """Times ``(N M,)`` of all stages of all steps, and inputs there."""
+        t, h, u = self.grid.flat
+        times = torch.cat([t + share * h for share in SHARES])
+        return times, {name: torch.cat([table[place] for place in INPUTS]) for name, table in u.items()}
 
     def kicks(self, values: Tensor, states: Tensor) -> Tensor:
         """What a force of 1 in each equation, throughout a step, does to the end of the step, ``(H, R, K, S, S)``."""
@@ -147,9 +201,10 @@ class Steps:
     def sloped(self, t: Tensor, s: Tensor, p: dict[str, Tensor], u: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Rates ``(H, M, S)`` at states ``(H, M, S)`` and their derivatives by these, ``(H, M, S, S)``."""
         with torch.enable_grad():
-            leaf = s.detach().requires_grad_(True)
-            rates = self.rates(t, leaf, p, u)
-            return rates.detach(), self.layout.derivatives(rates, leaf, {}, t, ())[0]
+            begin = spread(s)
+            rates = self.rates_of(t, begin, p, u)
+            slopes = self.layout.derivatives(rates, begin, {}, t, ())
+        return torch.stack(rates, dim=-1).detach(), stacked(slopes, begin[0])
 
     def difference(self, values: Tensor) -> float:
         """Largest difference between the first steps taken one after another and all at once, relative to the states'.

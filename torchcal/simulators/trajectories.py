@@ -13,7 +13,7 @@ from torchcal.errors import DomainError, RecordingError, SimulatorError
 from torchcal.simulators.careful import careful, real, unknown_name
 from torchcal.simulators.grid import Grid
 from torchcal.simulators.implicit import ImplicitSteps
-from torchcal.simulators.layout import Layout
+from torchcal.simulators.layout import Layout, spread, stacked
 from torchcal.simulators.solution import Solution
 from torchcal.simulators.static import Conditions, Linearisation, Simulator, check_values
 from torchcal.simulators.steps import POINTS, Steps
@@ -239,7 +239,7 @@ class Trajectories(Simulator):
     def readings(self, values: Tensor, start: Tensor) -> Tensor:
         """Recorded outputs ``(H, n_total)`` at all samples, of states ``(H, R, S)`` that stay as they begin."""
         p = self.layout.by_name(values, self.grid.run_of)
-        return self._measure(p, start[:, self.grid.run_of], self.recording.outputs)
+        return torch.cat(self._measure(p, start[:, self.grid.run_of].unbind(-1), self.recording.outputs), dim=-1)
 
     def along(self, states: Tensor) -> dict[str, Tensor]:
         """Time, states and inputs at the ends of all steps, each ``(R, K + 1)``; of one solution."""
@@ -254,10 +254,11 @@ class Trajectories(Simulator):
         run_of = self.grid.step_run
         t, _, u = self.grid.flat
         with torch.enable_grad():
-            begin = states[:, :, :-1].reshape(hyper, -1, size).detach().requires_grad_(True)
+            begin = spread(states[:, :, :-1].flatten(1, 2))
             leaves = self.layout.leaves(values, run_of, columns)
-            rates = self.steps.rates(t, begin, leaves, {name: table[0] for name, table in u.items()})
-            _, found = self.layout.derivatives(rates, begin, leaves, run_of, columns)
+            rates = self.steps.rates_of(t, begin, leaves, {name: table[0] for name, table in u.items()})
+            rows = self.layout.derivatives(rates, begin, leaves, run_of, columns)
+        found = stacked([row[size:] for row in rows], begin[0])
         return found.reshape(hyper, runs, self.num_steps, size, len(columns))
 
     def flow(self, values: Tensor, states: Tensor) -> Tensor:
@@ -276,17 +277,14 @@ class Trajectories(Simulator):
         """Outputs ``(H, n_total)`` and their derivatives ``(H, n_total, len(columns))``."""
         seen = states[:, self.grid.run_of, self.grid.node_of]  # (H, n, S)
         if tangents is None:
-            found = self._measure(self.layout.by_name(values, self.grid.run_of), seen, outputs)
+            parts = self._measure(self.layout.by_name(values, self.grid.run_of), seen.unbind(-1), outputs)
+            found = torch.cat(parts, dim=-1)
             return found, found.new_zeros(*found.shape, 0)
         moved = tangents[:, self.grid.run_of, self.grid.node_of]  # (H, n, S, C)
-        with torch.enable_grad():
-            begin = seen.detach().requires_grad_(True)
-            leaves = self.layout.leaves(values, self.grid.run_of, columns)
-            y = self._measure(leaves, begin, outputs)  # (H, outputs * n)
-            parts = torch.stack(y.split(seen.shape[1], dim=-1), dim=-1)
-            by_state, by_column = self.layout.derivatives(parts, begin, leaves, self.grid.run_of, columns)
-        jacobian = by_state @ moved + by_column  # (H, n, outputs, C)
-        return y.detach(), jacobian.transpose(1, 2).flatten(1, 2)
+        y, by_each = self._measured_slopes(values, seen, outputs, columns)
+        size = seen.shape[-1]
+        jacobian = by_each[..., :size] @ moved + by_each[..., size:]  # (H, n, outputs, C)
+        return y, jacobian.transpose(1, 2).flatten(1, 2)
 
     def observation_slopes(
         self, values: Tensor, states: Tensor, outputs: Sequence[str], columns: Sequence[int] = ()
@@ -294,13 +292,20 @@ class Trajectories(Simulator):
         """∂ output / ∂ state at every datum, ``(n_total, S)``, and by some parameters with the states as they are,
         ``(n_total, len(columns))``; one row of values."""
         seen = states[:, self.grid.run_of, self.grid.node_of]
+        by_each = self._measured_slopes(values, seen, outputs, columns)[1][0].transpose(0, 1).flatten(0, 1)
+        return by_each[:, : seen.shape[-1]], by_each[:, seen.shape[-1] :]
+
+    def _measured_slopes(
+        self, values: Tensor, seen: Tensor, outputs: Sequence[str], columns: Sequence[int]
+    ) -> tuple[Tensor, Tensor]:
+        """Outputs ``(H, n_total)`` of the states ``(H, n, S)`` at all samples, and their derivatives by states and
+        columns, ``(H, n, outputs, S + C)``."""
         with torch.enable_grad():
-            begin = seen.detach().requires_grad_(True)
+            begin = spread(seen)
             leaves = self.layout.leaves(values, self.grid.run_of, columns)
-            y = self._measure(leaves, begin, outputs)
-            parts = torch.stack(y.split(seen.shape[1], dim=-1), dim=-1)
-            by_state, by_column = self.layout.derivatives(parts, begin, leaves, self.grid.run_of, columns)
-        return by_state[0].transpose(0, 1).flatten(0, 1), by_column[0].transpose(0, 1).flatten(0, 1)
+            parts = self._measure(leaves, begin, outputs)
+            rows = self.layout.derivatives(parts, begin, leaves, self.grid.run_of, columns)
+        return torch.cat(parts, dim=-1).detach(), stacked(rows, begin[0])
 
     def slopes(self, values: Tensor, start: Tensor) -> Tensor:
         """Rates of all states at the beginning of every run, ``(H, R, states)``, at states ``(H, R, states)``."""
@@ -337,8 +342,9 @@ class Trajectories(Simulator):
             "values, or narrow the parameters' bounds or give initial=."
         )
 
-    def _measure(self, p: dict[str, Tensor], seen: Tensor, outputs: Sequence[str]) -> Tensor:
-        s = {name: seen[..., i] for i, name in enumerate(self._states)}
+    def _measure(self, p: dict[str, Tensor], seen: Sequence[Tensor], outputs: Sequence[str]) -> list[Tensor]:
+        """Each of some outputs ``(H, n)`` of the states ``(H, n)`` at all samples."""
+        s = dict(zip(self._states, seen, strict=True))
         parts = []
         for name in outputs:
             try:
@@ -358,8 +364,8 @@ class Trajectories(Simulator):
                     f"Expected the output {name!r} as a tensor. Its function raised {raised(error)}."
                     f"{unknown_name(error, s, p, self.grid.sample_u)}"
                 ) from error
-            parts.append(real(value, seen, seen.shape[:-1], f"the output {name!r}"))
-        return torch.cat(parts, dim=-1)
+            parts.append(real(value, seen[0], seen[0].shape, f"the output {name!r}"))
+        return parts
 
 
 class _WithJacobian(torch.autograd.Function):
