@@ -640,3 +640,41 @@ def test_a_first_guess_that_fades_within_a_step_is_solved_with_steps_that_do_not
     found = workable(bound, tensor(1.0)[None], allowed, halvings=2)
     assert found.implicit is (stiff is None)
     assert float((found.at(found.x)(tensor(1.0)) - 100 * torch.exp(-torch.as_tensor(t))).abs().max()) < 3.0
+
+
+@pytest.mark.parametrize("rise", [0.0, 2e-3])
+def test_a_state_that_stays_zero_is_no_obstacle_where_others_depend_on_it(rise):
+    """A winding's warming changes a current that settles within a step, whose equation is the pivot of the warming."""
+
+    def rates(t, s, p, u):
+        drop = p["R"] * (1 + s["hot"]) * s["i"]
+        return {
+            "w": (0.06 * s["i"] - 1e-4 * s["w"]) / 3e-4,
+            "i": (u["V"] - drop - 0.06 * s["w"]) / 1e-2,
+            "hot": p["r"] * s["i"] ** 2 - s["hot"] / 8.0,
+        }
+
+    motor = tc.ODESimulator(
+        rates, {"w": "rad/s", "i": "A", "hot": "1"}, [tc.Parameter("R"), tc.Parameter("r")], observe=("w",), stiff=True
+    )
+    t = torch.linspace(0, 2, 21, dtype=torch.float64)
+    volts = 4.0 + 8.0 * (t % 1 < 0.5)
+    zero = {"w": 0.0, "i": 0.0, "hot": 0.0}
+    run = tc.Run(time=t, outputs={"w": torch.zeros_like(t)}, inputs={"V": volts}, initial=zero, hold="zero")
+    bound = motor.bind(tc.Recording(runs=[run], noise=1.0)).refined(4)
+    found = bound.solve(torch.tensor([[1.2, rise]], dtype=torch.float64))[0, 0]
+    level = {"V": 0.0}
+
+    def told(t, s):
+        return [
+            (0.06 * s[1] - 1e-4 * s[0]) / 3e-4, (level["V"] - 1.2 * (1 + s[2]) * s[1] - 0.06 * s[0]) / 1e-2,
+            rise * s[1] ** 2 - s[2] / 8.0,
+        ]  # fmt: skip
+
+    wanted, state = [0.0], [0.0, 0.0, 0.0]
+    for k in range(20):
+        level["V"] = float(volts[k])
+        state = solve_ivp(told, (float(t[k]), float(t[k + 1])), state, rtol=1e-9, atol=1e-12, method="LSODA").y[:, -1]
+        wanted.append(state[0])
+    there = found[bound.grid.node_of, 0]
+    torch.testing.assert_close(there, torch.tensor(wanted, dtype=torch.float64), rtol=0, atol=0.02)

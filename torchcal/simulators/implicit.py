@@ -36,6 +36,8 @@ ASTRAY, HALVINGS, ELSEWHERE, FEW = 0.5, 3, 0.1, 1 / 8
 #: Share of a state's largest value below which it counts as that large; and of the terms that a gap is the difference
 #: of up to which it is rounding, whatever the states at rest are that it would correct.
 SMALLEST, ROUNDING = 1e-9, 1e-13
+#: What a state does to another one's equation within a step, above which that may be its pivot.
+PIVOT = 0.1
 
 
 class ImplicitSteps(Steps):
@@ -268,11 +270,20 @@ def _pushed(pushes: Tensor, h: Tensor) -> Tensor:
 
 
 def _share(largest: Tensor, stages: Tensor, change: Tensor, gap: Tensor, slopes: Tensor, h: Tensor) -> Tensor:
-    """Largest correction of the stages of a step, relative to these, ``(H, M)``; 0 where the gap is rounding."""
+    """Largest correction of the stages of a step, relative to these, ``(H, M)``; 0 where it, or the gap, is rounding.
+
+    Where another state's equation is a state's pivot, what is rounding of that equation's terms becomes one of this
+    state, however small it is itself: it may be 0 at all times, as what a term adds that is switched off.
+    """
     near = stages.abs()
+    reach = h[:, None, None] * slopes.abs()
+    terms = near + torch.einsum("himab,himb->hima", reach, near)
     size = torch.maximum(near.amax(1), SMALLEST * largest).clamp_min(1e-300)
-    found = (change.abs().amax(1) / size).amax(-1)
-    terms = near + h[:, None] * torch.einsum("himab,himb->hima", slopes.abs(), near)
+    moved = change.abs().amax(1)
+    by_pivot = torch.where(reach > PIVOT, terms.unsqueeze(-1) / reach, torch.zeros_like(reach))
+    by_pivot.diagonal(dim1=-2, dim2=-1).zero_()
+    rounding = ROUNDING * by_pivot.amax((1, 3))
+    found = torch.where(moved <= rounding, torch.zeros_like(moved), moved / size).amax(-1)
     found[(gap.abs() <= ROUNDING * terms).all(-1).all(1)] = 0.0
     return found
 
