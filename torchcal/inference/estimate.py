@@ -42,6 +42,9 @@ MOST_REFINED = 4
 SAME_MEANS = 1e-3
 """Difference of scaled means up to which two starts ended at one maximum."""
 
+FAR_STEPS = (10.0, 1e2, 1e3, 1e4, 1e5)
+"""Scaled units by which means are moved to see whether anything changes: up to where rounding would."""
+
 FAR, FORTH, LONGER = 30.0, 0.3, 1.5
 """Sizes of the parameters, or scaled units, along a ridge of maxima from which on it has no end; the part of a step
 along it that must be gone; and how much longer the next step is."""
@@ -226,9 +229,10 @@ def _flat_directions(curvature: Tensor) -> Tensor:
 
 
 def _unseen_means(problem: Problem, alpha: Tensor, curvature: Tensor) -> tuple[str, ...]:
-    """Parameters whose means can move by one scaled unit at no cost.
+    """Parameters whose means can move at no cost, by one scaled unit and, where that can be told, by any number.
 
-    Curvatures alone would not do: at a spike of the density every other direction looks flat beside it.
+    Curvatures alone would not do: at a spike of the density every other direction looks flat beside it. Nor would short
+    steps: intercept and slope of a line far from its origin make up for each other, but not for ever.
     """
     pattern = problem.propagate.pattern
     rows = pattern.leading.nonzero()[:, 0].to(alpha.device)
@@ -240,8 +244,9 @@ def _unseen_means(problem: Problem, alpha: Tensor, curvature: Tensor) -> tuple[s
         for direction in flat:
             step = torch.zeros_like(alpha)
             step[rows] = direction
-            there = problem.log_likelihood(torch.stack([alpha + step, alpha - step, alpha + 10 * step]))
-            if bool(((there - here).abs() <= 1e-6 * (1 + here.abs())).all()):
+            lengths = torch.tensor([1.0, -1.0, *FAR_STEPS], dtype=alpha.dtype, device=alpha.device)
+            change = (problem.log_likelihood(alpha + lengths[:, None] * step) - here).abs() / (1 + here.abs())
+            if bool((change[:3] <= 1e-6).all()) and not bool((change[3:] > 1e-6).any()):  # far away it may be NaN
                 names += [name for name, part in zip(pattern.names, direction.abs(), strict=True) if part > 0.1]
     return tuple(dict.fromkeys(names))
 

@@ -107,8 +107,7 @@ class ImplicitSteps(Steps):
         right = torch.cat([gap.unsqueeze(-1), still, _pushed(pushes, h)], dim=-1).transpose(1, 2).flatten(2, 3)
         found = torch.linalg.lu_solve(lu, pivots, right).unflatten(2, (STAGES, size)).transpose(1, 2)
         change, carried = found[..., 0], found[..., 1 : 1 + size]
-        stages = stages + change
-        off = _share(_largest(begin), stages, change, gap, slopes, h).amax(-1)
+        stages, off = _moved(_largest(begin), stages, change, gap, slopes, h)
         shape = (hyper, runs, self.grid.num_steps, size)
         by_begin, by_column = found[:, -1, ..., 1 : 1 + size], found[:, -1, ..., 1 + size :]
         return Pass(
@@ -117,7 +116,7 @@ class ImplicitSteps(Steps):
             by_column.reshape(*shape, len(columns)),
             stages,
             carried,
-            off,
+            off.amax(-1),
             (lu, pivots, slopes),
         )
 
@@ -131,9 +130,8 @@ class ImplicitSteps(Steps):
         gap = _gap(begin, stages, f, h)
         right = gap.transpose(1, 2).flatten(2, 3).unsqueeze(-1)
         change = torch.linalg.lu_solve(lu, pivots, right).squeeze(-1).unflatten(2, (STAGES, -1)).transpose(1, 2)
-        stages = stages + change
-        off = _share(_largest(begin), stages, change, gap, slopes, h).amax(-1)
-        return stages[:, -1].reshape(states[:, :, 1:].shape), stages, off
+        stages, off = _moved(_largest(begin), stages, change, gap, slopes, h)
+        return stages[:, -1].reshape(states[:, :, 1:].shape), stages, off.amax(-1)
 
     def astray(self, values: Tensor, states: Tensor, stages: Tensor) -> Tensor:
         """As `Steps.astray`: equations of stages may have another solution, as past a pole of the rates."""
@@ -236,8 +234,7 @@ class ImplicitSteps(Steps):
             right = gap.transpose(1, 2).flatten(2, 3).unsqueeze(-1)
             change = torch.linalg.solve_ex(_matrix(slopes, step), right)[0]
             change = change.squeeze(-1).unflatten(2, (STAGES, size)).transpose(1, 2)
-            stages[:, :, at] = now + change
-            now_share = _share(largest, stages[:, :, at], change, gap, slopes, step)
+            stages[:, :, at], now_share = _moved(largest, now, change, gap, slopes, step)
             settled = (now_share < SMALL) | ((now_share < ROUNDED) & (now_share > 0.5 * share[:, at]))
             share[:, at] = now_share
             at = at[(~settled & now_share.isfinite()).any(0)]
@@ -269,23 +266,26 @@ def _pushed(pushes: Tensor, h: Tensor) -> Tensor:
     return torch.einsum("ij,hjmsc->himsc", a, pushes) * h[:, None, None]
 
 
-def _share(largest: Tensor, stages: Tensor, change: Tensor, gap: Tensor, slopes: Tensor, h: Tensor) -> Tensor:
-    """Largest correction of the stages of a step, relative to these, ``(H, M)``; 0 where it, or the gap, is rounding.
+def _moved(
+    largest: Tensor, stages: Tensor, change: Tensor, gap: Tensor, slopes: Tensor, h: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Corrected stages, and the largest correction of those of a step relative to these, ``(H, M)``; 0 where the gap is
+    rounding.
 
-    Where another state's equation is a state's pivot, what is rounding of that equation's terms becomes one of this
-    state, however small it is itself: it may be 0 at all times, as what a term adds that is switched off.
+    Where another state's equation is a state's pivot, what is rounding of that equation's terms becomes a correction of
+    this state, however small it is: it may be 0 at all times, as what a term adds that is switched off. That is none.
     """
-    near = stages.abs()
+    after = stages + change
+    near, moved = after.abs(), change.abs().amax(1)
     reach = h[:, None, None] * slopes.abs()
     terms = near + torch.einsum("himab,himb->hima", reach, near)
-    size = torch.maximum(near.amax(1), SMALLEST * largest).clamp_min(1e-300)
-    moved = change.abs().amax(1)
     by_pivot = torch.where(reach > PIVOT, terms.unsqueeze(-1) / reach, torch.zeros_like(reach))
     by_pivot.diagonal(dim1=-2, dim2=-1).zero_()
-    rounding = ROUNDING * by_pivot.amax((1, 3))
-    found = torch.where(moved <= rounding, torch.zeros_like(moved), moved / size).amax(-1)
-    found[(gap.abs() <= ROUNDING * terms).all(-1).all(1)] = 0.0
-    return found
+    none = moved <= ROUNDING * by_pivot.amax((1, 3))
+    size = torch.maximum(near.amax(1), SMALLEST * largest).clamp_min(1e-300)
+    share = (moved / size).masked_fill(none, 0.0).amax(-1)
+    share[(gap.abs() <= ROUNDING * terms).all(-1).all(1)] = 0.0
+    return torch.where(none.unsqueeze(1), stages, after), share
 
 
 def _matrix(slopes: Tensor, h: Tensor) -> Tensor:
