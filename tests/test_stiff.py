@@ -538,6 +538,24 @@ def test_steps_leave_room_for_what_a_fit_may_find(k):
     assert float((found.at(found.x)(faster) - 1.0).abs().max()) < 1e-6
 
 
+@pytest.mark.parametrize(("k", "implicit"), [(5.5, False), (9.0, False), (60.0, True)])
+def test_a_few_times_as_many_explicit_steps_are_taken_rather_than_implicit_ones(k, implicit):
+    t = np.linspace(0, 60, 121)
+    model = tc.ODESimulator(lambda t, s, p, u: {"N": p["k"] * (1.0 - s["N"])}, ["N"], [tc.Parameter("k", low=0.0)])
+    recording = tc.Recording(runs=[run_of(t, {"N": 1.0}, ("N",))], noise=0.02)
+    bound = model.bind(recording)
+    values, allowed = tensor(k)[None], torch.full((len(t),), 1e-3, dtype=F64)
+    found = settled(bound, values, allowed)
+    problem = Problem.of(model, recording)
+    whitening = problem.whitening(allowed, torch.zeros(1, dtype=F64))
+    sharp, error = sharpen(fit(problem, whitening, values, [0]), lambda now: allowed, rounds=3)
+    assert error == 0.0
+    for simulator in (found, sharp.problem.simulator):
+        assert simulator.implicit == implicit
+        assert simulator.num_steps <= 4 * bound.num_steps
+        assert not magnified(simulator, values, simulator.solve(values))
+
+
 @pytest.mark.slow
 def test_a_fast_neighbour_is_no_bound_of_a_fit():
     """Point kinetics of a reactor with its Doppler feedback: prompt neutrons follow at once, and at the true value of

@@ -19,7 +19,6 @@ from torchcal.simulators.static import (
     nameless_advice,
 )
 from torchcal.simulators.stepping import (
-    calmed,
     fading,
     focused,
     magnified,
@@ -27,6 +26,7 @@ from torchcal.simulators.stepping import (
     outgrown,
     settled,
     settled_implicitly,
+    shortened,
     spared,
     step_errors,
     workable,
@@ -50,7 +50,6 @@ __all__ = [
     "Values",
     "asks_for_numbers",
     "build_surrogate",
-    "calmed",
     "careful",
     "check_parameters",
     "check_slopes",
@@ -65,6 +64,7 @@ __all__ = [
     "outgrown",
     "settled",
     "settled_implicitly",
+    "shortened",
     "spared",
     "step_errors",
     "unknown_name",

@@ -12,7 +12,6 @@ from torchcal.simulators.steps import inputs_between
 from torchcal.simulators.trajectories import Trajectories
 
 __all__ = [
-    "calmed",
     "fading",
     "focused",
     "magnified",
@@ -20,6 +19,7 @@ __all__ = [
     "outgrown",
     "settled",
     "settled_implicitly",
+    "shortened",
     "spared",
     "step_errors",
     "workable",
@@ -40,6 +40,8 @@ GROWTH = 2.0
 #: Size of h λ from which on explicit steps may magnify what fades; steps on end that do, by which factor in log all
 #: together, until it matters; how many parameter values are looked at; and how often they are halved for that alone.
 UNSTABLE, ON_END, MAGNIFIED, LOOKED_AT, CALMING = 2.5, 3, 7.0, 4, 4
+#: Halvings for that up to which explicit steps take less time than implicit ones.
+FEW_HALVINGS = 2
 #: How many times as fast as at those values a fit may want what fades to be: where steps magnified it there, χ² would
 #: rise as at a bound that is none.
 FASTER = 1.5
@@ -95,7 +97,10 @@ def settled(
         z = finer.outputs(values)
         change = torch.where(torch.isfinite(y) | torch.isfinite(z), (z - y).abs(), torch.zeros_like(y))
         if bool((change <= allowed).all()) and not outgrown(here.simulator, values, here.states):
-            return calmed(here.simulator, values, allowed, here.states, switch=switch)
+            if switch:
+                return calmed(here.simulator, values, allowed, here.states)
+            loud = magnified(here.simulator, values, here.states)
+            return (shortened(here.simulator, values, here.states) if loud else None) or here.simulator
         before, share = share, float((change / allowed).nan_to_num(nan=math.inf).max())
         slow = number == 1 and not share < before / CONVERGING
         if switch and slow and not simulator.implicit and fading(here.simulator, values, here.states):
@@ -261,18 +266,26 @@ def _finite(simulator: Trajectories, values: Tensor) -> bool:
     return bool(torch.isfinite(_Solved(simulator, simulator.solve(values)).outputs(values)).all())
 
 
-def calmed(
-    simulator: Trajectories, values: Tensor, allowed: Tensor, states: Tensor, *, switch: bool = True
-) -> Trajectories:
-    """The same, or where its explicit steps magnify what fades, with implicit ones or shorter ones that do not; itself
-    where there are none. Arguments are those of `settled`, and its solved states."""
-    excess = _magnifying(simulator, values, states)
-    if not excess:
+def calmed(simulator: Trajectories, values: Tensor, allowed: Tensor, states: Tensor) -> Trajectories:
+    """The same, or where its explicit steps magnify what fades, with a few times as many that do not; else with
+    implicit ones; else with many more; itself where there are none. Arguments are those of `settled`, and its solved
+    states."""
+    if not magnified(simulator, values, states):
         return simulator
-    if switch and (other := settled_implicitly(simulator, values, allowed)) is not None:
-        return other
+    return (
+        shortened(simulator, values, states, few=True)
+        or settled_implicitly(simulator, values, allowed)
+        or shortened(simulator, values, states)
+        or simulator
+    )
+
+
+def shortened(simulator: Trajectories, values: Tensor, states: Tensor, *, few: bool = False) -> Trajectories | None:
+    """The same with explicit steps halved until they do not magnify what fades; None where they do however often, or,
+    with ``few``, where implicit ones take less time. Arguments are those of `magnified`."""
+    halvings = FEW_HALVINGS if few else CALMING
     finer = simulator
-    for _ in range(CALMING if excess < 2**CALMING else 0):
+    for _ in range(halvings if _magnifying(simulator, values, states) < 2**halvings else 0):
         try:
             finer = finer.refined(2)
         except DomainError:  # more steps than anyone can take
@@ -281,7 +294,7 @@ def calmed(
             break
         if not _magnifying(finer, values, finer.solve(values)):
             return finer
-    return simulator
+    return None
 
 
 def magnified(simulator: Trajectories, values: Tensor, states: Tensor) -> bool:

@@ -10,13 +10,13 @@ from torchcal.discovery.fits.fitting import Fitted, fit
 from torchcal.errors import DomainError
 from torchcal.simulators import (
     Trajectories,
-    calmed,
     fading,
     focused,
     magnified,
     may_change,
     outgrown,
     settled_implicitly,
+    shortened,
     spared,
     step_errors,
 )
@@ -154,12 +154,11 @@ def _calm(found: Fitted, allowed: Tensor, states: Tensor, rounds: int) -> Fitted
     simulator = found.problem.simulator
     if not isinstance(simulator, Trajectories) or not magnified(simulator, found.values[None], states):
         return found
-    if (again := _implicit(found, allowed, rounds)) is not None:
+    calm = shortened(simulator, found.values[None], states, few=True)
+    if calm is None and (again := _implicit(found, allowed, rounds)) is not None:
         return again
-    calm = calmed(simulator, found.values[None], allowed, states, switch=False)
-    if calm is simulator:
-        return found
-    return _in_steps_of(calm, found) or found
+    calm = calm or shortened(simulator, found.values[None], states)
+    return found if calm is None else _in_steps_of(calm, found) or found
 
 
 def _implicit(found: Fitted, allowed: Tensor, rounds: int) -> Fitted | None:
