@@ -3,6 +3,7 @@
 Every tolerance follows from the number of seeds: five standard errors, or the binomial tail at 1e-4.
 """
 
+import dataclasses
 import math
 import re
 import types
@@ -17,6 +18,7 @@ from torchcal.discovery.fits.fitting import fit
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.base import calibrate_base
 from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.hypotheses.singles import refit_singles
 from torchcal.discovery.judged import _explained_by_place
 from torchcal.discovery.misfit.curves import orthonormal, smooth_columns
 from torchcal.discovery.misfit.noise import Noise, estimate
@@ -1070,3 +1072,26 @@ def test_a_sudden_change_taken_out_under_one_noise_is_credited_no_more_than_it_r
     assert d.verdict == "named"
     assert set(d.terms) == {"spring", "friction"}
     assert float(d.noise.sd["y"]) == pytest.approx(0.2, rel=0.25)
+
+
+def test_a_weak_memory_that_a_misfit_feigned_is_given_up_where_samples_are_close_together():
+    """From each sample to the next it is strong where these are far closer than most."""
+    rng = np.random.default_rng(3)
+    t = np.sort(rng.uniform(0.0, 20.0, 160))
+    t[0] = 0.0
+    level = 6.0 * np.exp(-0.3 * t) + 2.0 * (1 - np.exp(-0.3 * t))
+    run = tc.Run(time=t, outputs={"T": level + 0.1 * rng.standard_normal(160)}, initial={"T": 6.0})
+    base = tc.ODESimulator(lambda t, s, p, u: {"T": -p["k"] * s["T"]}, {"T": "K"}, [tc.Parameter("k", low=0.0)])
+    heating = tc.Term("heating", equation="T", rate=lambda t, s, p, u: p["q"], parameters=[tc.Parameter("q")])
+    problem = Problem.of(base, tc.Recording(runs=[run], noise=0.1))
+    search = Search(problem, [heating], {}, 0, 4, 1, lambda text: None, None)
+    search.calibrate_base()
+    search.screen_all()
+    refit_singles(search)
+    assert search.leader.names == ("heating",)
+    feigned = dataclasses.replace(search.noise, correlation=torch.tensor([0.049], dtype=torch.float64))
+    search.take(feigned, search.models)
+    assert search.leader.found.chi2 > 200  # of 160 data
+    search.reweigh()
+    assert float(search.noise.correlation) == 0.0
+    assert search.leader.found.chi2 < 200

@@ -22,7 +22,7 @@ from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.hypotheses.own_noise import suited
 from torchcal.discovery.hypotheses.screen import Screening, Window, screen, twins, windows
 from torchcal.discovery.hypotheses.verify import HeldOut, held_out_fit
-from torchcal.discovery.misfit.likeliest import Tangents, settled, with_unknown
+from torchcal.discovery.misfit.likeliest import Tangents, log_normal, settled, with_unknown
 from torchcal.discovery.misfit.noise import LEAST, Noise
 from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.misfit.structure import Structure, analyse
@@ -37,6 +37,9 @@ CLEARLY = 5.0
 #: Share of the best log evidence below which a model is not fitted again when the noise estimate has changed, nor on to
 #: its end where it falls slowly, nor with shorter steps.
 HOPELESS = 0.5
+#: Log odds from which on even a small change of the noise counts: of samples far closer together than most, a weak
+#: correlation from each to the next, which a misfit has feigned, is a strong one.
+LIKELIER = 3.0
 #: Simulated residuals by which what a model leaves is held to be noise or not.
 CHECKED = 500
 
@@ -243,9 +246,9 @@ class Search:
             return
         hopeful = [m for m in (*self.models, *self.merged.values()) if m.log_evidence > HOPELESS * best.log_evidence]
         fresh = suited(self, hopeful)
-        old = self.noise
+        old, likelier = self.noise, self._log_density(best, fresh) - self._log_density(best, self.noise)
         change = float((fresh.sd / old.sd).log().abs().max()) + float((fresh.correlation - old.correlation).abs().max())
-        if change < 0.05:
+        if change < 0.05 and likelier < LIKELIER:
             return
         base = refit(self.base, fresh.whitening(self.base.problem))
         if bool(runs_away(base, self.base).any()):
@@ -254,6 +257,11 @@ class Search:
         for model in (*self.models, *self.merged.values()):
             self.judge(model)
         self.local, _ = windows(self.residual, self.candidates, self.screening)
+
+    def _log_density(self, model: Model, noise: Noise) -> float:
+        """Of the data with a model and some noise."""
+        whitening = noise.whitening(model.found.problem)
+        return log_normal(whitening, whitening.vector(model.found.residual))
 
     def take(self, noise: Noise, again: Sequence[Model], base: Fitted | None = None) -> None:
         """Go on with another noise: the base, if it has not been, and some models are fitted again, the others weighed.
