@@ -217,6 +217,23 @@ def test_parameters_that_are_known_as_a_product_alone_are_told(additive):
         calibrate(product, recording, num_samples=0)
 
 
+def test_a_line_that_is_seen_far_from_its_origin_is_determined():
+    """Intercept and slope make up for each other over hundreds of their scaled units, as against Julian days."""
+    origin = 2460000.5
+    z = torch.linspace(-15, 15, 9, dtype=torch.float64)
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])
+    y = 1 + z / 30 + (z / 30) ** 2
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", IdentifiabilityWarning)
+        near, far = (tc.calibrate(line, tc.Recording(x=z + at, y=y), num_samples=0) for at in (0.0, origin))
+        draws = [tc.calibrate_additive(line, tc.Recording(x=z + at, y=y), num_samples=400) for at in (0.0, origin)]
+    assert far.map.objective == pytest.approx(near.map.objective, abs=1e-5)
+    torch.testing.assert_close(far.predict().map.sd, near.predict().map.sd, rtol=1e-3, atol=0)
+    first, second = (fit.predict().push_forward for fit in draws)
+    torch.testing.assert_close(second.mean, first.mean, rtol=0, atol=0.3 * float(first.sd.mean()))
+    torch.testing.assert_close(second.sd, first.sd, rtol=0.25, atol=0)
+
+
 def test_a_product_is_told_of_a_code_whose_starts_all_end_at_one_point():
     """Where starts that end alike share one end, and others are given up, no two ends show the ridge."""
     product = tc.ExternalSimulator(lambda x, p: p["a"] * p["b"] * x, [tc.Parameter("a"), tc.Parameter("b")])

@@ -45,8 +45,9 @@ def calibrate_additive(
     r"""Calibrate the conventional way: λ and ln σ of an additive Gaussian discrepancy (Eqs. 2-4).
 
     Of several outputs, σ is that of the first; the others' are in proportion to the spread of their data, so that
-    units do not matter. Flat priors on λ (within its bounds) and ln σ. This is the baseline whose push-forward shrinks
-    with more data, however wrong the model is.
+    units do not matter. Flat priors on λ (within its bounds) and ln σ; with known noise, where data that need no σ
+    would leave ln σ free, this ends at a thousandth of the smallest noise sd. This is the baseline whose push-forward
+    shrinks with more data, however wrong the model is.
 
     Args:
         simulator: The model, as for `torchcal.calibrate`.

@@ -42,8 +42,9 @@ MOST_REFINED = 4
 SAME_MEANS = 1e-3
 """Difference of scaled means up to which two starts ended at one maximum."""
 
-FAR_STEPS = (10.0, 1e2, 1e3, 1e4, 1e5)
-"""Scaled units by which means are moved to see whether anything changes: up to where rounding would."""
+QUADRATIC = 0.5
+"""Relative difference of a fall from what a curvature says, one and two standard deviations away, up to which it is
+one."""
 
 FAR, FORTH, LONGER = 30.0, 0.3, 1.5
 """Sizes of the parameters, or scaled units, along a ridge of maxima from which on it has no end; the part of a step
@@ -123,7 +124,7 @@ def maximise(
     if agreeing < 2 <= len(ends):
         warn(_lonely(problem, ends, given_up), ConvergenceWarning)
     curvature = _curvature(problem, best)
-    null = _flat_directions(curvature)
+    null = _flat_directions(problem, best, curvature)
     unseen = _unseen_means(problem, best, curvature)
     if unseen:
         warn(
@@ -218,21 +219,36 @@ def _curvature(problem: Problem, alpha: Tensor) -> Tensor:
     return torch.nan_to_num(hessian(lambda a: -problem.log_prob(a), _inside(problem, alpha)[None], piece=piece)[0])
 
 
-def _flat_directions(curvature: Tensor) -> Tensor:
-    """Unit vectors ``(k, P)`` along which there is none.
+def _flat_directions(problem: Problem, alpha: Tensor, curvature: Tensor) -> Tensor:
+    """Unit vectors ``(k, P)`` along which there is none at a point.
 
     Flat beside the steepest direction and flat in itself: at a spike every other direction is only the former.
     """
     values, vectors = torch.linalg.eigh(curvature)
     top = float(values.abs().max().clamp_min(1e-300))
-    return vectors.T[values.abs() <= min(NULL_CURVATURE * top, max(1.0, 1e-9 * top))]
+    flat = vectors.T[values.abs() <= min(NULL_CURVATURE * top, max(1.0, 1e-9 * top))]
+    return flat[[not _bends(problem, alpha, direction, curvature) for direction in flat]]
+
+
+def _bends(problem: Problem, alpha: Tensor, direction: Tensor, curvature: Tensor) -> bool:
+    """Whether the log-posterior falls along a direction ``(P,)`` as its curvature says, small as it may be.
+
+    Intercept and slope of a line that is seen far from its origin make up for each other over many scaled units.
+    """
+    own = direction @ curvature @ direction
+    if not float(own) > 0:
+        return False
+    sizes = torch.tensor([1.0, 2.0], dtype=alpha.dtype, device=alpha.device)
+    steps = (sizes / own.sqrt())[:, None] * direction
+    with torch.no_grad():  # both ways: so far away a gradient of rounding counts
+        fall = problem.log_prob(alpha) - 0.5 * (problem.log_prob(alpha + steps) + problem.log_prob(alpha - steps))
+    return bool(((fall / (0.5 * sizes.square()) - 1).abs() < QUADRATIC).all())
 
 
 def _unseen_means(problem: Problem, alpha: Tensor, curvature: Tensor) -> tuple[str, ...]:
-    """Parameters whose means can move at no cost, by one scaled unit and, where that can be told, by any number.
+    """Parameters whose means can move by one scaled unit at no cost.
 
-    Curvatures alone would not do: at a spike of the density every other direction looks flat beside it. Nor would short
-    steps: intercept and slope of a line far from its origin make up for each other, but not for ever.
+    Curvatures alone would not do: at a spike of the density every other direction looks flat beside it.
     """
     pattern = problem.propagate.pattern
     rows = pattern.leading.nonzero()[:, 0].to(alpha.device)
@@ -244,9 +260,9 @@ def _unseen_means(problem: Problem, alpha: Tensor, curvature: Tensor) -> tuple[s
         for direction in flat:
             step = torch.zeros_like(alpha)
             step[rows] = direction
-            lengths = torch.tensor([1.0, -1.0, *FAR_STEPS], dtype=alpha.dtype, device=alpha.device)
-            change = (problem.log_likelihood(alpha + lengths[:, None] * step) - here).abs() / (1 + here.abs())
-            if bool((change[:3] <= 1e-6).all()) and not bool((change[3:] > 1e-6).any()):  # far away it may be NaN
+            there = problem.log_likelihood(torch.stack([alpha + step, alpha - step, alpha + 10 * step]))
+            level = bool(((there - here).abs() <= 1e-6 * (1 + here.abs())).all())
+            if level and not _bends(problem, alpha, step, curvature):
                 names += [name for name, part in zip(pattern.names, direction.abs(), strict=True) if part > 0.1]
     return tuple(dict.fromkeys(names))
 
@@ -256,7 +272,7 @@ def _ridge(problem: Problem, found: Minima, best: Tensor, null: Tensor) -> tuple
     ``(k, P)`` tell so, and these: in the middle of it, or, as it may be bent, at ``best``, where they are ``null``."""
     middle = _middle_of_the_tied(problem, found, best)
     if middle is not best:
-        along = _flat_directions(_curvature(problem, middle))
+        along = _flat_directions(problem, middle, _curvature(problem, middle))
         if together := _known_together(problem, found, middle, along):
             return together, middle, along
     return _known_together(problem, found, best, null), best, null
