@@ -11,6 +11,7 @@ import torch
 from torch.autograd import forward_ad
 
 import torchcal as tc
+from torchcal.discovery import conclude
 from torchcal.discovery.fits.candidates import Candidate
 from torchcal.discovery.fits.fitting import FINISH, finished, fit, refit
 from torchcal.discovery.fits.problem import Problem
@@ -20,6 +21,7 @@ from torchcal.discovery.hypotheses.base import calibrate_base
 from torchcal.discovery.misfit.noise import GRID, Noise
 from torchcal.discovery.misfit.residual import Residual, _noise_draws
 from torchcal.discovery.verdicts.explain import deeper
+from torchcal.errors import ConvergenceWarning
 from torchcal.simulators.dual import transformed
 
 F64 = torch.float64
@@ -719,3 +721,12 @@ def test_more_starts_are_tried_and_told_where_few_come_to_the_best_fit(w, alike)
     assert d.verdict == "consistent"
     assert d.base.estimates[1].value == pytest.approx(w, rel=0.02)
     assert any("of the base's starting values came to the best fit" in str(one.message) for one in told) is not alike
+
+
+@pytest.mark.parametrize("high", [None, 2.0])
+def test_what_is_bounded_already_is_not_told_to_be_given_bounds(high):
+    parameters = [tc.Parameter("a", low=0.0, high=high, initial=1.0)]
+    base = SimpleNamespace(agreeing=0.1, free=[0], problem=SimpleNamespace(parameters=parameters))
+    with pytest.warns(ConvergenceWarning, match="10% of the base's starting values") as told:
+        conclude._warn(SimpleNamespace(base=base), lost=False)
+    assert ("Give initial= or bounds" in str(told[0].message)) is (high is None)

@@ -240,10 +240,16 @@ def _improved(simulator: Simulator, best: Model) -> Simulator:
 
 
 def _warn(search: Search, lost: bool) -> None:
-    if search.base.agreeing < FEW_AGREE:
+    base = search.base
+    if base.agreeing < FEW_AGREE:
+        free = [base.problem.parameters[i] for i in base.free]
+        guided = all(None not in (q.initial, q.low, q.high) for q in free)
+        advice = (
+            "Its misfit has several minima: more num_starts look at more of them, narrower bounds leave fewer."
+            if guided else "Give initial= or bounds to its parameters, or more num_starts."
+        )  # fmt: skip
         warn(
-            f"Only {search.base.agreeing:.0%} of the base's starting values came to the best fit. Give initial= or "
-            "bounds to its parameters, or more num_starts.",
+            f"Only {base.agreeing:.0%} of the base's starting values came to the best fit. {advice}",
             ConvergenceWarning,
         )
     if lost:
