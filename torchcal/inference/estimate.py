@@ -10,7 +10,7 @@ from torch import Tensor
 from tqdm.auto import tqdm
 
 from torchcal.display import PATIENCE
-from torchcal.errors import ConvergenceError, ConvergenceWarning, IdentifiabilityWarning, warn
+from torchcal.errors import ConvergenceError, ConvergenceWarning, IdentifiabilityWarning, SimulatorError, warn
 from torchcal.inference.newton import Minima, hessian, minimise
 from torchcal.inference.starts import check_starts, starting_points
 from torchcal.inference.tangent import few_nodes, pieces, search, search_with_few_nodes
@@ -42,9 +42,9 @@ MOST_REFINED = 4
 SAME_MEANS = 1e-3
 """Difference of scaled means up to which two starts ended at one maximum."""
 
-QUADRATIC = 0.5
+QUADRATIC, FARTHEST = 0.5, 1e5
 """Relative difference of a fall from what a curvature says, one and two standard deviations away, up to which it is
-one."""
+one; and how many scaled units away these are at most: farther off, differences of large numbers are rounding."""
 
 FAR, FORTH, LONGER = 30.0, 0.3, 1.5
 """Sizes of the parameters, or scaled units, along a ridge of maxima from which on it has no end; the part of a step
@@ -236,12 +236,15 @@ def _bends(problem: Problem, alpha: Tensor, direction: Tensor, curvature: Tensor
     Intercept and slope of a line that is seen far from its origin make up for each other over many scaled units.
     """
     own = direction @ curvature @ direction
-    if not float(own) > 0:
+    if not float(own) > FARTHEST**-2:
         return False
     sizes = torch.tensor([1.0, 2.0], dtype=alpha.dtype, device=alpha.device)
     steps = (sizes / own.sqrt())[:, None] * direction
-    with torch.no_grad():  # both ways: so far away a gradient of rounding counts
-        fall = problem.log_prob(alpha) - 0.5 * (problem.log_prob(alpha + steps) + problem.log_prob(alpha - steps))
+    try:
+        with torch.no_grad():  # both ways: so far away a gradient of rounding counts
+            fall = problem.log_prob(alpha) - 0.5 * (problem.log_prob(alpha + steps) + problem.log_prob(alpha - steps))
+    except SimulatorError:  # it may work near its best values alone
+        return False
     return bool(((fall / (0.5 * sizes.square()) - 1).abs() < QUADRATIC).all())
 
 
