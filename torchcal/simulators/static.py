@@ -369,7 +369,8 @@ def _describe(x: Conditions) -> str:
 
 def asks_for_numbers(error: Exception) -> bool:
     """Whether torch has refused to make plain numbers of tensors, as NumPy, float() and ``if`` want them."""
-    return any(part in str(error) for part in ("numpy()", "converted to Python scalars", "Boolean value of Tensor"))
+    asked = ("numpy()", "__array_wrap__", "converted to Python scalars", "Boolean value of Tensor")
+    return any(part in str(error) for part in asked)
 
 
 def nameless_advice(error: Exception, x: Any) -> str:

@@ -153,7 +153,7 @@ def locate(
         places.sort(key=lambda place: _rank(place, own, reads))
         mine = bool(places) and (places[0].channel.kind, places[0].channel.target) in own
         if not mine or places[0].share < PART * removed(search, best):  # as of what an instrument remembers
-            likely = sorted(places, key=lambda place: -place.evidence)
+            likely = sorted(places, key=lambda place: -round(place.evidence, TIED))
             rows.append(_moved(search, best, search.base.y, [place.driver for place in likely]))
         elif (row := _elsewhere(search, best, places[0])) is not None:
             rows.append(row)
@@ -340,7 +340,7 @@ def _by_plausibility(search: Search, found: Sequence[Place]) -> list[Place]:
     def weight(place: Place) -> float:
         return place.evidence * (_plausible(search, place) if search.problem.in_time else 1.0)
 
-    return sorted(found, key=lambda place: -weight(place))
+    return sorted(found, key=lambda place: -round(weight(place), TIED))
 
 
 def _plausible(search: Search, place: Place) -> float:
