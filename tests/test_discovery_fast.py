@@ -131,7 +131,7 @@ def test_steps_that_are_much_shorter_than_a_fit_needs_become_longer(in_short_ste
 
 def test_steps_that_were_chosen_for_another_orbit_are_not_kept_for_this_one():
     """The passages of the one are where the other is far away."""
-    problem = Problem.of(orbit(), passages(1.0))
+    problem = Problem.of(orbit(), passages())
     grown = problem.with_simulator(problem.simulator)
     for speed in (0.45, 0.5, 0.55):  # as a search passes by others
         values = torch.tensor([1.0, speed], dtype=F64)
@@ -189,15 +189,15 @@ def orbit() -> tc.ODESimulator:
     return tc.ODESimulator(rates, {"x": "1", "y": "1", "vx": "1", "vy": "1"}, body, observe=("x",))
 
 
-def passages(mu: float, speed: float = 0.8) -> tc.Recording:
-    """Of that, without noise."""
+def passages() -> tc.Recording:
+    """Of that, with mu = 1 and a first speed of 0.8, without noise."""
 
     def rates(t, s):
-        pull = mu / np.hypot(s[0], s[1]) ** 3
+        pull = 1 / np.hypot(s[0], s[1]) ** 3
         return [s[2], s[3], -pull * s[0], -pull * s[1]]
 
     t = np.linspace(0, 12, 61)
-    x = solve_ivp(rates, (0, 12), [1.0, 0.0, 0.0, speed], t_eval=t, rtol=1e-10, atol=1e-12).y[0]
+    x = solve_ivp(rates, (0, 12), [1.0, 0.0, 0.0, 0.8], t_eval=t, rtol=1e-10, atol=1e-12).y[0]
     at = {"x": 1.0, "y": 0.0, "vx": 0.0}
     run = tc.Run(time=torch.tensor(t), outputs={"x": torch.tensor(x)}, initial=at)
     return tc.Recording(runs=[run], noise=0.001)

@@ -29,7 +29,7 @@ from torchcal.discovery.hypotheses.own_noise import (
 from torchcal.discovery.hypotheses.refitting import take_over
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.hypotheses.singles import refit_singles
-from torchcal.discovery.misfit.likeliest import log_normal
+from torchcal.discovery.misfit.likeliest import density
 from torchcal.discovery.misfit.noise import Noise
 from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.several import refit_several
@@ -206,7 +206,7 @@ def _may_explain(search: Search, best: Model, observed: Problem) -> bool:
     """Whether a model explains what is set aside, or with one more term would to first order, as well as outliers."""
     problem = dataclasses.replace(best.found.problem, keep=observed.keep)
     found = refit(best.found, search.noise.whitening(problem), problem)
-    short = known_density(search, best.found) - log_normal(found.whitening, found.whitening.vector(found.residual))
+    short = known_density(search, best.found) - density(found, found.whitening)
     if short < 0:
         return True
     if len(best.numbers) >= search.max_terms:

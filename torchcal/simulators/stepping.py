@@ -99,8 +99,7 @@ def settled(
         if bool((change <= allowed).all()) and not outgrown(here.simulator, values, here.states):
             if switch:
                 return calmed(here.simulator, values, allowed, here.states)
-            loud = magnified(here.simulator, values, here.states)
-            return (shortened(here.simulator, values, here.states) if loud else None) or here.simulator
+            return shortened(here.simulator, values, here.states) or here.simulator
         before, share = share, float((change / allowed).nan_to_num(nan=math.inf).max())
         slow = number == 1 and not share < before / CONVERGING
         if switch and slow and not simulator.implicit and fading(here.simulator, values, here.states):
@@ -270,8 +269,6 @@ def calmed(simulator: Trajectories, values: Tensor, allowed: Tensor, states: Ten
     """The same, or where its explicit steps magnify what fades, with a few times as many that do not; else with
     implicit ones; else with many more; itself where there are none. Arguments are those of `settled`, and its solved
     states."""
-    if not magnified(simulator, values, states):
-        return simulator
     return (
         shortened(simulator, values, states, few=True)
         or settled_implicitly(simulator, values, allowed)
@@ -281,11 +278,14 @@ def calmed(simulator: Trajectories, values: Tensor, allowed: Tensor, states: Ten
 
 
 def shortened(simulator: Trajectories, values: Tensor, states: Tensor, *, few: bool = False) -> Trajectories | None:
-    """The same with explicit steps halved until they do not magnify what fades; None where they do however often, or,
-    with ``few``, where implicit ones take less time. Arguments are those of `magnified`."""
+    """The same, with explicit steps that magnify what fades halved until they do not; None where they do however often,
+    or, with ``few``, where implicit ones take less time. Arguments are those of `magnified`."""
+    excess = _magnifying(simulator, values, states)
+    if not excess:
+        return simulator
     halvings = FEW_HALVINGS if few else CALMING
     finer = simulator
-    for _ in range(halvings if _magnifying(simulator, values, states) < 2**halvings else 0):
+    for _ in range(halvings if excess < 2**halvings else 0):
         try:
             finer = finer.refined(2)
         except DomainError:  # more steps than anyone can take

@@ -12,7 +12,7 @@ from torchcal.discovery.fits.fitting import Fitted, refit
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.base import growing
 from torchcal.discovery.hypotheses.model import PRIOR, Model
-from torchcal.discovery.misfit.likeliest import alone, log_likelihood, log_normal
+from torchcal.discovery.misfit.likeliest import alone, density, log_likelihood
 from torchcal.discovery.misfit.noise import Noise, mine
 from torchcal.discovery.misfit.outliers import lone, spikes
 
@@ -294,14 +294,13 @@ def _density(search: "Search", found: Fitted) -> float:
     Not integrated over the base's parameters: which of them there are to integrate over, and how far away the data lie
     that they are told by, is not the same for other data.
     """
-    w = alone(found, search.noise, search.tangents)[0].whitening(found.problem)
-    return _of_outliers(search) + log_normal(w, w.vector(found.residual))
+    noise = alone(found, search.noise, search.tangents)[0]
+    return _of_outliers(search) + density(found, noise.whitening(found.problem))
 
 
 def known_density(search: "Search", found: Fitted) -> float:
     """The same of a model with the noise of the search."""
-    w = search.noise.whitening(found.problem)
-    return _of_outliers(search) + log_normal(w, w.vector(found.residual))
+    return _of_outliers(search) + density(found, search.noise.whitening(found.problem))
 
 
 def _of_outliers(search: "Search") -> float:

@@ -22,7 +22,7 @@ from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.hypotheses.own_noise import suited
 from torchcal.discovery.hypotheses.screen import Screening, Window, screen, twins, windows
 from torchcal.discovery.hypotheses.verify import HeldOut, held_out_fit
-from torchcal.discovery.misfit.likeliest import Tangents, log_normal, settled, with_unknown
+from torchcal.discovery.misfit.likeliest import Tangents, density, settled, with_unknown
 from torchcal.discovery.misfit.noise import LEAST, Noise
 from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.misfit.structure import Structure, analyse
@@ -246,7 +246,8 @@ class Search:
             return
         hopeful = [m for m in (*self.models, *self.merged.values()) if m.log_evidence > HOPELESS * best.log_evidence]
         fresh = suited(self, hopeful)
-        old, likelier = self.noise, self._log_density(best, fresh) - self._log_density(best, self.noise)
+        old, problem = self.noise, best.found.problem
+        likelier = density(best.found, fresh.whitening(problem)) - density(best.found, old.whitening(problem))
         change = float((fresh.sd / old.sd).log().abs().max()) + float((fresh.correlation - old.correlation).abs().max())
         if change < 0.05 and likelier < LIKELIER:
             return
@@ -257,11 +258,6 @@ class Search:
         for model in (*self.models, *self.merged.values()):
             self.judge(model)
         self.local, _ = windows(self.residual, self.candidates, self.screening)
-
-    def _log_density(self, model: Model, noise: Noise) -> float:
-        """Of the data with a model and some noise."""
-        whitening = noise.whitening(model.found.problem)
-        return log_normal(whitening, whitening.vector(model.found.residual))
 
     def take(self, noise: Noise, again: Sequence[Model], base: Fitted | None = None) -> None:
         """Go on with another noise: the base, if it has not been, and some models are fitted again, the others weighed.

@@ -22,7 +22,7 @@ from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.misfit.steps import sudden_changes
 from torchcal.discovery.misfit.structure import Rough, evidences, responses_of
 
-__all__ = ["Tangents", "alone", "log_likelihood", "log_normal", "settled", "with_unknown"]
+__all__ = ["Tangents", "alone", "density", "log_likelihood", "settled", "with_unknown"]
 
 #: Places in `GRID` of the coefficients that are tried beside something unknown, and how often for every output.
 TRIED, ROUNDS = (0, 8, 16, 24, 30, 36), 2
@@ -104,6 +104,11 @@ def _log_density(w: Whitening, e: Tensor, noise: Noise, tangents: Tangents, prob
     if tangents.directions.shape[1]:
         found -= float(torch.linalg.qr(w(tangents.directions)).R.diagonal().abs().log().sum())
     return found
+
+
+def density(found: Fitted, w: Whitening) -> float:
+    """Log density of the data with a fit and a noise, without the constant of 2π."""
+    return log_normal(w, w.vector(found.residual))
 
 
 def log_normal(w: Whitening, e: Tensor) -> float:
