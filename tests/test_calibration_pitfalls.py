@@ -1,5 +1,6 @@
 """What a calibration did wrong, or said nothing of, on problems that others brought: each case once."""
 
+import itertools
 import math
 import warnings
 from types import SimpleNamespace
@@ -296,6 +297,30 @@ def test_places_of_one_ridge_are_one_maximum():
     assert len(found.diagnostics.null_directions) == 1
     assert found.diagnostics.ties == 1
     assert len(found.diagnostics.modes) == 1
+
+
+def test_parameters_that_no_datum_sees_together_are_one_ridge():
+    """Each half of the data depends on a parameter of its own: how the two vary together turns the second row of the
+    triangle in a circle, and leaves every mean and sd as it is."""
+    t = np.linspace(0, 1, 21)
+    rng = np.random.default_rng(0)
+    first = 2 * t + 0.3 * np.sin(6 * t) + 0.02 * rng.normal(size=21)
+    second = -3 * t + 0.5 * t**2 + 0.02 * rng.normal(size=21)
+    half = np.repeat([0.0, 1.0], 21)
+    recording = tc.Recording(x={"t": np.tile(t, 2), "half": half}, y=np.concatenate([first, second]))
+    lines = tc.Simulator(
+        lambda x, p: (p["a"] * (1 - x["half"]) + p["b"] * x["half"]) * x["t"], [tc.Parameter("a"), tc.Parameter("b")]
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # few draws
+        found = tc.calibrate(
+            lines, recording, embedding=tc.embeddings.Gaussian(), likelihood=tc.likelihoods.ABC(epsilon=0.02),
+            num_samples=20, num_warmup=20, num_chains=4, seed=1,
+        )  # fmt: skip
+    assert len(found.diagnostics.null_directions) == 1
+    objectives = [mode.objective for mode in found.diagnostics.modes]
+    assert len(objectives) > 1  # the second half alone has two fits, of which one is the better
+    assert min(b - a for a, b in itertools.pairwise(objectives)) > 0.1
 
 
 @pytest.mark.parametrize(("draws", "chains"), [(8, 4), (20, 1)])

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from torchcal.inference.coordinates import Laplace
-from torchcal.inference.estimate import SAME_MEANS, Estimate
+from torchcal.inference.estimate import Estimate
 from torchcal.inference.newton import gradient, hessian, minimise
 from torchcal.inference.tangent import pieces
 from torchcal.models import Problem
@@ -20,6 +20,10 @@ MOST_MODES = 6
 BETWEEN, LEVEL = 9, 0.01
 """Points of a straight line between two maxima, ends included, and the difference in log-posterior along it up to which
 it is level."""
+
+LONGEST_STEP = 0.4
+"""Share of the way between two maxima that no step along a bent ridge exceeds. Of separate ones one step is the whole
+way."""
 
 
 def modes_of(problem: Problem, estimate: Estimate) -> list[Laplace]:
@@ -63,28 +67,32 @@ def modes_of(problem: Problem, estimate: Estimate) -> list[Laplace]:
 def _joined(problem: Problem, one: Tensor, other: Tensor) -> bool:
     """Whether two maxima ``(P,)`` are places of one ridge that the data do not see along.
 
-    A straight one keeps its height between them; along a bent one the density of λ changes in what the data see nothing
-    of, but neither in its mean nor in its covariance.
+    A straight one keeps its height between them. A bent one keeps it along a curve: points of the straight line, each
+    brought up to the maximum next to it, lie at the same height all along the way, rather than at one end or the other.
     """
-    propagate = problem.propagate
+    transform = problem.prior.transform
     share = torch.linspace(0, 1, BETWEEN).to(one)[:, None]
     with torch.no_grad():
-        heights = problem.log_prob(one + share * (other - one))
-        if not abs(float(heights[-1] - heights[0])) <= LEVEL:
+        line = one + share * (other - one)
+        heights = problem.log_prob(line)
+    if not abs(float(heights[-1] - heights[0])) <= LEVEL:
+        return False
+    if bool(((heights - heights[0]).abs() <= LEVEL).all()):
+        return True
+
+    def objective(u: Tensor) -> Tensor:
+        return -problem.log_prob(transform.bound(u))
+
+    piece = pieces(problem.propagate, len(problem.y))
+    places = [one]
+    for point in line[1:-1]:
+        top = minimise(objective, transform.unbound(point)[None], piece=piece)
+        if not abs(float(-top.values[0] - heights[0])) <= LEVEL:
             return False
-        if bool(((heights - heights[0]).abs() <= LEVEL).all()):
-            return True
-        if not propagate.pattern.num_germs:
-            return False
-        coefficients = torch.stack([one, other])[:, : propagate.num_alpha]
-        mean, covariance = (moment.double() for moment in propagate.parameter_moments(coefficients))
-    spread = covariance.diagonal(dim1=-2, dim2=-1).amax(0).sqrt()
-    unit = torch.maximum(spread, SAME_MEANS * mean.abs().amax(0)).clamp_min(1e-300)
-    apart = torch.maximum(
-        ((mean[1] - mean[0]) / unit).abs().max(),
-        ((covariance[1] - covariance[0]) / unit[:, None] / unit).abs().max(),
-    )
-    return float(apart) <= SAME_MEANS
+        places.append(transform.bound(top.points[0]))
+    reached = torch.stack([*places, other])
+    near = torch.cdist(reached, reached) <= LONGEST_STEP * (other - one).norm()
+    return bool(torch.linalg.matrix_power(near.double(), BETWEEN)[0, -1] > 0)
 
 
 def _apart(point: Tensor, mode: Laplace) -> float:
