@@ -490,6 +490,34 @@ def test_scatter_that_grows_with_the_value_is_no_physics(decades):
     assert "growing with it" in str(d)
 
 
+@pytest.mark.parametrize("shunt", [0.0, 2e-9])
+def test_scatter_in_proportion_over_ten_decades_hides_nothing_of_the_smallest(shunt):
+    # The current of a diode to 3 %, which nobody says; the shunt is some tenths of a nanoampere beside a tenth of one
+    # at most. The noise of all below a millionth of the largest was once taken to be that of a millionth.
+    volts = np.linspace(0.1, 0.75, 66)
+    thermal = 0.02585
+    scatter = 1 + 0.03 * np.random.default_rng(2).standard_normal(66)
+    current = (1e-13 * np.expm1(volts / (1.05 * thermal)) + shunt * volts) * scatter
+    diode = tc.Simulator(
+        lambda x, p: p["I0"] * torch.expm1(x / (p["n"] * thermal)),
+        [tc.Parameter("I0", unit="A", low=1e-16, high=1e-6, transform="log", initial=1e-12),
+         tc.Parameter("n", low=0.8, high=3.0, initial=1.1)],
+    )  # fmt: skip
+    terms = [
+        tc.Term("recombination", outputs={"I": lambda x, p, y: y + p["Ir"] * torch.expm1(x / (2 * thermal))},
+                parameters=[tc.Parameter("Ir", unit="A", low=0.0)]),
+        tc.Term("shunt", outputs={"I": lambda x, p, y: y + p["G"] * x},
+                parameters=[tc.Parameter("G", unit="S", low=0.0)]),
+        tc.Term("offset", outputs={"I": lambda x, p, y: y + p["b"]}, parameters=[tc.Parameter("b", unit="A")]),
+    ]  # fmt: skip
+    d = diagnose(diode, tc.Recording(x=volts, y={"I": current}), terms)
+    assert d.verdict == ("named" if shunt else "consistent")
+    assert d.terms == (["shunt"] if shunt else [])
+    low, high = d.noise.range["I"]
+    assert 0.03 * current.max() / 1.5 < high < 0.03 * current.max() * 1.5
+    assert 0.03 * current.min() / 6 < low < 0.03 * current.min() * 6
+
+
 @pytest.mark.slow
 def test_rows_of_a_grid_of_conditions_do_not_follow_one_another():
     # A smooth effect of the outer condition is steps along the rows, which looks like noise of correlation 0.95.

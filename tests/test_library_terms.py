@@ -8,6 +8,7 @@ import torch
 from torchcal import Parameter
 from torchcal.errors import DomainError
 from torchcal.simulators import ODESimulator, Values
+from torchcal.simulators.careful import takes_inputs
 from torchcal.terms import (
     electrical,
     extend,
@@ -178,12 +179,12 @@ def test_a_batch_gives_what_its_members_give_alone(case, term):
 
 @pytest.mark.parametrize(("case", "term"), TERMS)
 def test_initial_values_of_hidden_states(case, term):
-    _, s, p, _ = setting(case, term, batch=(4,), runs=1)
+    _, s, p, u = setting(case, term, batch=(4,), runs=1)
     known = {name: value for name, value in s.items() if name not in term.states}
     assert set(term.initial) == set(term.states) <= set(term.rates)
     for value in term.initial.values():
         if callable(value):
-            found = value(known, p)
+            found = value(known, p, u) if takes_inputs(value) else value(known, p)
             assert found.shape == (4, 1)
             assert bool(torch.isfinite(found).all())
         else:
@@ -413,12 +414,11 @@ def test_natural_convection_by_hand():
 
 
 def test_second_heat_capacity_begins_between_ambient_and_the_first():
-    for ambient, p in ((20.0, {}), ("Ta", {"Ta": tensor(20.0)})):
+    for ambient, p, u in ((20.0, {}, {}), ("Ta", {"Ta": tensor(20.0)}, {}), ("out", {}, {"out": tensor(20.0)})):
         term = term_of(thermal(ambient=ambient), "second heat capacity")
         (begin,) = term.initial.values()
-        torch.testing.assert_close(begin({"T": tensor(60.0)}, {"start": tensor(0.25), **p}), tensor(30.0), **EXACT)
-    (begin,) = term_of(thermal(ambient="out"), "second heat capacity").initial.values()
-    torch.testing.assert_close(begin({"T": tensor(60.0)}, {"start": tensor(0.25)}), tensor(60.0), **EXACT)
+        found = begin({"T": tensor(60.0)}, {"start": tensor(0.25), **p}, u)
+        torch.testing.assert_close(found, tensor(30.0), **EXACT)
 
 
 def test_torricelli_and_weir_by_hand():

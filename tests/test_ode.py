@@ -14,6 +14,7 @@ from torch import Tensor
 import torchcal as tc
 from torchcal.errors import DomainError, RecordingError, SimulatorError
 from torchcal.simulators import Solution, Trajectories, focused, settled, steps
+from torchcal.simulators.careful import takes_inputs
 from torchcal.simulators.recurrence import recur
 from torchcal.terms import extend
 
@@ -426,6 +427,40 @@ def test_gradients_by_autograd_pass_gradcheck() -> None:
     bound = per_run_model().bind(two_runs())
     values = torch.stack([tensor(1.0, 2.0, 0.8, 0.5, 0.3), tensor(0.5, 1.0, 1.2, 0.9, -0.4)]).requires_grad_(True)
     torch.autograd.gradcheck(bound.at(bound.x), values, eps=1e-6, atol=1e-7, rtol=1e-5)
+
+
+def test_an_initial_value_may_depend_on_what_an_input_is_when_a_run_begins() -> None:
+    model = tc.ODESimulator(
+        lambda t, s, p, u: {"T": s["W"] - s["T"], "W": p["k"] * (u["out"] - s["W"])},
+        ["T", "W"], [tc.Parameter("k"), tc.Parameter("a")],
+        observe=("T",), initial={"W": lambda s, p, u: u["out"] + p["a"] * (s["T"] - u["out"])},
+    )  # fmt: skip
+    wall = tc.Term(
+        "wall", rates={"T": lambda t, s, p, u: -p["c"] * (s["T"] - s["Z"]), "Z": lambda t, s, p, u: s["T"] - s["Z"]},
+        states={"Z": None}, initial={"Z": lambda s, p, u: p["d"] * u["out"]},
+        parameters=[tc.Parameter("c"), tc.Parameter("d", low=0.0, high=1.0)],
+    )  # fmt: skip
+    t = np.linspace(1.0, 3.0, 9)
+    recording = tc.Recording(
+        runs=[tc.Run(time=t, outputs={"T": t}, inputs={"out": 3.0 + t}, hold=hold) for hold in ("linear", "zero")]
+        + [tc.Run(time=t + 1, outputs={"T": t}, inputs={"out": np.cos(t)}, initial={"T": 2.0})]
+    )
+    bound = tc.terms.extend(model, [wall]).bind(recording)
+    assert bound.names == ("k", "a", "wall.c", "wall.d", "T(0)[0]", "T(0)[1]")
+    values = tensor(0.3, 0.25, 0.7, 0.5, 6.0, 8.0)
+    out, first = tensor(4.0, 4.0, float(np.cos(1.0))), tensor(6.0, 8.0, 2.0)
+    expected = torch.stack([first, out + 0.25 * (first - out), 0.5 * out], dim=-1)
+    torch.testing.assert_close(bound.layout.start(values[None])[0], expected, rtol=1e-14, atol=0)
+    found = bound.linearise(bound.x, values[None]).jacobian[0]
+    torch.testing.assert_close(found, differences(bound, values), rtol=1e-6, atol=1e-8)
+
+
+def test_a_function_of_an_initial_value_takes_inputs_only_where_it_asks_for_them() -> None:
+    assert takes_inputs(lambda s, p, u: 0.0)
+    assert not takes_inputs(lambda s, p: 0.0)
+    assert not takes_inputs(lambda s, p, late=1.0: 0.0)  # a number that a loop has left it
+    assert not takes_inputs(lambda *given: 0.0)
+    assert not takes_inputs(max)
 
 
 def test_sensitivities_of_a_term_with_a_hidden_state_and_a_sensor() -> None:

@@ -1,6 +1,7 @@
 """Calls of functions that users write, which are to leave what they are given as it is."""
 
 import copy
+import inspect
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -11,7 +12,7 @@ from torch import Tensor
 from torchcal.errors import SimulatorError
 from torchcal.simulators.dual import transformed
 
-__all__ = ["careful", "real", "unknown_name"]
+__all__ = ["careful", "real", "takes_inputs", "unknown_name"]
 
 
 def careful(seen: set[int], what: str, function: Callable[..., Any], **given: Any) -> Any:
@@ -81,6 +82,16 @@ def real(value: Any, like: Tensor, shape: torch.Size, what: str) -> Tensor:
         raise SimulatorError(
             f"Expected {what} of shape {tuple(shape)}. Got {tuple(value.shape)} (write it elementwise)."
         ) from error
+
+
+def takes_inputs(function: Callable[..., Any]) -> bool:
+    """Whether a function of an initial value is ``f(s, p, u)`` rather than ``f(s, p)``."""
+    try:
+        wanted = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):  # of some that are not written in Python
+        return False
+    places = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    return sum(one.kind in places and one.default is one.empty for one in wanted) > 2
 
 
 def unknown_name(error: Exception, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> str:

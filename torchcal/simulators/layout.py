@@ -11,7 +11,7 @@ from torch import Tensor
 from torchcal.data import Recording, Run
 from torchcal.display import raised
 from torchcal.errors import RecordingError, SimulatorError, TorchcalError
-from torchcal.simulators.careful import careful, real
+from torchcal.simulators.careful import careful, real, takes_inputs
 from torchcal.simulators.parameter import Parameter, in_run
 
 if TYPE_CHECKING:
@@ -91,6 +91,7 @@ class Layout:
                 parameters.append(parameter)
         self._own = len(parameters)  # the columns after these are initial states
         self._initial: list[dict[str, Any]] = []
+        self._first_inputs = [{name: float(values[0]) for name, values in run.inputs.items()} for run in runs]
         self.initial_names: list[str] = []
         for r, run in enumerate(runs):
             if unknown := [name for name in run.initial if name not in self._states]:
@@ -180,6 +181,7 @@ class Layout:
             entries: dict[str, Tensor] = {}
             own = {name: values[..., places[0 if len(places) == 1 else r], None]
                    for name, places in self._places.items()}  # fmt: skip
+            inputs = {name: values.new_full((1,), first) for name, first in self._first_inputs[r].items()}
             for state, value in known.items():
                 if isinstance(value, tuple):
                     entries[state] = values[..., value[1], None]
@@ -190,14 +192,16 @@ class Layout:
                     if isinstance(value, str):
                         entries[state] = entries[value]
                     elif callable(value):
-                        found = careful(self._seen, f"the initial value of {state!r}", value, s=entries, p=own)
+                        given = {"s": entries, "p": own} | ({"u": inputs} if takes_inputs(value) else {})
+                        found = careful(self._seen, f"the initial value of {state!r}", value, **given)
                         entries[state] = real(found, values, one, f"the initial value of {state!r}")
                 except TorchcalError:  # which says what to do
                     raise
                 except Exception as error:
                     raise SimulatorError(
                         f"Expected the initial value of {state!r} from those of {list(entries)}, which are known by "
-                        f"then, and parameters {list(own)}. It raised {raised(error)}."
+                        f"then, parameters {list(own)} and, as f(s, p, u), inputs {list(inputs)}. It raised "
+                        f"{raised(error)}."
                     ) from error
             rows.append(torch.cat([entries[state] for state in self._states], dim=-1))
         return torch.stack(rows, dim=-2)

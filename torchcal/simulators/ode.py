@@ -35,9 +35,9 @@ class ODESimulator(Simulator):
         observe: States that are observed, or a dict from output names to functions ``f(t, s, p, u)``. By default
             every state.
         initial: Initial values that the model itself knows, by state: a number, the name of another state whose
-            initial value it takes, or a function ``f(s, p)`` of the other states' initial values. What a run gives
-            comes first; what neither gives is calibrated, begun at the first recorded value of an output that is that
-            state as it is.
+            initial value it takes, or a function ``f(s, p)`` of the other states' initial values, or ``f(s, p, u)``
+            of these and a run's first inputs. What a run gives comes first; what neither gives is calibrated, begun at
+            the first recorded value of an output that is that state as it is.
         max_step: Longest time step. By default steps are halved until the solution stops changing.
         stiff: Whether steps are implicit, as some states follow others far faster than anything else happens. By
             default they are where explicit ones would have to be too short; with ``max_step`` only where this is True.

@@ -15,6 +15,7 @@ from torchcal.simulators import (
     Simulator,
     Trajectories,
 )
+from torchcal.simulators.careful import takes_inputs
 from torchcal.terms.term import Function, Term
 
 __all__ = ["extend"]
@@ -136,6 +137,8 @@ def _extend_ode(simulator: ODESimulator, terms: Sequence[Term]) -> ODESimulator:
 def _initial_of(term: Term, value: Any) -> Any:
     if not callable(value):
         return value
+    if takes_inputs(value):
+        return lambda s, p, u: value(s, term.own(p), u)
     return lambda s, p: value(s, term.own(p))
 
 

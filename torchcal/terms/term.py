@@ -62,7 +62,8 @@ class Term:
         rate: ``rate(t, s, p, u)``, added to that equation.
         rates: The same for several equations, and for its own states, by state.
         states: Hidden states of its own, with their units.
-        initial: Their initial values: a number, the name of another state, or ``f(s, p)``; 0 by default.
+        initial: Their initial values: a number, the name of another state, ``f(s, p)``, or ``f(s, p, u)`` with a run's
+            first inputs; 0 by default.
         outputs: By output ``f(t, s, p, u, y)`` in place of the simulated output y; ``f(x, p, y)`` for a static
             simulator.
         shifts: By parameter of the simulator ``f(t, s, p, u)``, added to it; ``f(x, p)`` for a static simulator.

@@ -138,7 +138,7 @@ def thermal(
              description="Constant heating, or cooling where q < 0, that nothing in the model accounts for.")
     )  # fmt: skip
     terms.append(_drift(T, loss, label, time))
-    terms.append(_second(T, ambient, label, time, unit))
+    terms.append(_second(T, ambient, surroundings, label, time, unit))
     if heater is not None:
         terms += _heater(check_name(heater, "heater"), T, label, time)
     return timed(terms, time)
@@ -161,14 +161,15 @@ def _drift(T: str, loss: str | None, label: str | None, time: str) -> Term:
     )  # fmt: skip
 
 
-def _second(T: str, ambient: float | str, label: str | None, time: str, unit: str) -> Term:
+def _second(
+    T: str, ambient: float | str, surroundings: Callable[..., Any], label: str | None, time: str, unit: str
+) -> Term:
     name = titled("second heat capacity", label)
     inner = f"{name}: {T}"
     k, tau, start = (own_name(own, ambient) for own in ("k", "tau", "start"))
 
-    def begin(s: Any, p: Any) -> Any:
-        # An ambient that is an input is not known here: the second body then starts as warm as the first.
-        outside = s.get(ambient, p.get(ambient, s[T])) if isinstance(ambient, str) else ambient
+    def begin(s: Any, p: Any, u: Any) -> Any:
+        outside = surroundings(s, p, u)
         return outside + p[start] * (s[T] - outside)
 
     return Term(

@@ -160,7 +160,7 @@ def alone(found: Fitted, noise: Noise, tangents: Tangents) -> tuple[Noise, float
                 here = mine(problem, k)
                 sd[here] = sizes[k, best[k]].sqrt() * unit[here]
     if noise.open:
-        sd = torch.maximum(sd, least(problem, noise.step))
+        sd = torch.maximum(sd, least(problem, noise.step, unit))
         noise = dataclasses.replace(noise, freedom=torch.where(count > 0, freedom, math.inf))
     fresh = dataclasses.replace(noise, sd=sd, correlation=correlation, posterior=posterior)
     return fresh, log_likelihood(found, fresh, tangents)
@@ -300,5 +300,5 @@ def _at(
             size = noise.sizes[output, place] * noise.unit[here] if other else sd[here]
             sd[here] = shares[output][factor, place] * size
     if noise.open:
-        sd = torch.maximum(sd, least(model.problem, noise.step))
+        sd = torch.maximum(sd, least(model.problem, noise.step, noise.unit))
     return dataclasses.replace(noise, sd=sd, correlation=correlation, posterior=posterior)

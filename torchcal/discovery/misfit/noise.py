@@ -31,7 +31,7 @@ LEAST = 40
 #: Posterior probability of the two smallest coefficients below which a correlation is clear, and the quantile of the
 #: posterior at which it is taken then.
 CLEAR, CAUTION = 0.05, 0.6
-#: Smallest noise sd that is estimated, in the output's spread.
+#: Smallest noise sd that is estimated, in the output's spread; of noise that grows, where it is largest.
 FLOOR = 1e-7
 #: Ratio of the largest to the smallest sd of an output from which on both are told.
 VARIES = 1.05
@@ -212,7 +212,7 @@ def estimate(
             excess[recording.outputs[output]] = scale
     step = quantisation(problem) if given is None else {}
     if given is None:
-        sd = torch.maximum(sd, least(problem, step))
+        sd = torch.maximum(sd, least(problem, step, unit))
     source = "given" if isinstance(given, Tensor) else "replicates" if replicated is not None else "estimated"
     return Noise(sd, correlation, freedom, posterior, source, table, excess, step, unit, log_density)
 
@@ -227,9 +227,11 @@ def mine(problem: Problem, output: int) -> Tensor:
     return torch.arange(len(problem.recording.y)) // problem.recording.n == output
 
 
-def least(problem: Problem, step: dict[str, float]) -> Tensor:
-    """Smallest noise sd of all data ``(n_total,)``: a perfect fit would leave no unit to measure anything in."""
-    sd = FLOOR * problem.recording.spread
+def least(problem: Problem, step: dict[str, float], unit: Tensor) -> Tensor:
+    """Smallest noise sd of all data ``(n_total,)``, in proportion to a unit as that of `Noise`: a perfect fit would
+    leave nothing to measure anything in."""
+    by_output = unit.expand_as(problem.recording.y).reshape(len(problem.recording.outputs), -1)
+    sd = FLOOR * problem.recording.spread * (by_output / by_output.amax(1, keepdim=True)).flatten()
     for name, size in step.items():
         mask = mine(problem, problem.recording.outputs.index(name))
         sd[mask] = sd[mask].clamp_min(size / math.sqrt(12.0))
