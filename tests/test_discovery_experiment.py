@@ -412,7 +412,7 @@ def test_what_each_run_has_for_itself_is_unknown_in_a_new_one():
 
 def test_static_experiments_stay_within_what_is_feasible_and_go_up_to_its_ends():
     x = {"T": torch.linspace(290, 320, 30, dtype=F64), "dose": torch.linspace(1, 2, 30, dtype=F64)[_order(30)]}
-    recording = tc.Recording(x=x, y=torch.zeros(30, dtype=F64))
+    recording = tc.Recording(x=x, y=torch.zeros(30, dtype=F64), units={"T": "K"})
     model = SimpleNamespace(problem=SimpleNamespace(in_time=False, recording=recording))
     feasible = Feasible.of({"T": (285.0, 320.0), "dose": (None, 2.2)}, None, recording)
     options = [*conditions.simple(model, feasible), *conditions.bolder(model, feasible)]
@@ -423,7 +423,7 @@ def test_static_experiments_stay_within_what_is_feasible_and_go_up_to_its_ends()
         assert float(new.x["dose"].max()) <= 2.2 + 1e-9
         assert "T above" not in text
     texts = [text for text, _, _ in options]
-    assert "conditions with T below the recorded range, to 285" in texts
+    assert "conditions with T below the recorded range, to 285 K" in texts
     assert "conditions with dose above the recorded range, to 2.2" in texts
     assert any(float(new.x["dose"].min()) < 0.9 for _, new, _ in options)  # that end is open
 

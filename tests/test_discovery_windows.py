@@ -428,6 +428,8 @@ def test_a_local_term_whose_shape_shows_is_named_all_the_same():
     d = diagnose(oscillator(), recording, terms)
     assert (d.verdict, d.terms) == ("named", ["quadratic drag"])
     assert float(d.settings["region"].removeprefix("v > ")) == pytest.approx(0.4, abs=0.1)
+    (begin,) = (e for row in d.ranking for e in row.estimates if row.terms == ("quadratic drag",) and "from" in e.name)
+    assert begin.unit == "m/s"
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchcal.data import Recording, Run
 from torchcal.discovery.findings.feasible import Feasible
 from torchcal.discovery.fits.fitting import Fitted
-from torchcal.display import between, placed
+from torchcal.display import between, placed, unit_of, units_of, with_unit
 from torchcal.simulators import Trajectories
 
 __all__ = ["Option", "bolder", "denser", "simple"]
@@ -181,7 +181,8 @@ def _cut(recording: Recording, option: Option, feasible: Feasible) -> Option:
         return option
     inputs = {name: values[kept] for name, values in chosen["inputs"].items()}
     chosen = {**chosen, "time": chosen["time"][kept], "inputs": inputs}
-    return f"{text}, until t = {last:.4g}", Recording(runs=[_blank_run(recording, chosen)]), chosen
+    until = with_unit(f"{last:.4g}", unit_of("t", units_of(recording, None)))
+    return f"{text}, until t = {until}", Recording(runs=[_blank_run(recording, chosen)]), chosen
 
 
 def _at_ends(recording: Recording, begin: _Begin, feasible: Feasible) -> list[Option]:
@@ -316,7 +317,8 @@ def _static(recording: Recording, feasible: Feasible) -> list[Option]:
             ranges.append(feasible.within(name, *feasible[name]))
         thirds = [ends for ends in dict.fromkeys(ranges) if ends is not None]
         for text, ends in zip(between(thirds, "and"), thirds, strict=True):
-            found.append(_moved(recording, f"conditions with {name} between {text}", {name: ends}, feasible))
+            text = with_unit(f"conditions with {name} between {text}", recording.units.get(name))
+            found.append(_moved(recording, text, {name: ends}, feasible))
     for name in x:
         for text, ends in _outside(recording, name, BEYOND, feasible):
             found.append(_moved(recording, f"conditions with {name} {text}", {name: ends}, feasible))
@@ -346,13 +348,18 @@ def _outside(
     width = high - low
     if not width:  # one value tells nothing of how far others may be
         return []
+    unit = recording.units.get(name)
+
+    def to(end: float) -> str:
+        return f"to {with_unit(placed(end, width), unit)}"
+
     above = feasible.clipped(name, high + share * width)
-    found = [(f"above the recorded range, to {placed(above, width)}", (high, above))] if above > high else []
+    found = [(f"above the recorded range, {to(above)}", (high, above))] if above > high else []
     # Of what spans decades a share of the width is below nothing; a factor is as far on their scale.
     below = low / (1 + 4 * share) if 0 < low < share * width else low - share * width
-    below = feasible.clipped(name, max(below, ABSOLUTE_ZERO.get(recording.units.get(name, ""), -math.inf)))
+    below = feasible.clipped(name, max(below, ABSOLUTE_ZERO.get(unit or "", -math.inf)))
     if (below >= 0 or low < 0) and below < low:
-        found.append((f"below the recorded range, to {placed(below, width)}", (below, low)))
+        found.append((f"below the recorded range, {to(below)}", (below, low)))
     return found
 
 

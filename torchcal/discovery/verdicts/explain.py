@@ -16,6 +16,7 @@ from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.structure import Structure
 from torchcal.discovery.records import Estimate, Fit
 from torchcal.display import unit_of, units_of
+from torchcal.simulators import Trajectories
 
 __all__ = [
     "deeper",
@@ -86,7 +87,10 @@ def estimates(
         value, unit = float(found.values[i]), q.unit
         spread = float(sd[i])
         if window is not None and q.name.endswith(tuple(ENDS.values())):
-            unit = unit_of(window.driver, units_of(found.problem.recording, found.problem.simulator)) or None
+            simulator = found.problem.simulator
+            model = simulator.ode if isinstance(simulator, Trajectories) else simulator
+            units = units_of(found.problem.recording, model)
+            unit = unit_of(window.driver, units) or None
         if window is not None and not found.problem.in_time and q.name.endswith(tuple(ENDS.values())):
             spread = _stepped_sd(found, i, window, spread)
         allowed = math.inf if q.low is None or q.high is None else q.high - q.low
