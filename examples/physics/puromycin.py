@@ -7,7 +7,7 @@ The rate of a reaction that an enzyme speeds up follows Michaelis and Menten,
 with c the concentration of the substrate. Real enzymes may cooperate (Hill exponent), be inhibited by their own
 substrate, or let some react without them, and a counter has a background. None of it shows here: the twelve rates are
 six pairs at equal concentration, whose differences give a noise sd of 10.8 counts/min² without any model, and the
-fitted curve leaves 10.9. The background is the closest: 32 ± 13 counts/min², one in thirty by chance for a single
+fitted curve leaves 10.9. The background is the closest: 32 ± 15 counts/min², one in thirty by chance for a single
 look, and every candidate is a look. The verdict must be ``consistent``.
 
 Recording: typed in (see `data.puromycin` for the source). The noise is not known, but there are replicates.

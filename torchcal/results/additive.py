@@ -114,14 +114,23 @@ class AdditiveCalibration(Result):
         return draws
 
     def to_datatree(self) -> Any:
-        """The result as an ``xarray.DataTree``."""
+        """The result as an ``xarray.DataTree``: groups posterior, map, prediction, observed_data, constant_data."""
         return storage.additive_tree(self)
 
     @classmethod
     def load(
         cls, path: str | os.PathLike[str], *, simulator: Simulator | None = None
     ) -> "AdditiveCalibration":
-        """Read a result that `save` wrote."""
+        """Read a result that `save` wrote.
+
+        Args:
+            path: The file.
+            simulator: The simulator it was calibrated with, for predictions elsewhere than at the data.
+
+        Raises:
+            TorchcalError: If there is no such file, or it is none of these, damaged, or of another version.
+            SimulatorError, EmbeddingError, RecordingError: If the simulator is another one than that of the file.
+        """
         return reading.read_additive(cls, path, simulator)
 
     def __str__(self) -> str:

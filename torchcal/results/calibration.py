@@ -73,6 +73,11 @@ class Calibration(Result):
             function: ``function(x, p)`` of the same parameters, for another quantity of interest; its conditions
                 may have other names than the data's.
             max_draws: At most this many draws, evenly spaced, are averaged over.
+
+        Raises:
+            DomainError: If there is no simulator, as none was given to `load`; or times or runs are none of the
+                recording's.
+            SimulatorError, RecordingError: If the conditions are not those that the simulator takes.
         """
         if self.propagate is None and x is None and function is None and self.stored is not None:
             return self.stored
@@ -117,6 +122,9 @@ class Calibration(Result):
             x: Conditions; the data's by default.
             kind: ``"posterior"`` (Eq. 31) or ``"map"`` (Eq. 30).
             seed: Of the draws.
+
+        Raises:
+            DomainError: As `predict`; or if there are no draws, and ``kind`` is ``"posterior"``.
         """
         with warned_once():
             propagate = self.propagation_at(x)
@@ -125,14 +133,23 @@ class Calibration(Result):
                 return propagate.outputs_at(alpha, xi, paired=True).to(device="cpu", dtype=torch.float64)
 
     def sample_parameters(self, num: int, *, kind: str = "posterior", seed: int = 0) -> Tensor:
-        """Draws of λ in physical units, ``(num, d)``, from the posterior or MAP predictive density (Eq. 44)."""
+        """Draws of λ in physical units, ``(num, d)``, from the posterior or MAP predictive density (Eq. 44).
+
+        Raises:
+            DomainError: As `sample_outputs`.
+        """
         propagate = self.propagation_at()
         alpha, xi = self._joint_draws(propagate, num, kind, seed)
         with torch.no_grad():
             return propagate.parameters_at(alpha, xi, paired=True).to(device="cpu", dtype=torch.float64)
 
     def parameter_density(self, points: Any, *, kind: str = "posterior", max_draws: int = 1000) -> Tensor:
-        """Density of λ at physical points ``(M, d)``, of the posterior or MAP predictive (Eq. 44)."""
+        """Density of λ at physical points ``(M, d)``, of the posterior or MAP predictive (Eq. 44).
+
+        Raises:
+            DomainError: As `sample_outputs`.
+            ShapeError: If the points are no numbers of that shape.
+        """
         propagate = self.propagation_at()
         alpha = self.map.alpha[None] if self._kind(kind) == "map" else thin(self.draws, max_draws)
         if alpha is None:
@@ -175,7 +192,8 @@ class Calibration(Result):
         return draws[chosen].to(like), xi
 
     def to_datatree(self) -> Any:
-        """The result as an ``xarray.DataTree``: groups posterior, map, prediction, observed_data."""
+        """The result as an ``xarray.DataTree``: groups posterior, map, prediction, observed_data,
+        constant_data."""
         return storage.calibration_tree(self)
 
     @classmethod
@@ -185,6 +203,10 @@ class Calibration(Result):
         Args:
             path: The file.
             simulator: The simulator it was calibrated with, for predictions elsewhere than at the data.
+
+        Raises:
+            TorchcalError: If there is no such file, or it is none of these, damaged, or of another version.
+            SimulatorError, EmbeddingError, RecordingError: If the simulator is another one than that of the file.
         """
         return reading.read_calibration(cls, path, simulator)
 

@@ -93,7 +93,7 @@ def build_surrogate(
 
     Warns:
         SurrogateWarning: If the error is above `threshold`.
-        TorchcalWarning: If workers died; nothing is lost then.
+        WorkerWarning: If workers died; nothing is lost then.
 
     Source: Sargsyan, Najm & Ghanem (2015), Int. J. Chem. Kinet. 47, 246-276, Eqs. 41-43; with ``points=``
     A. Cohen & G. Migliorati (2017), SMAI J. Comput. Math. 3, 181-203.

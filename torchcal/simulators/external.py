@@ -57,7 +57,7 @@ class ExternalSimulator(Simulator):
             an evaluation raises, kills a worker again and again, or returns something that is not a real number.
 
     Warns:
-        TorchcalWarning: If workers died; nothing is lost then.
+        WorkerWarning: If workers died; nothing is lost then.
 
     A calibration calls a simulator thousands of times: for an expensive one build a surrogate first
     (`build_surrogate`).

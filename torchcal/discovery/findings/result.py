@@ -117,7 +117,8 @@ class Diagnosis:
         return f"<pre>{html.escape(str(self))}</pre>"
 
     def plot(self, fig: Any = None) -> Any:
-        """Draw data with both fits, where the mismatch sits, the ranking, and held-out data before and after."""
+        """Draw data with both fits, where the mismatch sits, the ranking, what is needed, held-out data before and after,
+        and detection limits: what there is of them."""
         from torchcal import plots
 
         return plots.discovery_overview(self, fig=fig)
@@ -137,7 +138,14 @@ class Diagnosis:
         as_json.write(self, path)
 
     def report(self, path: str | os.PathLike[str]) -> None:
-        """Write everything into one self-contained HTML page."""
+        """Write everything into one self-contained HTML page.
+
+        Args:
+            path: The file; an older one is replaced. Its folder must exist.
+
+        Raises:
+            DomainError: If the folder does not exist, or the path is a folder.
+        """
         from torchcal import report
 
         report.write(self, path)
