@@ -10,8 +10,8 @@ DOCS = Path(__file__).parents[1] / "docs"
 GUIDES = sorted(path for path in (DOCS / "how_to").glob("*.md") if path.stem != "index")
 #: Seconds each, and a quarter of a minute or longer.
 QUICK = (
-    "command_line", "diagnostics", "expensive", "hold_out", "noise_and_missing", "several_outputs", "what_is_noise",
-    "write_a_term",
+    "command_line", "diagnostics", "embeddings", "expensive", "hold_out", "noise_and_missing", "several_outputs",
+    "what_is_noise", "write_a_term",
 )  # fmt: skip
 LONGER = (
     "diagnose_in_time", "diagnose_static", "epsilon_and_gamma", "pyro_model", "read_a_diagnosis", "samplers", "saving",
