@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 
 import torchcal as tc
 from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.hypotheses.judge import _unseen
 from torchcal.discovery.verdicts import verdict
 from torchcal.discovery.verdicts.doubts import between_outputs
 from torchcal.display import NONE
@@ -644,3 +645,42 @@ def test_what_two_outputs_share_is_told_where_nothing_is_missing(size):
     assert d.verdict == "consistent"
     told = "what is left of i goes with what is left of w" in " ".join(str(d).split())
     assert told == (size > 0)
+
+
+@pytest.mark.parametrize("begun", [1.0, 0.0])
+def test_a_pump_that_is_late_may_have_run_before_the_recording(begun):
+    """The late flow begins anywhere between none and what is asked for. Begun at none, steady pumps were unexplained,
+    and an actuator's lag was called one of the sensor."""
+    t = np.arange(0.0, 200.0, 2.0)
+    asked = np.where(t < 20, 2.0, 2 + 0.8 * np.sign(np.sin(2 * np.pi * (t - 20) / 70)))
+    level = np.empty((2, len(t)))
+    level[:, 0] = 1.0, 2.0 * begun
+    for j in range(len(t) - 1):
+        level[:, j + 1] = solve_ivp(
+            lambda _, y, q: [0.01 * y[1] - 0.02 * math.sqrt(y[0]), (q - y[1]) / 8], (0, 2), level[:, j],
+            args=(asked[j],), rtol=1e-9, atol=1e-11,
+        ).y[:, -1]  # fmt: skip
+    noisy = level[0] + 0.003 * np.random.default_rng(1).standard_normal(len(t))
+    tank = tc.ODESimulator(
+        lambda t, s, p, u: {"h": p["k"] * u["pump"] - p["c"] * s["h"].clamp_min(1e-9).sqrt()}, {"h": "m"},
+        [tc.Parameter("k", low=0.0, initial=0.01), tc.Parameter("c", low=0.0, initial=0.02)],
+    )  # fmt: skip
+    run = tc.Run(time=t, outputs={"h": noisy}, inputs={"pump": asked}, hold="zero")
+    library = [
+        term for term in tc.terms.hydraulics(level="h", inflow="pump", outlet="c")
+        if term.name in ("pump lag", "pump saturation", "seepage", "overflow")
+    ]  # fmt: skip
+    d = tc.diagnose(tank, tc.Recording(runs=[run]), [*library, *tc.terms.sensor(("h",))], seed=0, progress=False)
+    # Beside a pump that has run steadily a sensor that lags does nearly the same.
+    assert d.terms == ["pump lag"] if begun == 0 else d.tied[:2] == [["lag of h"], ["pump lag"]]
+    found = {e.name: e for row in d.ranking if row.terms == ("pump lag",) and not row.region for e in row.estimates}
+    assert found["pump lag.tau"].value == pytest.approx(8.0, abs=4 * found["pump lag.tau"].sd)
+    assert found["pump lag.start"].value == pytest.approx(begun, abs=max(4 * found["pump lag.start"].sd, 0.05))
+
+
+def test_where_a_lag_begins_costs_nothing_where_it_follows_nothing_yet():
+    found = SimpleNamespace(free=[0, 1, 2, 3], jacobian=torch.tensor([[1.0, 2.0, 0.5, 0.0], [1.0, 0.0, 0.1, 0.0]]))
+    acting = SimpleNamespace(found=found, candidate=SimpleNamespace(amplitudes=[1], own=[1, 2, 3]))
+    assert _unseen(acting) == {3}
+    idle = SimpleNamespace(found=found, candidate=SimpleNamespace(amplitudes=[3], own=[2, 3]))
+    assert _unseen(idle) == set()  # what does nothing at all is paid for in full

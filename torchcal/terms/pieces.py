@@ -93,12 +93,12 @@ def lagging(name: str, equation: str, drive: str, unit: str, time: str, descript
             hidden: lambda t, s, p, u: (u[drive] - s[hidden]) / p["tau"],
         },
         states={hidden: f"[{drive}]"},
-        initial={hidden: 0.0},
-        parameters=[amplitude("g", unit, low=0.0), shape("tau", time)],
+        initial={hidden: lambda s, p, u: p["start"] * u[drive]},
+        parameters=[amplitude("g", unit, low=0.0), shape("tau", time), shape("start", "1", 0.0, 1.0)],
         scales={"tau": "t"},
         takes=drive,
         formula=f"d{equation}/dt ∋ g ({drive}_late - {drive}), "
-        f"d{drive}_late/dt = ({drive} - {drive}_late)/tau, {drive}_late(0) = 0",
+        f"d{drive}_late/dt = ({drive} - {drive}_late)/tau, {drive}_late(0) = start {drive}(0)",
         description=description,
     )
 

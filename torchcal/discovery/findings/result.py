@@ -117,8 +117,8 @@ class Diagnosis:
         return f"<pre>{html.escape(str(self))}</pre>"
 
     def plot(self, fig: Any = None) -> Any:
-        """Draw data with both fits, where the mismatch sits, the ranking, what is needed, held-out data before and after,
-        and detection limits: what there is of them."""
+        """Draw data with both fits, where the mismatch sits, the ranking, what is needed, held-out data before and
+        after, and detection limits: what there is of them."""
         from torchcal import plots
 
         return plots.discovery_overview(self, fig=fig)

@@ -48,8 +48,19 @@ def judge(model: Model, base: Fitted) -> None:
         model.note = f"at its bound: {', '.join(new)}"
     else:
         model.note = ""
-    parameters = len([i for i in candidate.own if names[i] not in off])
+    unseen = _unseen(model)
+    parameters = len([i for i in candidate.own if names[i] not in off and i not in unseen])
     model.price = -0.5 * parameters * math.log(base.problem.n) + (UNPHYSICAL if new else 0.0) + _expected(model)
+
+
+def _unseen(model: Model) -> set[int]:
+    """Places of the shapes of effects that act on which no datum depends, as where a lag begins that follows nothing
+    yet: they fit nothing, and cost nothing."""
+    found = model.found
+    moves = dict(zip(found.free, (found.jacobian != 0).any(0).tolist(), strict=True))
+    if not any(moves[i] for i in model.candidate.amplitudes):
+        return set()
+    return {i for i in model.candidate.own if not moves[i]} - set(model.candidate.amplitudes)
 
 
 def _expected(model: Model) -> float:
