@@ -488,7 +488,7 @@ def response(term, p, signal, end, steps=2000):
     p = {name: tensor(value) for name, value in p.items()}
     hidden = list(term.states)
     z = [term.initial[name] for name in hidden]
-    z = torch.stack([value({"x": signal(tensor(0.0))}, p) if callable(value) else tensor(value) for value in z])
+    z = torch.stack([value({"x": signal(tensor(0.0))}, p, {}) if callable(value) else tensor(value) for value in z])
 
     def slope(t, z):
         s = {"x": signal(t), **dict(zip(hidden, z, strict=True))}

@@ -455,6 +455,20 @@ def test_an_initial_value_may_depend_on_what_an_input_is_when_a_run_begins() -> 
     torch.testing.assert_close(found, differences(bound, values), rtol=1e-6, atol=1e-8)
 
 
+def test_an_instrument_that_lags_begins_at_an_output_that_depends_on_an_input() -> None:
+    model = tc.ODESimulator(
+        lambda t, s, p, u: {"v": u["i"] - p["k"] * s["v"]}, ["v"], [tc.Parameter("k")],
+        observe={"w": lambda t, s, p, u: s["v"] + 0.5 * u["i"]},
+    )  # fmt: skip
+    lag = next(
+        term for term in tc.terms.sensor({"w": lambda t, s, p, u: s["v"] + 0.5 * u["i"]}) if term.name == "lag of w"
+    )
+    t = np.linspace(0.0, 2.0, 9)
+    run = tc.Run(time=t, outputs={"w": t}, inputs={"i": 3.0 + t}, initial={"v": 1.0})
+    bound = tc.terms.extend(model, [lag]).bind(tc.Recording(runs=[run]))
+    assert bound.layout.start(tensor(0.3, 1.0, 0.7)[None]).tolist() == [[[1.0, 2.5]]]
+
+
 def test_a_function_of_an_initial_value_takes_inputs_only_where_it_asks_for_them() -> None:
     assert takes_inputs(lambda s, p, u: 0.0)
     assert not takes_inputs(lambda s, p: 0.0)

@@ -45,7 +45,7 @@ def sensor(
     Args:
         outputs: Names of the outputs. Lag and delay follow the state of the same name; for an output that is a
             function of the states, give ``{output: f(t, s, p, u)}``. They begin at its first value, which must follow
-            from states and parameters alone; where it depends on t or an input, say ``dynamic=False``.
+            from states, parameters and inputs; where it depends on t, say ``dynamic=False``.
         static: Whether they are outputs of a static simulator: then there is neither lag nor delay, and a drift only
             against a condition.
         drift: Condition against which the instrument of a static simulator drifts, and the value at which it reads
@@ -172,20 +172,12 @@ def _dynamic(output: str, unit: str, time: str, given: Signal) -> list[Term]:
     def signal(t: Any, s: Any, p: Any, u: Any) -> Any:
         return given(t, s, outer(p), u)
 
-    def first(s: Any, p: Any) -> Any:
+    def first(s: Any, p: Any, u: Any) -> Any:
         like = next(iter(s.values()))
-        try:
-            found, later = (torch.as_tensor(signal(torch.full_like(like, t), s, p, {})) for t in (0.0, 1.0))
-        except DomainError:  # which says what to do
-            raise
-        except Exception as error:
-            raise DomainError(
-                f"Expected the output {output!r} from states and parameters alone, to begin its lag with. It fails "
-                f"without inputs ({type(error).__name__}: {error}). Use dynamic=False to leave lag and delay out."
-            ) from error
+        found, later = (torch.as_tensor(signal(torch.full_like(like, t), s, p, u)) for t in (0.0, 1.0))
         if not torch.equal(found.nan_to_num(), later.nan_to_num()):  # a run need not begin at t = 0
             raise DomainError(
-                f"Expected the output {output!r} from states and parameters alone, to begin its lag with. It depends "
+                f"Expected the output {output!r} from states, parameters and inputs, to begin its lag with. It depends "
                 "on t. Use dynamic=False to leave lag and delay out."
             )
         return found
@@ -210,7 +202,7 @@ def _dynamic(output: str, unit: str, time: str, given: Signal) -> list[Term]:
              parameters=[amplitude("a", "1", low=0.0, high=1.5), shape("t90", time)], scales={"t90": "t"},
              expected={"a": NATURE},
              formula=f"{output} → {output} + a ({output}_shown - {output}), "
-             f"d{output}_shown/dt = 2.303 ({output} - {output}_shown)/t90",
+             f"d{output}_shown/dt = 2.303 ({output} - {output}_shown)/t90, {output}_shown(0) = {output}(0)",
              description="The instrument follows with a response time t90 (to 90 % of a step); a = 1 in nature."),
         Term(delay,
              rates={smooth: lambda t, s, p, u: s[slope], slope: lambda t, s, p, u: s[bend], bend: jerk},
