@@ -54,7 +54,7 @@ TERMS = [pytest.param(case, term, id=f"{case}: {term.name}") for case in CASES f
 
 
 def is_amplitude(parameter):
-    return parameter.neutral is not None
+    return parameter.neutral is not None and parameter.name != "start"
 
 
 def draw(generator, *size):
@@ -184,7 +184,8 @@ def test_initial_values_of_hidden_states(case, term):
     assert set(term.initial) == set(term.states) <= set(term.rates)
     for value in term.initial.values():
         if callable(value):
-            found = value(known, p, u) if takes_inputs(value) else value(known, p)
+            given = p | term.numbers
+            found = value(known, given, u) if takes_inputs(value) else value(known, given)
             assert found.shape == (4, 1)
             assert bool(torch.isfinite(found).all())
         else:
@@ -485,7 +486,7 @@ def test_a_hard_limit_clips_both_sides():
 
 def response(term, p, signal, end, steps=2000):
     """What the instrument shows at the end, by Runge-Kutta; the signal is the state x."""
-    p = {name: tensor(value) for name, value in p.items()}
+    p = {name: tensor(value) for name, value in ({"start": 0.0} | p | term.numbers).items()}
     hidden = list(term.states)
     z = [term.initial[name] for name in hidden]
     z = torch.stack([value({"x": signal(tensor(0.0))}, p, {}) if callable(value) else tensor(value) for value in z])
@@ -503,6 +504,26 @@ def response(term, p, signal, end, steps=2000):
         z, t = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4), t + h
     s = {"x": signal(t), **dict(zip(hidden, z, strict=True))}
     return float(term.outputs["x"](t, s, p, {}, signal(t)))
+
+
+@pytest.mark.parametrize(("case", "term"), TERMS)
+def test_hidden_states_begin_where_they_usually_do_unless_data_tell(case, term):
+    starts = [parameter for parameter in term.parameters if parameter.name == "start"]
+    if not starts:
+        return
+    _, s, p, u = setting(case, term, batch=(4,), runs=1)
+    s = {name: value for name, value in s.items() if name not in term.states}
+    (begins,) = {*term.initial.values()}  # branches of a ladder begin alike
+    found = []
+    for share in (0.0, 0.25, 1.0):
+        given = p | term.numbers | {"start": tensor(share)}
+        found.append(begins(s, given, u) if takes_inputs(begins) else begins(s, given))
+    torch.testing.assert_close(found[1], found[0] + 0.25 * (found[2] - found[0]), **EXACT)
+    assert bool((found[2] != found[0]).all())
+    (start,) = starts
+    if case != "thermal, input" and start.neutral is not None:
+        assert start.low < start.neutral < start.high
+    assert term.name in ("second heat capacity",) or start.neutral in (0.0, 1.0)
 
 
 def test_response_time_of_a_lag():

@@ -354,7 +354,8 @@ def record(field: Field, effect: str, seed: int) -> tuple[tc.Recording, Tensor]:
     term = next(term for term in field.library if term.name == effect)
     recording = tc.Recording(runs=field.runs({}))
     bound = Trajectories(tc.terms.extend(field.base, [term]), recording, subdivide=8)
-    values = field.values | {f"{effect}.{name}": value for name, value in field.effects[effect].items()}
+    usual = {term.full(q.name): q.neutral for q in term.parameters if q.name == "start"}
+    values = field.values | usual | {f"{effect}.{name}": value for name, value in field.effects[effect].items()}
     row = torch.tensor([[values[q.name] for q in bound.parameters]], dtype=F64)
     clean = bound.linearise(recording.x, row, recording.outputs, []).y[0]
     generator = torch.Generator().manual_seed(seed)

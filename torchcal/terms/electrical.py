@@ -3,9 +3,10 @@
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from torchcal.errors import DomainError
-from torchcal.terms.pieces import amplitude, check_name, own_name, quantity, shape, timed, titled
+from torchcal.terms.pieces import amplitude, check_name, own_name, quantity, shape, start, timed, titled
 from torchcal.terms.term import Term
 
 __all__ = ["electrical"]
@@ -113,9 +114,10 @@ def _absorption(v: str, label: str | None, volt: str, time: str) -> Term:
         name,
         rates={v: lambda t, s, p, u: -p["k"] * (s[v] - s[hidden]),
                hidden: lambda t, s, p, u: (s[v] - s[hidden]) / p["tau"]},
-        states={hidden: volt}, initial={hidden: v},
-        parameters=[amplitude("k", f"1/{time}", low=0.0), shape("tau", time)], scales={"tau": "t"},
-        formula=f"d{v}/dt ∋ -k ({v} - {v}_slow), d{v}_slow/dt = ({v} - {v}_slow)/tau, {v}_slow(0) = {v}(0)",
+        states={hidden: volt}, initial={hidden: lambda s, p: p["start"] * s[v]},
+        parameters=[amplitude("k", f"1/{time}", low=0.0), shape("tau", time), start(1.0, -1.0, 3.0)],
+        scales={"tau": "t"},
+        formula=f"d{v}/dt ∋ -k ({v} - {v}_slow), d{v}_slow/dt = ({v} - {v}_slow)/tau, {v}_slow(0) = start {v}(0)",
         description="Charge that creeps into the dielectric and back, as a resistor and capacitor in parallel do.",
     )  # fmt: skip
 
@@ -136,9 +138,11 @@ def _warburg(v: str, label: str | None, volt: str, time: str) -> Term:
     rates: dict[str, Any] = {v: current}
     rates |= {branch: following(branch, stretch) for branch, (stretch, _) in zip(hidden, LADDER, strict=True)}
     return Term(
-        name, rates=rates, states=dict.fromkeys(hidden, volt), initial=dict.fromkeys(hidden, v),
-        parameters=[amplitude("k", f"1/{time}", low=0.0), shape("tau", time)], scales={"tau": "t"},
-        formula=f"d{v}/dt ∋ -k Σ wj ({v} - zj), dzj/dt = ({v} - zj)/(nj tau), zj(0) = {v}(0), nj = 1, 8, 64",
+        name, rates=rates, states=dict.fromkeys(hidden, volt),
+        initial=dict.fromkeys(hidden, lambda s, p: p["start"] * s[v]),
+        parameters=[amplitude("k", f"1/{time}", low=0.0), shape("tau", time), start(1.0, -1.0, 3.0)],
+        scales={"tau": "t"},
+        formula=f"d{v}/dt ∋ -k Σ wj ({v} - zj), dzj/dt = ({v} - zj)/(nj tau), zj(0) = start {v}(0), nj = 1, 8, 64",
         description="Diffusion of ions or carriers, whose current after a step falls as one over the root of time.",
     )  # fmt: skip
 
@@ -159,13 +163,17 @@ def _self_heating(resistance: str, heated_by: tuple[str, str], label: str | None
     driver, unit = heated_by
     heat = quantity(driver, "what heats the resistance")
     a, tau = own_name("a", resistance, driver), own_name("tau", resistance, driver)
+
+    def heating(s: Any, p: Any, u: Any) -> Tensor:
+        return torch.as_tensor(heat(s, p, u)).square()
+
     return Term(
         name,
-        rates={warmth: lambda t, s, p, u: (torch.as_tensor(heat(s, p, u)).square() - s[warmth]) / p[tau]},
+        rates={warmth: lambda t, s, p, u: (heating(s, p, u) - s[warmth]) / p[tau]},
         shifts={resistance: lambda t, s, p, u: p[resistance] * p[a] * s[warmth]},
-        states={warmth: f"{unit}^2"}, initial={warmth: 0.0},
-        parameters=[amplitude(a, f"1/{unit}^2", low=0.0), shape(tau, time)], scales={tau: "t"},
-        formula=f"{resistance} → {resistance} (1 + {a} θ), dθ/dt = ({driver}² - θ)/{tau}, θ(0) = 0",
+        states={warmth: f"{unit}^2"}, initial={warmth: lambda s, p, u: p["start"] * heating(s, p, u)},
+        parameters=[amplitude(a, f"1/{unit}^2", low=0.0), shape(tau, time), start(usual=0.0)], scales={tau: "t"},
+        formula=f"{resistance} → {resistance} (1 + {a} θ), dθ/dt = ({driver}² - θ)/{tau}, θ(0) = start {driver}(0)²",
         description="The dissipated power warms the conductor, whose resistance rises with its temperature.",
     )  # fmt: skip
 

@@ -17,6 +17,7 @@ from torchcal.terms.pieces import (
     quantity,
     shape,
     square_root,
+    start,
     timed,
     titled,
 )
@@ -99,9 +100,10 @@ def _second(h: str, label: str | None, units: Units) -> Term:
         name,
         rates={h: lambda t, s, p, u: -p["k"] * (s[h] - s[inner]),
                inner: lambda t, s, p, u: (s[h] - s[inner]) / p["tau"]},
-        states={inner: units.length}, initial={inner: h},
-        parameters=[amplitude("k", units(0, 1), low=0.0), shape("tau", units.time)], scales={"tau": "t"},
-        formula=f"d{h}/dt ∋ -k ({h} - h2), dh2/dt = ({h} - h2)/tau, h2(0) = {h}(0)",
+        states={inner: units.length}, initial={inner: lambda s, p: p["start"] * s[h]},
+        parameters=[amplitude("k", units(0, 1), low=0.0), shape("tau", units.time), start(1.0, 0.0, 2.0)],
+        scales={"tau": "t"},
+        formula=f"d{h}/dt ∋ -k ({h} - h2), dh2/dt = ({h} - h2)/tau, h2(0) = start {h}(0)",
         description="An unseen volume in connection with the tank, which fills and empties with it in a time tau.",
     )  # fmt: skip
 

@@ -16,6 +16,7 @@ from torchcal.terms.pieces import (
     own_name,
     quantity,
     shape,
+    start,
     timed,
     titled,
 )
@@ -157,10 +158,10 @@ def _adsorption(a: str, amount: str, time: str, label: str | None) -> Term:
         name,
         rates={a: lambda t, s, p, u: -p["k"] * (s[a] - s[hidden]),
                hidden: lambda t, s, p, u: (s[a] - s[hidden]) / p["tau"]},
-        states={hidden: amount}, initial={hidden: 0.0},
-        parameters=[amplitude("k", f"1/{time}", low=0.0), shape("tau", time)], scales={"tau": "t"},
-        formula=f"d{a}/dt ∋ -k ({a} - {a}_bound), d{a}_bound/dt = ({a} - {a}_bound)/tau, {a}_bound(0) = 0",
-        description="A wall or an unseen phase, empty at first, takes up the reactant and gives it back.",
+        states={hidden: amount}, initial={hidden: lambda s, p: p["start"] * s[a]},
+        parameters=[amplitude("k", f"1/{time}", low=0.0), shape("tau", time), start(usual=0.0)], scales={"tau": "t"},
+        formula=f"d{a}/dt ∋ -k ({a} - {a}_bound), d{a}_bound/dt = ({a} - {a}_bound)/tau, {a}_bound(0) = start {a}(0)",
+        description="A wall or an unseen phase, usually empty at first, takes up the reactant and gives it back.",
     )  # fmt: skip
 
 

@@ -20,6 +20,7 @@ from torchcal.terms.pieces import (
     own_name,
     quantity,
     shape,
+    start,
     timed,
     titled,
 )
@@ -153,13 +154,14 @@ def _large_angle(x: str, v: str, stiffness: Quantity | None, label: str | None, 
 
 def _viscoelastic(v: str, label: str | None, units: Units) -> Term:
     name = titled("viscoelastic branch", label)
-    hidden = f"{name}: stretch"
+    hidden, size = f"{name}: stretch", f"{v}_max"
     return Term(
         name,
         rates={v: lambda t, s, p, u: -p["k"] * s[hidden], hidden: lambda t, s, p, u: s[v] - s[hidden] / p["tau"]},
-        states={hidden: units.length}, initial={hidden: 0.0},
-        parameters=[amplitude("k", units(0, 2), low=0.0), shape("tau", units(0, -1))], scales={"tau": "t"},
-        formula=f"d{v}/dt ∋ -k stretch, d stretch/dt = {v} - stretch/tau, stretch(0) = 0",
+        states={hidden: units.length}, initial={hidden: lambda s, p: p["start"] * p[size] * p["tau"]},
+        parameters=[amplitude("k", units(0, 2), low=0.0), shape("tau", units(0, -1)), start(0.0, -2.0, 2.0)],
+        scales={"tau": "t"}, constants={size: v},
+        formula=f"d{v}/dt ∋ -k stretch, d stretch/dt = {v} - stretch/tau, stretch(0) = start {size} tau",
         description="Spring in series with a damper (a Maxwell element): stiff when moved fast, relaxing in tau.",
     )  # fmt: skip
 

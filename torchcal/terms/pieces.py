@@ -31,6 +31,7 @@ __all__ = [
     "shape",
     "signed_power",
     "square_root",
+    "start",
     "timed",
     "titled",
 ]
@@ -53,6 +54,14 @@ def amplitude(
 def shape(name: str, unit: str, low: float | None = None, high: float | None = None) -> Parameter:
     """A threshold, width, time or exponent: without effect while the amplitude is 0."""
     return Parameter(name, unit=unit, low=low, high=high)
+
+
+def start(usual: float, low: float = -0.25, high: float = 1.25) -> Parameter:
+    """Where a hidden state begins, as a share of what its term says: usually there, elsewhere only where data tell.
+
+    There is room beyond what physics allows, so that noise does not push an estimate against a bound.
+    """
+    return Parameter("start", unit="1", low=low, high=high, neutral=usual)
 
 
 def adder(terms: list[Term], equation: str, label: str | None) -> Callable[..., None]:
@@ -94,7 +103,7 @@ def lagging(name: str, equation: str, drive: str, unit: str, time: str, descript
         },
         states={hidden: f"[{drive}]"},
         initial={hidden: lambda s, p, u: p["start"] * u[drive]},
-        parameters=[amplitude("g", unit, low=0.0), shape("tau", time), shape("start", "1", 0.0, 1.0)],
+        parameters=[amplitude("g", unit, low=0.0), shape("tau", time), start(usual=1.0)],
         scales={"tau": "t"},
         takes=drive,
         formula=f"d{equation}/dt ∋ g ({drive}_late - {drive}), "

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchcal.errors import DomainError
 from torchcal.simulators import Parameter
-from torchcal.terms.pieces import amplitude, check_name, check_names, excess, factor, shape, timed
+from torchcal.terms.pieces import amplitude, check_name, check_names, excess, factor, shape, start, timed
 from torchcal.terms.term import Term, outer
 
 __all__ = ["sensor"]
@@ -183,7 +183,7 @@ def _dynamic(output: str, unit: str, time: str, given: Signal) -> list[Term]:
         return found
 
     lag, delay = f"lag of {output}", f"delay of {output}"
-    shown = f"{lag}: shown"
+    shown, size = f"{lag}: shown", f"{output}_max"
     smooth, slope, bend = (f"{delay}: {part}" for part in ("smooth", "slope", "bend"))
 
     def jerk(t: Any, s: Any, p: Any, u: Any) -> Any:
@@ -197,12 +197,13 @@ def _dynamic(output: str, unit: str, time: str, given: Signal) -> list[Term]:
     return [
         Term(lag,
              rates={shown: lambda t, s, p, u: RESPONSE * (signal(t, s, p, u) - s[shown]) / p["t90"]},
-             states={shown: unit}, initial={shown: first},
+             states={shown: unit}, initial={shown: lambda s, p, u: first(s, p, u) + p["start"] * p[size]},
              outputs={output: lambda t, s, p, u, y: y + p["a"] * (s[shown] - y)},
-             parameters=[amplitude("a", "1", low=0.0, high=1.5), shape("t90", time)], scales={"t90": "t"},
-             expected={"a": NATURE},
+             parameters=[amplitude("a", "1", low=0.0, high=1.5), shape("t90", time), start(0.0, -2.0, 2.0)],
+             scales={"t90": "t"}, constants={size: output}, expected={"a": NATURE},
              formula=f"{output} → {output} + a ({output}_shown - {output}), "
-             f"d{output}_shown/dt = 2.303 ({output} - {output}_shown)/t90, {output}_shown(0) = {output}(0)",
+             f"d{output}_shown/dt = 2.303 ({output} - {output}_shown)/t90, "
+             f"{output}_shown(0) = {output}(0) + start {size}",
              description="The instrument follows with a response time t90 (to 90 % of a step); a = 1 in nature."),
         Term(delay,
              rates={smooth: lambda t, s, p, u: s[slope], slope: lambda t, s, p, u: s[bend], bend: jerk},

@@ -49,8 +49,10 @@ def judge(model: Model, base: Fitted) -> None:
     else:
         model.note = ""
     unseen = _unseen(model)
-    parameters = len([i for i in candidate.own if names[i] not in off and i not in unseen])
-    model.price = -0.5 * parameters * math.log(base.problem.n) + (UNPHYSICAL if new else 0.0) + _expected(model)
+    each = 0.5 * math.log(base.problem.n)
+    usual = _away(model)
+    costs = [min(each, usual.get(names[i], each)) for i in candidate.own if names[i] not in off and i not in unseen]
+    model.price = -sum(costs) + (UNPHYSICAL if new else 0.0) + _expected(model)
 
 
 def _unseen(model: Model) -> set[int]:
@@ -61,6 +63,21 @@ def _unseen(model: Model) -> set[int]:
     if not any(moves[i] for i in model.candidate.amplitudes):
         return set()
     return {i for i in model.candidate.own if not moves[i]} - set(model.candidate.amplitudes)
+
+
+def _away(model: Model) -> dict[str, float]:
+    """What it would cost in log density to have those shapes at their usual values that have one, by name: as much as
+    they cost at most, since the term without them is a hypothesis too."""
+    candidate, found = model.candidate, model.found
+    amplitudes = {candidate.problem.parameters[i].name for i in candidate.amplitudes}
+    usual = {
+        term.full(q.name): q.neutral for term in candidate.terms for q in term.parameters if q.neutral is not None
+    }  # fmt: skip
+    usual = {name: value for name, value in usual.items() if name not in amplitudes}
+    if not usual:
+        return {}
+    values, spread = found.by_name, dict(zip(found.by_name, found.sd().tolist(), strict=True))
+    return {name: 0.5 * ((values[name] - at) / max(spread[name], 1e-300)) ** 2 for name, at in usual.items()}
 
 
 def _expected(model: Model) -> float:
