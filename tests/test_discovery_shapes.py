@@ -14,7 +14,7 @@ from torchcal.discovery.fits.candidates import prepare
 from torchcal.discovery.fits.fitting import fit
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.fits.rhythm import rhythms
-from torchcal.discovery.fits.shapes import _between, _shared, looked_at
+from torchcal.discovery.fits.shapes import _between, _shared, looked_at, points_of_shapes
 from torchcal.discovery.hypotheses.beginnings import learned
 
 F64 = torch.float64
@@ -248,3 +248,11 @@ def test_what_fits_better_in_a_window_begins_there_everywhere(monkeypatch):
     lead.window = None
     windows._hand_back(search)
     assert len(asked) == 1
+
+
+def test_a_shape_with_a_usual_value_is_looked_at_there_and_leaves_the_others_their_points():
+    parameters = [tc.Parameter("tau", low=1.0, high=2.0), tc.Parameter("start", low=-1.0, high=3.0, neutral=1.0)]
+    problem = SimpleNamespace(parameters=parameters)
+    times, starts = points_of_shapes(problem, [0, 1], {}, {1: 1.0})
+    assert (times, starts) == (points_of_shapes(problem, [0], {}, {})[0], [1.0])
+    assert len(times) > len(points_of_shapes(problem, [0, 1], {}, {})[0])

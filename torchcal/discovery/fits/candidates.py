@@ -318,11 +318,15 @@ def prepare(
         )
     moves = torch.nan_to_num(jacobian[0], nan=1.0, posinf=1.0, neginf=1.0).abs().amax(0) > 0
     amplitudes = [place for place, sure, m in zip(own, certain, moves.tolist(), strict=True) if sure and m]
-    if not amplitudes:  # a product of parameters, or a threshold: try each with the others away from neutral
+    usual: dict[int, float] = {}
+    if amplitudes:  # what they do is seen with the other shapes where these usually are
+        given = {name: q.neutral for name, (_, q) in terms_names.items() if q.neutral is not None}
+        usual = {i: given[name] for i in own if i not in amplitudes and (name := problem.parameters[i].name) in given}
+    else:  # a product of parameters, or a threshold: try each with the others away from neutral
         amplitudes = _hidden_amplitudes(problem, own, certain, begin, linear)
     shape = [place for place in own if place not in amplitudes]
     drivers = driver_values(base, found, terms, [problem.parameters[i] for i in shape])
-    points = points_of_shapes(problem, shape, drivers)
+    points = points_of_shapes(problem, shape, drivers, usual)
 
     def rows_of(grid: Tensor) -> Tensor:
         rows = begin.repeat(len(grid), 1)
@@ -334,8 +338,8 @@ def prepare(
 
     grid, tangents = combined(points), begin.new_zeros(0, problem.n, len(amplitudes))
     if screened:
-        given = [base.dear or problem.parameters[i].name in drivers for i in shape]
-        grid, tangents = looked_at(problem, shape, points, given, look, found)
+        stay = [base.dear or i in usual or problem.parameters[i].name in drivers for i in shape]
+        grid, tangents = looked_at(problem, shape, points, stay, look, found)
     return Candidate(
         terms=terms,
         problem=problem,

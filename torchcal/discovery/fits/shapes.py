@@ -82,14 +82,18 @@ def driver_values(
 
 
 def points_of_shapes(
-    problem: Problem, shape: Sequence[int], drivers: Mapping[str, Sequence[Tensor]]
+    problem: Problem, shape: Sequence[int], drivers: Mapping[str, Sequence[Tensor]], usual: Mapping[int, float]
 ) -> list[list[float]]:
-    """Values at which each of the parameters at places ``shape`` is tried, with what `driver_values` tells of them."""
-    level = min(len(shape), len(GRID_POINTS) - 1)
+    """Values at which each of the parameters at places ``shape`` is tried, with what `driver_values` tells of them; one
+    that has a ``usual`` value there alone."""
+    level = min(len(shape) - len(usual), len(GRID_POINTS) - 1)
     count, more = GRID_POINTS[level], DRIVER_POINTS[level]
     points = []
     for place in shape:
         q = problem.parameters[place]
+        if place in usual:
+            points.append([usual[place]])
+            continue
         values = [each for each in drivers.get(q.name, ()) if len(each)]
         if not values:
             points.append(shape_points(q, count))
