@@ -143,7 +143,7 @@ def test_an_instruments_own_amplitude_is_not_the_users_parameter_of_that_name():
     recording = tc.Recording(runs=[tc.Run(time=T, outputs={"y": torch.full((11,), 2.0)})])
     bound = extend(base, [sensor("lag of y", signal)]).bind(recording)
     torch.testing.assert_close(
-        bound.at(recording.x)(tensor(2.0, 0.5, 0.01)), torch.full((11,), 2.0, dtype=torch.float64)
+        bound.at(recording.x)(tensor(2.0, 0.5, 0.01, 0.0)), torch.full((11,), 2.0, dtype=torch.float64)
     )
 
 
@@ -171,8 +171,8 @@ def test_a_lag_of_an_output_that_depends_on_time_is_refused():
 
     base = still({"y": signal}, [tc.Parameter("k", initial=1.0)], initial={"x": 0.0})
     recording = tc.Recording(runs=[tc.Run(time=T + 100, outputs={"y": torch.ones(11)})])
-    with pytest.raises(DomainError, match="from states and parameters alone"):
-        extend(base, [sensor("lag of y", signal)]).bind(recording).at(recording.x)(tensor(0.01, 1.0, 2.0))
+    with pytest.raises(DomainError, match="from states, parameters and inputs"):
+        extend(base, [sensor("lag of y", signal)]).bind(recording).at(recording.x)(tensor(0.01, 1.0, 2.0, 0.0))
 
 
 @pytest.mark.slow

@@ -117,7 +117,7 @@ def test_a_lag_is_no_falling_instrument():
     base = tc.ODESimulator(lambda t, s, p, u: {"y": p["k"] + 0 * s["y"]}, {"y": None}, [tc.Parameter("k")])
     recording = tc.Recording(runs=[tc.Run(t, {"y": 1 + 1.3 * t}, initial={"y": 1.0})], noise=0.01)
     terms = {term.name: term for term in tc.terms.sensor(("y",))}
-    lag = {"k": 1.3, "lag of y.a": 1.2, "lag of y.t90": 0.5}
+    lag = {"k": 1.3, "lag of y.a": 1.2, "lag of y.t90": 0.5, "lag of y.start": 0.0}
     assert not falling(base, recording, terms["lag of y"], lag)
     assert not falling(base, recording, terms["drift of y"], {"k": 1.3, "drift of y.b": -5.0})
 

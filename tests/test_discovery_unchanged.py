@@ -217,7 +217,7 @@ def test_a_shape_without_bounds_is_sought_where_the_data_are(origin, size):
 def test_many_shapes_are_all_tried_at_several_values():
     parameters = [tc.Parameter(f"s{k}", low=1.0, high=2.0) for k in range(6)]
     problem = Problem.of(tc.Simulator(lambda x, p: x + p["s0"], parameters), tc.Recording(x=[0.0, 1.0], y=[1.0, 2.0]))
-    grid = combined(points_of_shapes(problem, list(range(6)), {}))
+    grid = combined(points_of_shapes(problem, list(range(6)), {}, {}))
     assert len(grid) == 256
     for column in grid.T:
         values, counts = column.unique(return_counts=True)

@@ -466,7 +466,7 @@ def test_an_instrument_that_lags_begins_at_an_output_that_depends_on_an_input() 
     t = np.linspace(0.0, 2.0, 9)
     run = tc.Run(time=t, outputs={"w": t}, inputs={"i": 3.0 + t}, initial={"v": 1.0})
     bound = tc.terms.extend(model, [lag]).bind(tc.Recording(runs=[run]))
-    assert bound.layout.start(tensor(0.3, 1.0, 0.7)[None]).tolist() == [[[1.0, 2.5]]]
+    assert bound.layout.start(tensor(0.3, 1.0, 0.7, 0.1)[None]).tolist() == [[[1.0, 2.6]]]  # a tenth of 1
 
 
 def test_a_function_of_an_initial_value_takes_inputs_only_where_it_asks_for_them() -> None:

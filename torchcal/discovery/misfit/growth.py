@@ -16,7 +16,7 @@ __all__ = ["growth"]
 #: Fewest data of an output whose noise may grow with it; the log-likelihood that this must gain; the ratio of the
 #: largest sd to the smallest that is too little; and the powers and offsets, of the largest output, that are tried.
 FEWEST, GROWS, LITTLE, POWERS = 20, 3.0, 4.0, (1.0, 0.5)
-OFFSETS = (*(10.0**k for k in range(-9, -5)), 1e-5, 3e-5, 1e-4, 3e-4, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3)
+OFFSETS = (*(10.0**k for k in range(-12, -5)), 1e-5, 3e-5, 1e-4, 3e-4, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3)
 #: How often data are held against the line between their neighbours: once, and so often that a wave of six of them is
 #: lost too, where noise must grow as well (one that fades with the output is as large beside its neighbours as noise
 #: that grows); and as how many independent data differences count.
