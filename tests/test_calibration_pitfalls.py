@@ -299,6 +299,26 @@ def test_places_of_one_ridge_are_one_maximum():
     assert len(found.diagnostics.modes) == 1
 
 
+@pytest.mark.parametrize("seed", [2, 3])
+def test_separate_maxima_on_long_ridges_are_two(seed):
+    """Of a and b the data see the sum, of c the square: c = 1 and c = -1 are two maxima, each a ridge along a - b."""
+    x = np.linspace(-1, 1, 21)
+    y = 2 * x + 1 + 0.7 * x**2 + 0.05 * np.random.default_rng(seed).normal(size=21)
+    model = tc.Simulator(
+        lambda x, p: (p["a"] + p["b"]) * x + p["c"] ** 2 + p["d"] * x**2,
+        [tc.Parameter("a", low=-20, high=20), tc.Parameter("b", low=-20, high=20), tc.Parameter("c", low=-3, high=3),
+         tc.Parameter("d", low=-3, high=3)],
+    )  # fmt: skip
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = tc.calibrate(
+            model, tc.Recording(x=x, y=y), embedding=tc.embeddings.Gaussian(parameters=("d",)),
+            likelihood=tc.likelihoods.ABC(epsilon=0.05), num_samples=20, num_warmup=20, num_chains=4, seed=seed,
+        )  # fmt: skip
+    signs = {math.copysign(1.0, mode.alpha[found.alpha_names.index("c[0]")]) for mode in found.diagnostics.modes}
+    assert signs == {1.0, -1.0}
+
+
 def test_parameters_that_no_datum_sees_together_are_one_ridge():
     """Each half of the data depends on a parameter of its own: how the two vary together turns the second row of the
     triangle in a circle, and leaves every mean and sd as it is."""

@@ -250,9 +250,9 @@ def test_what_fits_better_in_a_window_begins_there_everywhere(monkeypatch):
     assert len(asked) == 1
 
 
-def test_a_shape_with_a_usual_value_is_looked_at_there_and_leaves_the_others_their_points():
+def test_a_shape_with_a_usual_value_is_looked_at_around_it_and_leaves_the_others_their_points():
     parameters = [tc.Parameter("tau", low=1.0, high=2.0), tc.Parameter("start", low=-1.0, high=3.0, neutral=1.0)]
     problem = SimpleNamespace(parameters=parameters)
     times, starts = points_of_shapes(problem, [0, 1], {}, {1: 1.0})
-    assert (times, starts) == (points_of_shapes(problem, [0], {}, {})[0], [1.0])
+    assert (times, starts) == (points_of_shapes(problem, [0], {}, {})[0], [1.0, 0.0, 2.0])
     assert len(times) > len(points_of_shapes(problem, [0, 1], {}, {})[0])

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 import torchcal as tc
 from torchcal.discovery.fits.problem import Problem
-from torchcal.discovery.hypotheses.judge import _away, _unseen
+from torchcal.discovery.hypotheses.judge import _away
 from torchcal.discovery.verdicts import verdict
 from torchcal.discovery.verdicts.doubts import between_outputs
 from torchcal.display import NONE
@@ -678,22 +678,31 @@ def test_a_pump_that_is_late_may_have_run_before_the_recording(begun):
     assert found["pump lag.start"].value == pytest.approx(begun, abs=max(4 * found["pump lag.start"].sd, 0.05))
 
 
-def test_where_a_lag_begins_costs_nothing_where_it_follows_nothing_yet():
-    found = SimpleNamespace(free=[0, 1, 2, 3], jacobian=torch.tensor([[1.0, 2.0, 0.5, 0.0], [1.0, 0.0, 0.1, 0.0]]))
-    acting = SimpleNamespace(found=found, candidate=SimpleNamespace(amplitudes=[1], own=[1, 2, 3]))
-    assert _unseen(acting) == {3}
-    idle = SimpleNamespace(found=found, candidate=SimpleNamespace(amplitudes=[3], own=[2, 3]))
-    assert _unseen(idle) == set()  # what does nothing at all is paid for in full
+def late(gain, start, sd, jacobian, states=("late",)):
+    """What is away from usual of a lag, fitted with a gain of a base beside it."""
+    q = [tc.Parameter(name, neutral=neutral) for name, neutral in (("g", 0.0), ("start", 1.0), ("tau", None))]
+    term = SimpleNamespace(parameters=q, full=lambda name: f"lag.{name}", states=states)
+    parameters = [tc.Parameter("k"), *(tc.Parameter(f"lag.{one.name}") for one in q)]
+    candidate = SimpleNamespace(
+        terms=(term,), amplitudes=[1], problem=SimpleNamespace(parameters=parameters), neutral_at=lambda i: 0.0
+    )
+    values = torch.tensor([1.0, gain, start, 3.0], dtype=F64)
+    found = SimpleNamespace(
+        values=values, free=[0, 1, 2, 3], sd=lambda: torch.tensor([0.1, 0.1, sd, 0.2], dtype=F64),
+        jacobian=torch.tensor(jacobian, dtype=F64),
+    )  # fmt: skip
+    return _away(SimpleNamespace(candidate=candidate, found=found))
 
 
 def test_a_shape_at_its_usual_value_costs_no_more_than_it_would_to_have_it_there():
-    q = [tc.Parameter(name, neutral=neutral) for name, neutral in (("k", 0.0), ("start", 1.0), ("tau", None))]
-    term = SimpleNamespace(parameters=q, full=lambda name: f"lag.{name}")
-    parameters = [tc.Parameter(f"lag.{one.name}") for one in q]
-    candidate = SimpleNamespace(terms=(term,), amplitudes=[0], problem=SimpleNamespace(parameters=parameters))
-    values = {"lag.k": 2.0, "lag.start": 1.06, "lag.tau": 3.0}
-    found = SimpleNamespace(by_name=values, sd=lambda: torch.tensor([0.1, 0.03, 0.2], dtype=F64))
-    assert _away(SimpleNamespace(candidate=candidate, found=found)) == {"lag.start": pytest.approx(2.0)}
+    seen = [[1.0, 2.0, 0.5, 1.0], [1.0, 0.0, 0.1, 0.0]]
+    assert late(2.0, 1.06, 0.03, seen) == {"lag.start": pytest.approx(2.0)}
+    assert late(2.0, 1.06, 0.03, seen, states={}) == {}  # an exponent, say, is a parameter like any other
+    unseen = [[1.0, 2.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0]]
+    assert late(2.0, 0.3, 0.03, unseen) == {"lag.start": 0.0}
+    # What does nothing is paid for in full.
+    assert late(0.0, 0.3, 0.03, unseen) == {}
+    assert late(2.0, 0.3, 0.03, [[1.0, 0.0, 0.0, 0.0]]) == {}
 
 
 @pytest.mark.slow

@@ -21,9 +21,9 @@ BETWEEN, LEVEL = 9, 0.01
 """Points of a straight line between two maxima, ends included, and the difference in log-posterior along it up to which
 it is level."""
 
-LONGEST_STEP = 0.4
-"""Share of the way between two maxima that no step along a bent ridge exceeds. Of separate ones one step is the whole
-way."""
+DIP, HALVINGS = 0.5, 6
+"""How much lower the log-posterior may be half-way between two places of one ridge that are near each other; and how
+often the way is halved until they are."""
 
 
 def modes_of(problem: Problem, estimate: Estimate) -> list[Laplace]:
@@ -67,8 +67,9 @@ def modes_of(problem: Problem, estimate: Estimate) -> list[Laplace]:
 def _joined(problem: Problem, one: Tensor, other: Tensor) -> bool:
     """Whether two maxima ``(P,)`` are places of one ridge that the data do not see along.
 
-    A straight one keeps its height between them. A bent one keeps it along a curve: points of the straight line, each
-    brought up to the maximum next to it, lie at the same height all along the way, rather than at one end or the other.
+    A straight one keeps its height between them. A bent one does along a curve: the middle of the straight line,
+    brought up to the maximum next to it, is another place of it, and the nearer two are, the less the line between them
+    dips. Between separate ones it dips as deep however near the places are otherwise.
     """
     transform = problem.prior.transform
     share = torch.linspace(0, 1, BETWEEN).to(one)[:, None]
@@ -84,15 +85,21 @@ def _joined(problem: Problem, one: Tensor, other: Tensor) -> bool:
         return -problem.log_prob(transform.bound(u))
 
     piece = pieces(problem.propagate, len(problem.y))
-    places = [one]
-    for point in line[1:-1]:
-        top = minimise(objective, transform.unbound(point)[None], piece=piece)
+
+    def connected(first: Tensor, last: Tensor, halvings: int) -> bool:
+        middle = 0.5 * (first + last)
+        with torch.no_grad():
+            if float(problem.log_prob(middle)) >= float(heights[0]) - DIP:
+                return True
+        if not halvings:
+            return False
+        top = minimise(objective, transform.unbound(middle)[None], piece=piece)
         if not abs(float(-top.values[0] - heights[0])) <= LEVEL:
             return False
-        places.append(transform.bound(top.points[0]))
-    reached = torch.stack([*places, other])
-    near = torch.cdist(reached, reached) <= LONGEST_STEP * (other - one).norm()
-    return bool(torch.linalg.matrix_power(near.double(), BETWEEN)[0, -1] > 0)
+        between = transform.bound(top.points[0])
+        return connected(first, between, halvings - 1) and connected(between, last, halvings - 1)
+
+    return connected(one, other, HALVINGS)
 
 
 def _apart(point: Tensor, mode: Laplace) -> float:

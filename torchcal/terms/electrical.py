@@ -162,7 +162,7 @@ def _self_heating(resistance: str, heated_by: tuple[str, str], label: str | None
     warmth = f"{name}: warmth"
     driver, unit = heated_by
     heat = quantity(driver, "what heats the resistance")
-    a, tau = own_name("a", resistance, driver), own_name("tau", resistance, driver)
+    a, tau, begun = (own_name(own, resistance, driver) for own in ("a", "tau", "start"))
 
     def heating(s: Any, p: Any, u: Any) -> Tensor:
         return torch.as_tensor(heat(s, p, u)).square()
@@ -171,9 +171,10 @@ def _self_heating(resistance: str, heated_by: tuple[str, str], label: str | None
         name,
         rates={warmth: lambda t, s, p, u: (heating(s, p, u) - s[warmth]) / p[tau]},
         shifts={resistance: lambda t, s, p, u: p[resistance] * p[a] * s[warmth]},
-        states={warmth: f"{unit}^2"}, initial={warmth: lambda s, p, u: p["start"] * heating(s, p, u)},
-        parameters=[amplitude(a, f"1/{unit}^2", low=0.0), shape(tau, time), start(usual=0.0)], scales={tau: "t"},
-        formula=f"{resistance} → {resistance} (1 + {a} θ), dθ/dt = ({driver}² - θ)/{tau}, θ(0) = start {driver}(0)²",
+        states={warmth: f"{unit}^2"}, initial={warmth: lambda s, p, u: p[begun] * heating(s, p, u)},
+        parameters=[amplitude(a, f"1/{unit}^2", low=0.0), shape(tau, time), start(usual=0.0, name=begun)],
+        scales={tau: "t"},
+        formula=f"{resistance} → {resistance} (1 + {a} θ), dθ/dt = ({driver}² - θ)/{tau}, θ(0) = {begun} {driver}(0)²",
         description="The dissipated power warms the conductor, whose resistance rises with its temperature.",
     )  # fmt: skip
 

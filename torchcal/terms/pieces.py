@@ -56,12 +56,12 @@ def shape(name: str, unit: str, low: float | None = None, high: float | None = N
     return Parameter(name, unit=unit, low=low, high=high)
 
 
-def start(usual: float, low: float = -0.25, high: float = 1.25) -> Parameter:
+def start(usual: float, low: float = -0.25, high: float = 1.25, name: str = "start") -> Parameter:
     """Where a hidden state begins, as a share of what its term says: usually there, elsewhere only where data tell.
 
     There is room beyond what physics allows, so that noise does not push an estimate against a bound.
     """
-    return Parameter("start", unit="1", low=low, high=high, neutral=usual)
+    return Parameter(name, unit="1", low=low, high=high, neutral=usual)
 
 
 def adder(terms: list[Term], equation: str, label: str | None) -> Callable[..., None]:

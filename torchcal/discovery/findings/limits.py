@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchcal.discovery.fits.candidates import Candidate
+from torchcal.discovery.fits.candidates import Candidate, usual_starts
 from torchcal.discovery.fits.fitting import fit
 from torchcal.discovery.hypotheses.model import PRIOR
 from torchcal.discovery.hypotheses.search import Search
@@ -65,7 +65,9 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
         if i in few or (blind and not candidate.blind):
             continue
         # Seen is not enough: the evidence for the term must outweigh that for the base too.
-        wanted = max(critical, math.sqrt(max(2 * odds + len(candidate.own) * math.log(search.problem.n), 0.0)))
+        usual = [usual_starts(term, candidate.problem, candidate.amplitudes) for term in candidate.terms]
+        paid = len(candidate.own) - sum(map(len, usual))
+        wanted = max(critical, math.sqrt(max(2 * odds + paid * math.log(search.problem.n), 0.0)))
         if blind:
             first = _Effect(len(candidate.shapes) // 2, 0, wanted, order=2)
             direction = _left(search, i, first, _seen_from(search, i, first), _simulated(search, i, first, 0.0))

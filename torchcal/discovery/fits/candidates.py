@@ -26,7 +26,7 @@ from torchcal.simulators.static import asks_for_numbers
 from torchcal.terms import Term, extend
 from torchcal.terms.term import neutral_of
 
-__all__ = ["Candidate", "base_columns", "call_once", "prepare", "replaces", "spread_values", "widened"]
+__all__ = ["Candidate", "base_columns", "call_once", "prepare", "replaces", "spread_values", "usual_starts", "widened"]
 
 #: Share of the data's spread that a candidate adds when it is tried.
 A_LITTLE = 0.03
@@ -188,6 +188,16 @@ def widened(base: Problem, candidate: Candidate, held_back: Sequence[str], given
     return dataclasses.replace(candidate, terms=tuple(terms), problem=problem)
 
 
+def usual_starts(term: Term, problem: Problem, amplitudes: Sequence[int]) -> dict[int, float]:
+    """Where hidden states of a term usually begin, by the places of the shapes that say where they do; none where its
+    amplitude is not among some, by their places."""
+    place = {q.name: i for i, q in enumerate(problem.parameters)}
+    own = {place[term.full(q.name)]: q.neutral for q in term.parameters}
+    if not term.states or not any(i in amplitudes for i in own):
+        return {}
+    return {i: at for i, at in own.items() if at is not None and i not in amplitudes}
+
+
 def spread_values(target: Problem, names: Sequence[str], values: Tensor) -> Tensor:
     """Values by name in another simulator's order; nan for names it alone has."""
     place = {name: i for i, name in enumerate(names)}
@@ -318,11 +328,8 @@ def prepare(
         )
     moves = torch.nan_to_num(jacobian[0], nan=1.0, posinf=1.0, neginf=1.0).abs().amax(0) > 0
     amplitudes = [place for place, sure, m in zip(own, certain, moves.tolist(), strict=True) if sure and m]
-    usual: dict[int, float] = {}
-    if amplitudes:  # what they do is seen with the other shapes where these usually are
-        given = {name: q.neutral for name, (_, q) in terms_names.items() if q.neutral is not None}
-        usual = {i: given[name] for i in own if i not in amplitudes and (name := problem.parameters[i].name) in given}
-    else:  # a product of parameters, or a threshold: try each with the others away from neutral
+    usual = {place: at for term in terms for place, at in usual_starts(term, problem, amplitudes).items()}
+    if not amplitudes:  # a product of parameters, or a threshold: try each with the others away from neutral
         amplitudes = _hidden_amplitudes(problem, own, certain, begin, linear)
     shape = [place for place in own if place not in amplitudes]
     drivers = driver_values(base, found, terms, [problem.parameters[i] for i in shape])

@@ -85,14 +85,15 @@ def points_of_shapes(
     problem: Problem, shape: Sequence[int], drivers: Mapping[str, Sequence[Tensor]], usual: Mapping[int, float]
 ) -> list[list[float]]:
     """Values at which each of the parameters at places ``shape`` is tried, with what `driver_values` tells of them; one
-    that has a ``usual`` value there alone."""
+    that has a ``usual`` value there, and half-way to its bounds."""
     level = min(len(shape) - len(usual), len(GRID_POINTS) - 1)
     count, more = GRID_POINTS[level], DRIVER_POINTS[level]
     points = []
     for place in shape:
         q = problem.parameters[place]
         if place in usual:
-            points.append([usual[place]])
+            ends = [end for end in (q.low, q.high) if end is not None]
+            points.append([usual[place], *(0.5 * (usual[place] + end) for end in ends)])
             continue
         values = [each for each in drivers.get(q.name, ()) if len(each)]
         if not values:

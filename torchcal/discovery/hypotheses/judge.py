@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+from torchcal.discovery.fits.candidates import usual_starts
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.local import ENDS, is_window
 from torchcal.discovery.hypotheses.model import Model
@@ -48,36 +49,36 @@ def judge(model: Model, base: Fitted) -> None:
         model.note = f"at its bound: {', '.join(new)}"
     else:
         model.note = ""
-    unseen = _unseen(model)
     each = 0.5 * math.log(base.problem.n)
     usual = _away(model)
-    costs = [min(each, usual.get(names[i], each)) for i in candidate.own if names[i] not in off and i not in unseen]
+    costs = [min(each, usual.get(names[i], each)) for i in candidate.own if names[i] not in off]
     model.price = -sum(costs) + (UNPHYSICAL if new else 0.0) + _expected(model)
 
 
-def _unseen(model: Model) -> set[int]:
-    """Places of the shapes of effects that act on which no datum depends, as where a lag begins that follows nothing
-    yet: they fit nothing, and cost nothing."""
-    found = model.found
-    moves = dict(zip(found.free, (found.jacobian != 0).any(0).tolist(), strict=True))
-    if not any(moves[i] for i in model.candidate.amplitudes):
-        return set()
-    return {i for i in model.candidate.own if not moves[i]} - set(model.candidate.amplitudes)
-
-
 def _away(model: Model) -> dict[str, float]:
-    """What it would cost in log density to have those shapes at their usual values that have one, by name: as much as
-    they cost at most, since the term without them is a hypothesis too."""
+    """What it would cost in log density to have hidden states begin where they usually do, by the names of the shapes
+    that say where: as much as these cost at most, since the term without them is a hypothesis too. Nothing where no
+    datum depends on it, as of a lag that follows nothing yet.
+
+    An effect has to be there, and to be seen.
+    """
     candidate, found = model.candidate, model.found
-    amplitudes = {candidate.problem.parameters[i].name for i in candidate.amplitudes}
-    usual = {
-        term.full(q.name): q.neutral for term in candidate.terms for q in term.parameters if q.neutral is not None
-    }  # fmt: skip
-    usual = {name: value for name, value in usual.items() if name not in amplitudes}
-    if not usual:
-        return {}
-    values, spread = found.by_name, dict(zip(found.by_name, found.sd().tolist(), strict=True))
-    return {name: 0.5 * ((values[name] - at) / max(spread[name], 1e-300)) ** 2 for name, at in usual.items()}
+    column, sd = {i: k for k, i in enumerate(found.free)}, found.sd()
+    costs: dict[str, float] = {}
+    for term in candidate.terms:
+        usual = usual_starts(term, candidate.problem, candidate.amplitudes)
+        own = {term.full(q.name) for q in term.parameters}
+        acting = [
+            i for i in candidate.amplitudes
+            if candidate.problem.parameters[i].name in own and float(found.values[i]) != candidate.neutral_at(i)
+        ]  # fmt: skip
+        if not any(bool(found.jacobian[:, column[i]].any()) for i in acting):
+            continue
+        for i, at in usual.items():
+            seen = bool(found.jacobian[:, column[i]].any())
+            away = (float(found.values[i]) - at) / max(float(sd[i]), 1e-300)
+            costs[candidate.problem.parameters[i].name] = 0.5 * away**2 if seen else 0.0
+    return costs
 
 
 def _expected(model: Model) -> float:
