@@ -506,11 +506,10 @@ def response(term, p, signal, end, steps=2000):
     return float(term.outputs["x"](t, s, p, {}, signal(t)))
 
 
-@pytest.mark.parametrize(("case", "term"), TERMS)
+@pytest.mark.parametrize(
+    ("case", "term"), [one for one in TERMS if any(q.name == "start" for q in one.values[1].parameters)]
+)
 def test_hidden_states_begin_where_they_usually_do_unless_data_tell(case, term):
-    starts = [parameter for parameter in term.parameters if parameter.name == "start"]
-    if not starts:
-        return
     _, s, p, u = setting(case, term, batch=(4,), runs=1)
     s = {name: value for name, value in s.items() if name not in term.states}
     (begins,) = {*term.initial.values()}  # branches of a ladder begin alike
@@ -520,10 +519,12 @@ def test_hidden_states_begin_where_they_usually_do_unless_data_tell(case, term):
         found.append(begins(s, given, u) if takes_inputs(begins) else begins(s, given))
     torch.testing.assert_close(found[1], found[0] + 0.25 * (found[2] - found[0]), **EXACT)
     assert bool((found[2] != found[0]).all())
-    (start,) = starts
-    if case != "thermal, input" and start.neutral is not None:
+    (start,) = (parameter for parameter in term.parameters if parameter.name == "start")
+    if term.name == "second heat capacity":  # nothing is usual of it
+        assert start.neutral is None
+    else:
+        assert start.neutral in (0.0, 1.0)
         assert start.low < start.neutral < start.high
-    assert term.name in ("second heat capacity",) or start.neutral in (0.0, 1.0)
 
 
 def test_response_time_of_a_lag():

@@ -121,16 +121,7 @@ class AdditiveCalibration(Result):
     def load(
         cls, path: str | os.PathLike[str], *, simulator: Simulator | None = None
     ) -> "AdditiveCalibration":
-        """Read a result that `save` wrote.
-
-        Args:
-            path: The file.
-            simulator: The simulator it was calibrated with, for predictions elsewhere than at the data.
-
-        Raises:
-            TorchcalError: If there is no such file, or it is none of these, damaged, or of another version.
-            SimulatorError, EmbeddingError, RecordingError: If the simulator is another one than that of the file.
-        """
+        """Read a result that `save` wrote, as `Calibration.load` does."""
         return reading.read_additive(cls, path, simulator)
 
     def __str__(self) -> str:

@@ -92,6 +92,7 @@ class Layout:
         self._own = len(parameters)  # the columns after these are initial states
         self._initial: list[dict[str, Any]] = []
         self._first_inputs = [{name: float(values[0]) for name, values in run.inputs.items()} for run in runs]
+        self._asking = {state for state, value in ode.initial.items() if callable(value) and takes_inputs(value)}
         self.initial_names: list[str] = []
         for r, run in enumerate(runs):
             if unknown := [name for name in run.initial if name not in self._states]:
@@ -192,7 +193,7 @@ class Layout:
                     if isinstance(value, str):
                         entries[state] = entries[value]
                     elif callable(value):
-                        given = {"s": entries, "p": own} | ({"u": inputs} if takes_inputs(value) else {})
+                        given = {"s": entries, "p": own} | ({"u": inputs} if state in self._asking else {})
                         found = careful(self._seen, f"the initial value of {state!r}", value, **given)
                         entries[state] = real(found, values, one, f"the initial value of {state!r}")
                 except TorchcalError:  # which says what to do

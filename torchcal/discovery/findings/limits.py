@@ -65,8 +65,7 @@ def limits(search: Search, alpha: float, power: float, contained: Sequence[Term]
         if i in few or (blind and not candidate.blind):
             continue
         # Seen is not enough: the evidence for the term must outweigh that for the base too.
-        usual = [usual_starts(term, candidate.problem, candidate.amplitudes) for term in candidate.terms]
-        paid = len(candidate.own) - sum(map(len, usual))
+        paid = len(candidate.own) - len(usual_starts(candidate.terms, candidate.problem, candidate.amplitudes))
         wanted = max(critical, math.sqrt(max(2 * odds + paid * math.log(search.problem.n), 0.0)))
         if blind:
             first = _Effect(len(candidate.shapes) // 2, 0, wanted, order=2)

@@ -188,14 +188,16 @@ def widened(base: Problem, candidate: Candidate, held_back: Sequence[str], given
     return dataclasses.replace(candidate, terms=tuple(terms), problem=problem)
 
 
-def usual_starts(term: Term, problem: Problem, amplitudes: Sequence[int]) -> dict[int, float]:
-    """Where hidden states of a term usually begin, by the places of the shapes that say where they do; none where its
-    amplitude is not among some, by their places."""
+def usual_starts(terms: Sequence[Term], problem: Problem, amplitudes: Sequence[int]) -> dict[int, float]:
+    """Where hidden states of terms usually begin, by the places of the shapes that say where they do; not of a term
+    whose amplitude is not among some, by their places."""
     place = {q.name: i for i, q in enumerate(problem.parameters)}
-    own = {place[term.full(q.name)]: q.neutral for q in term.parameters}
-    if not term.states or not any(i in amplitudes for i in own):
-        return {}
-    return {i: at for i, at in own.items() if at is not None and i not in amplitudes}
+    found: dict[int, float] = {}
+    for term in terms:
+        own = {place[term.full(q.name)]: q.neutral for q in term.parameters}
+        if term.states and any(i in amplitudes for i in own):
+            found |= {i: at for i, at in own.items() if at is not None and i not in amplitudes}
+    return found
 
 
 def spread_values(target: Problem, names: Sequence[str], values: Tensor) -> Tensor:
@@ -328,7 +330,7 @@ def prepare(
         )
     moves = torch.nan_to_num(jacobian[0], nan=1.0, posinf=1.0, neginf=1.0).abs().amax(0) > 0
     amplitudes = [place for place, sure, m in zip(own, certain, moves.tolist(), strict=True) if sure and m]
-    usual = {place: at for term in terms for place, at in usual_starts(term, problem, amplitudes).items()}
+    usual = usual_starts(terms, problem, amplitudes)
     if not amplitudes:  # a product of parameters, or a threshold: try each with the others away from neutral
         amplitudes = _hidden_amplitudes(problem, own, certain, begin, linear)
     shape = [place for place in own if place not in amplitudes]

@@ -63,10 +63,12 @@ def _away(model: Model) -> dict[str, float]:
     An effect has to be there, and to be seen.
     """
     candidate, found = model.candidate, model.found
+    if not usual_starts(candidate.terms, candidate.problem, candidate.amplitudes):
+        return {}
     column, sd = {i: k for k, i in enumerate(found.free)}, found.sd()
     costs: dict[str, float] = {}
     for term in candidate.terms:
-        usual = usual_starts(term, candidate.problem, candidate.amplitudes)
+        usual = usual_starts([term], candidate.problem, candidate.amplitudes)
         own = {term.full(q.name) for q in term.parameters}
         acting = [
             i for i in candidate.amplitudes
