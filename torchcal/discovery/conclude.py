@@ -15,6 +15,7 @@ from torchcal.discovery.findings.ranking import ranking
 from torchcal.discovery.findings.result import Diagnosis
 from torchcal.discovery.findings.symptoms import (
     along,
+    in_blocks,
     in_rows,
     in_times,
     larger_than_given,
@@ -108,8 +109,10 @@ def conclude(judged: Judged, asked: Asked, *, interrupted: str = "") -> Diagnosi
     improved = asked.simulator if best is None else _improved(asked.simulator, best)
     left = search.base if best is None else best.found
     apart = [*unlike(search, left), *shared(search, left)] if decision.verdict in ("consistent", "named") else []
+    blocks = in_blocks(search)
+    apart += blocks
     if decision.verdict == "consistent":
-        apart += [*in_rows(search, left), *along(search, left), *together(search, left)]
+        apart += [*(() if blocks else in_rows(search, left)), *along(search, left), *together(search, left)]
     aside = asked.recording.observed_once & ~search.problem.keep
     apart += side_by_side(search.problem, final.residual / search.noise.sd, aside)
     any_unlike = bool(apart)
@@ -119,7 +122,7 @@ def conclude(judged: Judged, asked: Asked, *, interrupted: str = "") -> Diagnosi
         every = () if best is not None else (model.found for model in (*search.models, *search.nameless))
         least = min(every, key=lambda found: found.chi2, default=left)
         apart = [*unbounded(search), *begun_elsewhere(search), *more_than_replicates(search, least), *apart]
-        apart += in_rows(search, least)
+        apart += () if blocks else in_rows(search, least)
     places = [] if decision.verdict == "consistent" else sharpened(search)
     if decision.verdict in ("ambiguous", "unexplained"):
         apart = [*held_otherwise(search), *apart, *shared(search, least, places)]

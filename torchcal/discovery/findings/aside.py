@@ -13,13 +13,16 @@ __all__ = ["side_by_side"]
 
 #: Probability by chance of as many outliers side by side, on the same side, below which they are told.
 CHANCE = 0.1
+#: Rows on end that were all set aside, at least, to be told; and probability by chance below which they are.
+ON_END, SELDOM = 3, 0.01
 
 
 def side_by_side(problem: Problem, off: Tensor, aside: Tensor) -> list[str]:
     """Outliers that are neighbours, and on the same side, where that is hardly chance (`chance_of_pairs`), or no others
     tell that this recording has any: two of few data are easily neighbours, however far they are off.
 
-    Neighbours are those in time, along the only condition, or along one of several where the others are the same.
+    Neighbours are those in time, along the only condition, or along one of several where the others are the same. Rows
+    on end come first, as of a sweep that is off as a whole.
 
     Args:
         problem: The used data.
@@ -30,6 +33,8 @@ def side_by_side(problem: Problem, off: Tensor, aside: Tensor) -> list[str]:
         return []
     problem = dataclasses.replace(problem, keep=problem.keep | aside)
     far, out = off[problem.index], aside[problem.index]
+    if told := _on_end(problem, far, out):
+        return told
     curves = _curves(problem)
     pairs = [pair for places, at in curves for pair in _pairs(places, far, out, at)]
     if not pairs:
@@ -49,6 +54,31 @@ def side_by_side(problem: Problem, off: Tensor, aside: Tensor) -> list[str]:
         f"outliers are so by chance with a probability of {chance:.2g}{alone}. Something short may act there; repeat "
         "them, or record more densely there"
     ]
+
+
+def _on_end(problem: Problem, far: Tensor, out: Tensor) -> list[str]:
+    """Rows of a table that were all set aside, one after the other and on the same side, where that is no chance."""
+    told: list[str] = []
+    if problem.in_time:
+        return told
+    sign = torch.where(out, far.sign(), 0.0)
+    for number, name in enumerate(problem.recording.outputs):
+        mine = (problem.output_of == number).nonzero()[:, 0]
+        sides, counts = sign[mine].unique_consecutive(return_counts=True)
+        lengths = counts.where(sides != 0, 0)
+        size = int(lengths.max()) if len(mine) else 0
+        if size < ON_END or len(mine) * float((sign[mine] != 0).double().mean()) ** size >= SELDOM:
+            continue
+        rows = mine[int(counts[: int(lengths.argmax())].sum()) :][:size]
+        first, last = (int(problem.condition_of[rows[k]]) + 1 for k in (0, -1))
+        of = f" of {name}" if len(problem.recording.outputs) > 1 else ""
+        told.append(
+            f"{size} rows on end{of}, {first} to {last}, were set aside as outliers, all on one side, by "
+            f"{float(far[rows].mean()):+.1f} noise sd on average: what these rows have in common, as a sweep, a day or "
+            "a sample, is off as a whole. If that is no mistake, give a condition that says so, and let a parameter or "
+            "an offset differ with it"
+        )
+    return told
 
 
 def _curves(problem: Problem) -> list[tuple[Tensor, Tensor]]:

@@ -6,20 +6,22 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from torchcal.discovery.findings.called import joined
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.fits.problem import SWEEP, Problem, breaks, remembered
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.search import Search
+from torchcal.discovery.misfit.blocks import jumps
 from torchcal.discovery.misfit.noise import GRID, LEAST, decorrelated, estimate
 from torchcal.discovery.misfit.places import Place
-from torchcal.discovery.misfit.replicates import goes_on_along, in_common_at
+from torchcal.discovery.misfit.replicates import goes_on_along, in_common_at, replicates
 from torchcal.discovery.verdicts.doubts import ALONG, along_rows, between_outputs, goes_on
 from torchcal.discovery.verdicts.explain import estimates, stated_sd
 from torchcal.display import up_to, with_unit
 
 __all__ = [
-    "along", "in_rows", "in_times", "larger_than_given", "more_than_replicates", "shared", "symptoms", "together",
-    "unlike",
+    "along", "in_blocks", "in_rows", "in_times", "larger_than_given", "more_than_replicates", "shared", "symptoms",
+    "together", "unlike",
 ]  # fmt: skip
 
 #: A base parameter that moves by this many sd when a term is added was bent by it.
@@ -272,6 +274,25 @@ def together(search: Search, found: Fitted) -> list[str]:
         f"what is left of {pair[0]} goes with what is left of {pair[1]}: that is no noise of each, but something that "
         "acts on both, or noise that they share"
     ]
+
+
+def in_blocks(search: Search) -> list[str]:
+    """Outputs whose replicates differ by blocks of rows, in words: that is no noise of each datum, and nothing that
+    the conditions do."""
+    rows: list[str] = []
+    problem = search.problem
+    for name, own in zip(problem.recording.outputs, replicates(problem) or (), strict=False):
+        found = jumps(problem, own, search.noise.unit)
+        if found:
+            of = f" of {name}" if len(problem.recording.outputs) > 1 else ""
+            told = joined([str(one) for one in found])
+            counted = "" if found[0].gain else " (sd of what they differ by otherwise)"
+            rows.append(
+                f"replicates{of} differ by blocks of rows and hardly within these: {told}{counted}. Sweeps, days or "
+                "samples differ, or the instrument was set anew, and the noise was estimated with that in it. Give a "
+                "condition that says which block a row belongs to, and let a parameter or an offset differ with it"
+            )
+    return rows
 
 
 def more_than_replicates(search: Search, found: Fitted) -> list[str]:
