@@ -35,7 +35,7 @@ from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.several import refit_several
 from torchcal.discovery.verdicts.verdict import WHITE, base_alone
 from torchcal.discovery.windows import refit_local
-from torchcal.errors import SimulatorError
+from torchcal.errors import SimulatorError, TorchcalError
 
 __all__ = ["settle", "with_all", "with_explained", "without_others"]
 
@@ -80,7 +80,7 @@ def _without_isolated(
     if apart is None or float(kept.sum()) < (1 - MOST) * observed.n:
         return search, detected
     fewer = _of(search, observed.keeping(kept))
-    if not _may_be_alone(fewer, search, confidence):
+    if fewer is None or not _may_be_alone(fewer, search, confidence):
         return search, detected
     still = _refit(fewer, confidence)
     if not search.stop.is_set() and outliers_alone(fewer, search, still):
@@ -116,6 +116,8 @@ def _again(search: Search, observed: Problem, detected: bool, confidence: float)
         kept = search.problem if sticking is None else observed.keeping(~sticking)
         seen.append(kept.keep)
         other = _of(search, kept, unit=search.unit if unit is None else unit)
+        if other is None:
+            break
         still = _refit(other, confidence)
         if not search.stop.is_set():
             search, detected = other, still
@@ -131,6 +133,8 @@ def with_all(
     Where they are too few to prove it, the names of what may explain them are returned instead.
     """
     every = _of(search, observed, unit=None)
+    if every is None:
+        return None, ()
     every.screen_all()
     refit_singles(every)
     if search.stop.is_set():
@@ -162,6 +166,8 @@ def with_explained(search: Search, observed: Problem, confidence: float) -> Sear
     if not _may_explain(search, best, observed):
         return None
     every = _of(search, observed)
+    if every is None:
+        return None
     if not _refit(every, confidence) or search.stop.is_set():
         return None
     refit_several(every)
@@ -190,15 +196,21 @@ def without_others(search: Search, observed: Problem) -> Search:
         return search
     kept = search.problem if sticking is None else observed.keeping(~sticking)
     other = _of(search, kept, unit=search.unit if unit is None else unit)
+    if other is None:
+        return search
     other.screen_all()
     take_over(other, search.models)
     return other if not search.stop.is_set() and other.physical_leader is not None else search
 
 
-def _of(search: Search, problem: Problem, **changes: Any) -> Search:
-    """The same search of other data, whose outliers are known, with their base calibrated and nothing else fitted."""
+def _of(search: Search, problem: Problem, **changes: Any) -> Search | None:
+    """The same search of other data, whose outliers are known, with their base calibrated and nothing else fitted; None
+    where it cannot be: what is set aside may have been all that told of an initial state."""
     other = dataclasses.replace(search, problem=problem, clean=True, **changes)
-    other.calibrate_base()
+    try:
+        other.calibrate_base()
+    except TorchcalError:
+        return None
     return other
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from torchcal.discovery.fits.fitting import FINISH, Fitted, finished, fit
+from torchcal.discovery.fits.jumps import placed
 from torchcal.discovery.fits.problem import Problem, Whitening
 from torchcal.errors import DomainError, MissingDependencyError, SimulatorError, TorchcalError
 from torchcal.simulators import Solution
@@ -55,7 +56,8 @@ class Refit:
                 return None
             begin = first.ends[first.ends_chi2.argsort()[:2]]
             warm = None if first.warm is None else first.warm.repeated(len(begin))
-        return fit(self.problem, self.whitening, begin, self.free, warm=warm, aim=self.aim, finish=0, later=FINISH)
+        found = fit(self.problem, self.whitening, begin, self.free, warm=warm, aim=self.aim, finish=0, later=FINISH)
+        return None if found is None else placed(found, self.shape)
 
 
 def refit_all(

@@ -15,7 +15,7 @@ from torchcal.discovery.fits.starts import follow_slopes, starts
 from torchcal.discovery.fits.trial import check_finite, point_of
 from torchcal.discovery.misfit.growth import growth
 from torchcal.discovery.misfit.noise import Noise, estimate
-from torchcal.discovery.misfit.outliers import spikes
+from torchcal.discovery.misfit.outliers import lone_values, spikes
 from torchcal.errors import ConvergenceError, DomainError, SimulatorError
 from torchcal.simulators import Trajectories, focused, may_change, step_errors, workable
 
@@ -41,6 +41,10 @@ SAME_FIT = 0.01
 #: Share of the data that may be outliers, and how often some are set aside before those that are left are looked at
 #: again.
 MOST, ROUNDS = 0.2, 5
+#: How many robust sd of the others outliers are off that may have drawn the fit into another minimum.
+DRAWN = 20.0
+#: Share of the misfit of all others that a fit without a datum leaves at most, which follows it at their cost.
+RUINED = 0.3
 #: How often noise that grows is estimated from what it leaves when it is weighed.
 GROWTHS = 4
 #: Log odds from which on noise forgets with every sample and not with time.
@@ -98,6 +102,7 @@ def calibrate_base(
             "rate is about 1 over the time in which something happens), and look at the runs' initial values."
         )
     found = _unwound(_sharpen(found))
+    found = found if exact or clean else _unfollowed(found, begin, rough, outputs)
     found, units = _grown(found, unit)
     if not exact and not clean:
         whole = found, units
@@ -111,7 +116,7 @@ def calibrate_base(
             if float(keep.sum()) < (1 - MOST) * whole[0].problem.n:  # so many are none
                 found, units = whole
                 break
-            found, units = _grown(_again(found, keep), unit)
+            found, units = _grown(_again(found, keep, begin if _drawn(found, bad) else begin[:0]), unit)
     noise = estimate(found.problem, found.residual, found.jacobian, recording.noise, units)
     base = refit(found, noise.whitening(found.problem))
     if not exact:
@@ -298,14 +303,48 @@ def _unwound(found: Fitted) -> Fitted:
     return dataclasses.replace(again, agreeing=found.agreeing)
 
 
-def _again(found: Fitted, keep: Tensor) -> Fitted:
-    """The same fit to fewer data."""
+def _again(found: Fitted, keep: Tensor, begin: Tensor) -> Fitted:
+    """The same fit to fewer data, or a better one from some starting values ``(H, P)``."""
     problem = dataclasses.replace(found.problem, keep=keep)
     rough = torch.zeros(len(keep), dtype=torch.float64)
     rough[found.problem.index] = found.whitening.sd
-    return refit(
-        found, problem.whitening(rough, torch.zeros(len(problem.recording.outputs), dtype=torch.float64)), problem
-    )
+    outputs = torch.zeros(len(problem.recording.outputs), dtype=torch.float64)
+    again = refit(found, problem.whitening(rough, outputs), problem)
+    if not len(begin) or problem.dear:
+        return again
+    try:
+        other = _from_starts(problem, begin, found.free, rough, outputs)
+        other = other and fit(problem, again.whitening, other.values[None], found.free)
+    except SimulatorError:
+        return again
+    return again if other is None or other.chi2 > again.chi2 - WORTH else other
+
+
+def _unfollowed(found: Fitted, begin: Tensor, rough: Tensor, outputs: Tensor) -> Fitted:
+    """The fit, or one without data that it follows at the cost of all others: a peak may be as high and narrow as a
+    decimal point in the wrong place makes one."""
+    problem = found.problem
+    alone = lone_values(problem)
+    if not bool(alone.any()) or problem.dear:
+        return found
+    keep = problem.keep.clone()
+    keep[problem.index[alone]] = False
+    fewer = dataclasses.replace(problem, keep=keep)
+    try:
+        other = _from_starts(fewer, begin, found.free, rough, outputs)
+    except SimulatorError:
+        return found
+    if other is None:
+        return found
+    size = rough[fewer.index]
+    now, then = (r.div(size).square().mean() for r in (found.residual[~alone], other.residual))
+    return other if float(then) < RUINED**2 * float(now) else found
+
+
+def _drawn(found: Fitted, bad: Tensor) -> bool:
+    """Whether outliers, bool ``(n,)``, are so far off that they may have drawn a fit away from the others."""
+    size = found.residual.abs()
+    return bool((size[bad] > DRAWN * 1.4826 * size[~bad].median()).any())
 
 
 def _misfit_of_each(found: Fitted) -> Tensor:

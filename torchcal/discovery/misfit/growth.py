@@ -9,6 +9,7 @@ from torch import Tensor
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.misfit.curves import beyond
 from torchcal.discovery.misfit.noise import mine
+from torchcal.discovery.misfit.outliers import gross
 from torchcal.discovery.misfit.replicates import Replicates, replicates
 
 __all__ = ["growth"]
@@ -76,17 +77,20 @@ def _growing(
     little), and no smaller than where `SAY` data were looked at: of a blank nothing is known but by them.
     """
     unit = torch.ones_like(problem.recording.y)
+    parts = [places[~gross(residual[places])] for places in parts]
     used = f[problem.index[torch.cat(parts)]]
     most = float(used.max())
     if not most > 0:
         return unit, 0.0
     if replicated is not None:
-        found = _grows(replicated.even, f[problem.index[replicated.places]] / most, float(replicated.freedom))
+        kept = ~gross(replicated.even)
+        size = f[problem.index[replicated.places[kept]]] / most
+        found = _grows(replicated.even[kept], size, float(replicated.freedom - int((~kept).sum())))
     else:
         for times in (FASTER, 1) if problem.order is not None else (1,):
             each = [_fastest(problem, places, residual, design, before, times) for places in parts]
             size = torch.cat([f[problem.index[p]][inside] for p, (_, inside) in zip(parts, each, strict=True)])
-            left = torch.cat([kept for kept, _ in each])
+            left = torch.cat([fast for fast, _ in each])
             if times > 1 and len(left) < FEWEST:  # of short runs
                 continue
             independent = INDEPENDENT[times] if problem.order is not None else 1.0

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.misfit.curves import smooth_columns
 
-__all__ = ["chance_of_pairs", "lone", "spikes"]
+__all__ = ["chance_of_pairs", "gross", "lone", "lone_values", "spikes"]
 
 #: A sample that leaves its neighbours' range by more than this many robust sd, alone or with one beside it, is one.
 SPIKE = 4.5
@@ -26,6 +26,11 @@ UNEVEN = 2.0
 ROUNDED = 1e-12
 #: Share of supposed outliers with another one as nearest neighbour above which they are no outliers.
 TOGETHER = 0.4
+#: How many times as far off as all others a few data are that are outliers whatever the noise is; the share that they
+#: are at most; and data of an output at least that tell.
+GROSS, RARE, FEWEST = 8.0, 0.05, 20
+#: Share of the distance of another one beside it up to which a sample is not off itself, but by a fit that this bends.
+DWARFED = 0.02
 #: Probability of as many of them at one value of a condition by chance, below which they are no outliers; and of as
 #: many on end along one, `BESIDE` places apart at most and on the same side.
 CHANCE, IN_ROW, BESIDE = 0.1, 0.02, 2
@@ -83,6 +88,39 @@ def lone(problem: Problem, residual: Tensor, sd: Tensor | None, ends: bool = Fal
         if not ends:
             far[[0, -1]] = False
         found[places] = (far & (beside < 0.5 * r.abs())) | _twins(r, far)
+    return found
+
+
+def gross(r: Tensor) -> Tensor:
+    """Which of some data ``(n,)`` are so far off beside all others that they are outliers whatever the noise is, bool
+    ``(n,)``: one decimal point in the wrong place would make noise grow with the value.
+
+    >>> gross(torch.tensor([1.0, -2.0, 1.5, 900.0, 0.5])).tolist()
+    [False, False, False, True, False]
+    """
+    size = r.abs().sort(descending=True).values
+    most = min(max(int(RARE * len(r)), 1), len(r) - 1)
+    apart = (size[:most] > GROSS * size[1 : most + 1]).nonzero()[:, 0]
+    least = size[apart[-1]] if len(apart) else torch.inf
+    found: Tensor = r.abs() >= least
+    return found
+
+
+def lone_values(problem: Problem) -> Tensor:
+    """Used data whose values are far beyond those of all others of their output, singly and not at an end, bool
+    ``(n,)``: of what is recorded in an order."""
+    found = torch.zeros(problem.n, dtype=torch.bool)
+    for output in range(len(problem.recording.outputs) if problem.order is not None else 0):
+        mine = problem.output_of == output
+        if int(mine.sum()) >= FEWEST:
+            found[mine] = gross(problem.y[mine] - problem.y[mine].median())
+    for places in problem.sequences if bool(found.any()) else ():
+        out = found[places]
+        beside = torch.zeros_like(out)
+        beside[1:] |= out[:-1]
+        beside[:-1] |= out[1:]
+        beside[[0, -1]] = True
+        found[places] = out & ~beside
     return found
 
 
@@ -181,7 +219,8 @@ def _alone(at: Tensor, r: Tensor, off: Tensor, least: Tensor) -> Tensor:
     step the values differ; before and behind a spike they do not. Two at the top of a curve are off their neighbours,
     but not off the parabola through those.
     """
-    high = (off.abs() > least).tolist()
+    around = torch.nn.functional.max_pool1d(off.abs()[None], 2 * BESIDE + 1, 1, BESIDE)[0]
+    high = ((off.abs() > least) & (off.abs() > DWARFED * around)).tolist()
     size = [*off.abs().tolist(), 0.0]
     found = torch.zeros(len(off), dtype=torch.bool)
     k = 0
