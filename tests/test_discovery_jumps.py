@@ -96,3 +96,21 @@ def test_a_threshold_of_a_condition_is_found_and_a_smooth_shape_stays():
     (row,) = (row for row in told.ranking if list(row.terms) == ["breaks"] and not row.region)
     c = next(e for e in row.estimates if e.name == "breaks.c")
     assert c.value == pytest.approx(6.4, abs=0.2)
+
+
+def test_a_time_that_nobody_says_anything_of_is_no_amplitude():
+    """At 0, where parameters of terms are neutral unless somebody says otherwise, its rate is infinite."""
+    t = np.linspace(0.0, 10.0, 80)
+    x = np.exp(-0.5 * t) * (1 + 0.0 * t) + 0.004 * np.random.default_rng(0).standard_normal(80)
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"x": -p["k"] * s["x"]}, {"x": "m"}, [tc.Parameter("k", low=0.0, initial=0.3)]
+    )
+    eddy = tc.Term(
+        "eddy", states={"e": "m"}, initial={"e": 0.0},
+        rates={"x": lambda t, s, p, u: -p["k"] * (s["x"] - s["e"]),
+               "e": lambda t, s, p, u: (s["x"] - s["e"]) / p["te"]},
+        parameters=[tc.Parameter("k", low=0.0), tc.Parameter("te")],
+    )  # fmt: skip
+    told = diagnose(base, tc.Recording(runs=[tc.Run(time=t, outputs={"x": x})]), [eddy])
+    assert told.verdict == "consistent"
+    assert [row.term for row in told.detection_limit] == ["eddy"]

@@ -306,6 +306,14 @@ def prepare(
         return y, jacobian
 
     y, jacobian = linear(begin[None], own)
+    for k, i in enumerate(own):  # nobody says that it is 0: a time that something is divided by is a shape
+        q = problem.parameters[i]
+        if not bool(torch.isfinite(y).all()) and q.name in terms_names and q.neutral is None and certain[k]:
+            row = begin.index_fill(0, torch.tensor(i), shape_points(q, 1)[0])
+            other = linear(row[None], own)
+            if bool(torch.isfinite(other[0]).all()):
+                (y, jacobian), begin = other, row
+                certain[k], neutral[k] = False, float(row[i])
     name = " + ".join(term.name for term in terms)
     values = dict(zip([problem.parameters[i].name for i in own], neutral, strict=True))
     if not bool(torch.isfinite(y).all()):
@@ -315,7 +323,8 @@ def prepare(
         raise SimulatorError(
             f"Expected finite outputs with the term {name!r} at its neutral values {values}. Got {float(y[0, bad[0]])} "
             f"for {len(bad)} of {problem.n} data, first {place_of(problem, int(bad[0]))} (no coefficient switches off "
-            "what is infinite: keep logarithms, roots and quotients finite at every datum)."
+            "what is infinite: keep logarithms, roots and quotients finite at every datum, and give low= and high= to "
+            "what may not be 0)."
         )
     size = torch.maximum(found.whitening.sd, base.recording.spread[base.index])
     moved = (y[0] - found.y).abs()
