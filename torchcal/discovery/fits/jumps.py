@@ -1,7 +1,6 @@
 """Shapes at which outputs jump, such as the time at which something sets in at once: no slope tells where they fit."""
 
 import dataclasses
-import math
 from collections.abc import Sequence
 
 import torch
@@ -9,14 +8,15 @@ from torch import Tensor
 
 from torchcal.discovery.fits.fitting import Fitted, fit
 from torchcal.discovery.fits.local import is_window
-from torchcal.discovery.fits.shapes import shape_points
+from torchcal.discovery.fits.shapes import beside, shape_points
 from torchcal.errors import SimulatorError
 
 __all__ = ["placed"]
 
-#: Shares of its range by which a shape is moved to see whether outputs do what their slopes say; how many noise sd they
-#: must move to tell; and the share of that which the slopes must miss.
-NUDGES, SEEN, MISSED = (0.005, 0.03), 0.5, 0.5
+#: Shares of its range by which a shape is moved, either way, to see whether outputs do what their slopes say: a bend
+#: makes less of a smaller one, and a jump does not. How many noise sd they must move to tell; the share of that which
+#: slopes must miss each time; and the share of it below which they say nothing.
+NUDGES, SEEN, MISSED, FLAT = (0.02, 0.05), 0.5, 0.5, 1e-6
 #: Values over the range that are tried, then between the neighbours of the best one; and how often.
 COARSE, FINE, ROUNDS = 48, 12, 3
 #: Of those the ones that are refitted, in so many steps; and by how much χ² must fall.
@@ -44,11 +44,9 @@ def _jumping(found: Fitted, shapes: Sequence[int]) -> list[int]:
         q, value = problem.parameters[place], float(found.values[place])
         if is_window(q.name):
             continue
-        low, high = (math.inf * sign if end is None else end for sign, end in ((-1, q.low), (1, q.high)))
-        width = high - low if math.isfinite(high - low) else abs(value) or 1.0
-        rows = found.values.repeat(2 * len(NUDGES), 1)
-        rows[:, place] += torch.tensor([sign * share * width for share in NUDGES for sign in (-1, 1)])
-        rows[:, place] = rows[:, place].clamp(low, high)
+        points = [point for share in NUDGES for point in beside(q, value, share)]
+        rows = found.values.repeat(len(points), 1)
+        rows[:, place] = torch.tensor(points, dtype=torch.float64)
         try:
             y = problem.evaluate(rows, [], problem.guess(found.warm, rows))[0]
         except SimulatorError:
@@ -57,7 +55,8 @@ def _jumping(found: Fitted, shapes: Sequence[int]) -> list[int]:
         by = rows[1::2, place] - rows[::2, place]
         told = w.vector(found.jacobian[:, found.free.index(place)] * by[:, None])
         size = moved.norm(dim=-1)
-        if bool(((size > SEEN) & ((moved - told).norm(dim=-1) > MISSED * size)).any()):  # not where they are NaN
+        missed = (size > SEEN) & ((moved - told).norm(dim=-1) > MISSED * size)  # not where they are NaN
+        if bool(missed.all() or (missed & (told.norm(dim=-1) < FLAT * size)).any()):
             jumping.append(place)
     return jumping
 

@@ -13,7 +13,7 @@ from torchcal.simulators import Parameter
 from torchcal.terms import Term
 
 __all__ = [
-    "combined", "driver_values", "lies_anywhere", "looked_at", "points_of_shapes", "shape_points",
+    "beside", "combined", "driver_values", "lies_anywhere", "looked_at", "points_of_shapes", "shape_points",
 ]  # fmt: skip
 
 #: Points of a grid of shape parameters: along one, two, three and more of them.
@@ -50,6 +50,16 @@ def shape_points(parameter: Parameter, count: int) -> list[float]:
     if _over_decades(parameter):
         return [float(low * (high / low) ** a) for a in at]
     return [float(low + (high - low) * a) for a in at]
+
+
+def beside(q: Parameter, value: float, share: float) -> tuple[float, float]:
+    """Values of a shape below and above one, by a share of its range, or of itself where it has none; within bounds."""
+    low, high = -math.inf if q.low is None else q.low, math.inf if q.high is None else q.high
+    if _over_decades(q):
+        factor = (high / low) ** share
+        return max(value / factor, low), min(value * factor, high)
+    away = share * (high - low if math.isfinite(high - low) else abs(value) or 1.0)
+    return max(value - away, low), min(value + away, high)
 
 
 def _over_decades(q: Parameter) -> bool:
