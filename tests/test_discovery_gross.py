@@ -95,3 +95,38 @@ def test_a_narrow_peak_that_one_datum_shows_is_no_outlier():
     assert told.verdict == "consistent"
     assert told.noise.outliers == 0
     assert np.isclose(float(told.before.fitted.rmse), 0.5, rtol=0.3)
+
+
+@pytest.mark.parametrize("seed", [0, 2, 6, 10, 19])
+def test_few_large_values_in_proportional_noise_are_no_gross_readings(seed):
+    """The largest calibrators of a table are off by as much as all others together: that is how noise grows."""
+    g = np.random.default_rng(seed)
+    x = np.concatenate([np.linspace(0.5, 10.0, 38), [800.0, 1000.0]])
+    y = 2 * x * (1 + 0.1 * g.standard_normal(40))
+    line = tc.Simulator(lambda x, p: p["b"] * x, parameters=[tc.Parameter("b", initial=1.0)])
+    recording = tc.Recording(x=torch.as_tensor(x), y=torch.as_tensor(y))
+    told = diagnose(line, recording, tc.terms.sensor(outputs=recording.outputs, static=True))
+    assert told.verdict == "consistent"
+    assert told.noise.outliers == 0
+
+
+@pytest.mark.parametrize(("at", "times"), [(8, 1e3), (20, 10.0), (20, 1e3)])
+def test_a_gross_reading_of_one_output_beside_another_one(at, times):
+    g = torch.Generator().manual_seed(1)
+    x = torch.linspace(0, 10, 40, dtype=F64)
+    y = 20 * torch.exp(-(((x - 5) / 1.5) ** 2)) + 5 + 0.5 * torch.randn(40, generator=g, dtype=F64)
+    z = 1 + 2 * x + 0.5 * torch.randn(40, generator=g, dtype=F64)
+    y[at] *= times
+    simulator = tc.Simulator(
+        lambda x, p: {"y": p["a"] * torch.exp(-(((x - p["b"]) / p["w"]) ** 2)) + p["c"], "z": p["d"] + p["e"] * x},
+        parameters=[
+            tc.Parameter("a", low=0.0, initial=10.0),
+            tc.Parameter("b", low=0.0, high=10.0, initial=4.5),
+            tc.Parameter("w", low=0.2, high=10.0, initial=2.0),
+            *(tc.Parameter(name, initial=1.0) for name in "cde"),
+        ],
+    )
+    terms = tc.terms.sensor(outputs=("y", "z"), static=True)
+    told = diagnose(simulator, tc.Recording(x=x, y={"y": y, "z": z}), terms)
+    assert told.verdict == "consistent"
+    assert told.set_aside.nonzero().flatten().tolist() == [at]

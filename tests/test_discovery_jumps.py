@@ -84,18 +84,40 @@ def test_an_onset_whose_slope_is_that_of_something_else_is_found():
     assert onset.value == pytest.approx(180.0, abs=3.0)
 
 
-def test_a_threshold_of_a_condition_is_found_and_a_smooth_shape_stays():
+def test_a_threshold_of_a_condition_is_found_though_a_function_raises_beyond():
     x = torch.linspace(0.0, 10.0, 60, dtype=F64)
     noise = 0.05 * torch.randn(60, generator=torch.Generator().manual_seed(4), dtype=F64)
     y = 1.0 + 0.5 * x + torch.where(x > 6.4, 0.4 * (x - 6.4) + 0.3, 0.0) + noise
     simulator = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, parameters=[tc.Parameter("a"), tc.Parameter("b")])
-    kink = tc.Term("breaks", outputs={"y": lambda x, p, y: y + torch.where(x > p["c"], p["h"] + p["k"] * x, 0.0)},
+
+    def breaks(x, p, y):
+        if bool((p["c"] > 9.0).any()):
+            raise ValueError("no threshold there")
+        return y + torch.where(x > p["c"], p["h"] + p["k"] * x, 0.0)
+
+    kink = tc.Term("breaks", outputs={"y": breaks},
                    parameters=[tc.Parameter("h"), tc.Parameter("k"), tc.Parameter("c", low=0.5, high=9.5)])  # fmt: skip
     told = diagnose(simulator, tc.Recording(x=x, y=y), [kink])
     assert ["breaks"] in [told.terms, *told.tied]
     (row,) = (row for row in told.ranking if list(row.terms) == ["breaks"] and not row.region)
     c = next(e for e in row.estimates if e.name == "breaks.c")
     assert c.value == pytest.approx(6.4, abs=0.2)
+
+
+def test_the_interval_of_a_threshold_is_the_gap_between_data_and_it_has_an_effect():
+    x = torch.linspace(0.0, 10.0, 60, dtype=F64)
+    noise = 0.05 * torch.randn(60, generator=torch.Generator().manual_seed(4), dtype=F64)
+    y = 1.0 + 0.5 * x + torch.where(x > 6.4, 0.5, 0.0) + noise
+    simulator = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, parameters=[tc.Parameter("a"), tc.Parameter("b")])
+    step = tc.Term("step", outputs={"y": lambda x, p, y: y + torch.where(x > p["c"], p["h"], 0.0)},
+                   parameters=[tc.Parameter("h"), tc.Parameter("c", low=0.5, high=9.5)])  # fmt: skip
+    told = diagnose(simulator, tc.Recording(x=x, y=y), [step])
+    assert told.terms == ["step"]
+    c = next(e for e in told.ranking[0].estimates if e.name == "step.c")
+    low, high = c.interval
+    assert 6.0 < low <= c.value <= high < 6.8
+    assert "not determined" not in str(told)
+    assert "has no effect" not in str(told)
 
 
 def test_a_time_that_nobody_says_anything_of_is_no_amplitude():

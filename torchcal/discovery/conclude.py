@@ -27,6 +27,7 @@ from torchcal.discovery.findings.symptoms import (
 )
 from torchcal.discovery.findings.where import locate, missing_rate, needed_shifts, sharpened
 from torchcal.discovery.fits.fitting import Fitted
+from torchcal.discovery.fits.jumps import within
 from torchcal.discovery.hypotheses import verify
 from torchcal.discovery.hypotheses.base import FEW_AGREE
 from torchcal.discovery.hypotheses.model import Model
@@ -100,7 +101,8 @@ def conclude(judged: Judged, asked: Asked, *, interrupted: str = "") -> Diagnosi
     final = base
     if best is not None:
         if not search.exact:
-            best.intervals = by_profile(best.found, best.candidate.own, search.stop.is_set)
+            shapes = [i for i in best.candidate.own if i not in best.candidate.amplitudes]
+            best.intervals = by_profile(best.found, best.candidate.own, search.stop.is_set) | within(best.found, shapes)
         final = explain.fit_record(best.found, best.structure, best.names, best.window, best.intervals)
     lost = is_lost(search, decision)
     _warn(search, lost)
@@ -111,6 +113,7 @@ def conclude(judged: Judged, asked: Asked, *, interrupted: str = "") -> Diagnosi
     apart = [*unlike(search, left), *shared(search, left)] if decision.verdict in ("consistent", "named") else []
     blocks = in_blocks(search)
     apart += blocks
+    blocks = blocks if len(search.problem.recording.outputs) == 1 else []  # of others rows tell the rest
     if decision.verdict == "consistent":
         apart += [*(() if blocks else in_rows(search, left)), *along(search, left), *together(search, left)]
     aside = asked.recording.observed_once & ~search.problem.keep

@@ -35,7 +35,7 @@ from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.several import refit_several
 from torchcal.discovery.verdicts.verdict import WHITE, base_alone
 from torchcal.discovery.windows import refit_local
-from torchcal.errors import SimulatorError, TorchcalError
+from torchcal.errors import ConvergenceError, SimulatorError
 
 __all__ = ["settle", "with_all", "with_explained", "without_others"]
 
@@ -209,7 +209,7 @@ def _of(search: Search, problem: Problem, **changes: Any) -> Search | None:
     other = dataclasses.replace(search, problem=problem, clean=True, **changes)
     try:
         other.calibrate_base()
-    except TorchcalError:
+    except (ConvergenceError, SimulatorError):
         return None
     return other
 

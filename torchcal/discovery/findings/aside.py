@@ -33,22 +33,23 @@ def side_by_side(problem: Problem, off: Tensor, aside: Tensor) -> list[str]:
         return []
     problem = dataclasses.replace(problem, keep=problem.keep | aside)
     far, out = off[problem.index], aside[problem.index]
-    if told := _on_end(problem, far, out):
-        return told
+    told, together = _on_end(problem, far, out)
+    out &= ~together
     curves = _curves(problem)
     pairs = [pair for places, at in curves for pair in _pairs(places, far, out, at)]
     if not pairs:
-        return []
+        return told
     above, below = (int((out & (far * sign > 0)).sum()) for sign in (1, -1))
     # 1 of data in one row; replicates are no neighbours.
     ways = sum(int((at[places].diff() != 0).sum()) for places, at in curves) / max(problem.n - 1, 1)
     chance = chance_of_pairs(len(pairs), above, below, problem.n, ways)
     others = int(aside.sum()) > len({k for pair in pairs for k in pair})
     if chance >= CHANCE and others:
-        return []
+        return told
     first, second = max(pairs, key=lambda pair: float(far[list(pair)].abs().min()))
     alone = ", and there are no others" if int(aside.sum()) == 2 else ""
     return [
+        *told,
         f"two that were set aside as outliers are neighbours, {place_of(problem, first)} and "
         f"{place_of(problem, second)}, off by {float(far[first]):+.1f} and {float(far[second]):+.1f} noise sd: "
         f"outliers are so by chance with a probability of {chance:.2g}{alone}. Something short may act there; repeat "
@@ -56,11 +57,13 @@ def side_by_side(problem: Problem, off: Tensor, aside: Tensor) -> list[str]:
     ]
 
 
-def _on_end(problem: Problem, far: Tensor, out: Tensor) -> list[str]:
-    """Rows of a table that were all set aside, one after the other and on the same side, where that is no chance."""
-    told: list[str] = []
-    if problem.in_time:
-        return told
+def _on_end(problem: Problem, far: Tensor, out: Tensor) -> tuple[list[str], Tensor]:
+    """Rows of a table that were all set aside, one after the other and on the same side, where that is no chance; and
+    which data these are, bool ``(n,)``. Of a table in the order of its only condition they are neighbours."""
+    told, together = list[str](), torch.zeros_like(out)
+    steps = None if problem.order is None else problem.order.diff()
+    if problem.in_time or (steps is not None and bool((steps >= 0).all() | (steps <= 0).all())):
+        return told, together
     sign = torch.where(out, far.sign(), 0.0)
     for number, name in enumerate(problem.recording.outputs):
         mine = (problem.output_of == number).nonzero()[:, 0]
@@ -72,13 +75,14 @@ def _on_end(problem: Problem, far: Tensor, out: Tensor) -> list[str]:
         rows = mine[int(counts[: int(lengths.argmax())].sum()) :][:size]
         first, last = (int(problem.condition_of[rows[k]]) + 1 for k in (0, -1))
         of = f" of {name}" if len(problem.recording.outputs) > 1 else ""
+        together[rows] = True
         told.append(
-            f"{size} rows on end{of}, {first} to {last}, were set aside as outliers, all on one side, by "
+            f"all data{of} in rows {first} to {last}, {size} of them, were set aside as outliers, all on one side, by "
             f"{float(far[rows].mean()):+.1f} noise sd on average: what these rows have in common, as a sweep, a day or "
             "a sample, is off as a whole. If that is no mistake, give a condition that says so, and let a parameter or "
             "an offset differ with it"
         )
-    return told
+    return told, together
 
 
 def _curves(problem: Problem) -> list[tuple[Tensor, Tensor]]:

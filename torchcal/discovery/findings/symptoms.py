@@ -286,11 +286,12 @@ def in_blocks(search: Search) -> list[str]:
         if found:
             of = f" of {name}" if len(problem.recording.outputs) > 1 else ""
             told = joined([str(one) for one in found])
-            counted = "" if found[0].gain else " (sd of what they differ by otherwise)"
+            counted = "% of the mean of all" if found[0].gain else "sd of what they differ by otherwise"
+            also = "" if search.noise.source == "given" else ", and the noise was estimated with that in it"
             rows.append(
-                f"replicates{of} differ by blocks of rows and hardly within these: {told}{counted}. Sweeps, days or "
-                "samples differ, or the instrument was set anew, and the noise was estimated with that in it. Give a "
-                "condition that says which block a row belongs to, and let a parameter or an offset differ with it"
+                f"replicates{of} differ by blocks of rows and hardly within these: {told} ({counted}). Sweeps, days or "
+                f"samples differ, or the instrument was set anew{also}. Give a condition that says which block a row "
+                "belongs to, and let a parameter or an offset differ with it"
             )
     return rows
 

@@ -336,15 +336,21 @@ def _unfollowed(found: Fitted, begin: Tensor, rough: Tensor, outputs: Tensor) ->
         return found
     if other is None:
         return found
-    size = rough[fewer.index]
-    now, then = (r.div(size).square().mean() for r in (found.residual[~alone], other.residual))
-    return other if float(then) < RUINED**2 * float(now) else found
+    for output in problem.output_of[alone].unique():
+        now = found.residual[~alone & (problem.output_of == output)].square().mean()
+        then = other.residual[fewer.output_of == output].square().mean()
+        if not float(then) < RUINED**2 * float(now):
+            return found
+    return other
 
 
 def _drawn(found: Fitted, bad: Tensor) -> bool:
     """Whether outliers, bool ``(n,)``, are so far off that they may have drawn a fit away from the others."""
-    size = found.residual.abs()
-    return bool((size[bad] > DRAWN * 1.4826 * size[~bad].median()).any())
+    size, output_of = found.residual.abs(), found.problem.output_of
+    return any(
+        bool((size[bad & (output_of == k)] > DRAWN * 1.4826 * size[~bad & (output_of == k)].median()).any())
+        for k in output_of[bad].unique()
+    )
 
 
 def _misfit_of_each(found: Fitted) -> Tensor:

@@ -23,6 +23,10 @@ COST = 1.5
 #: Log odds against noise with a memory, from which on there are jumps. Of AR(1) noise, whatever its coefficient, one
 #: recording in a hundred has as much.
 SURER = 5.0
+#: Powers of the row number, and times in which something fades as shares of the rows, that smooth drifts are made of.
+POWERS, FADING = 3, (0.02, 0.05, 0.1, 0.2, 0.4)
+#: Share of the largest jump below which another one is none: steps follow what wanders too.
+SMALL = 0.2
 #: Share of its norm that the means of the conditions leave of a jump's effect at least, for it to be seen.
 SEEN = 1e-6
 #: Variation of the data, in their size, from which on a gain does something else than an offset.
@@ -52,7 +56,8 @@ class Jump:
 
 
 def jumps(problem: Problem, own: Replicates, unit: Tensor) -> list[Jump]:
-    """Rows at which replicates of one output jump; none where noise with or without a memory explains them as well.
+    """Rows at which replicates of one output jump; none where noise with or without a memory, or
+    a smooth drift along the rows, explains them as well.
 
     Args:
         problem: Its rows are in the order of the recording.
@@ -73,7 +78,8 @@ def jumps(problem: Problem, own: Replicates, unit: Tensor) -> list[Jump]:
             return []
         scale = each[problem.index[own.places]]
         jacobian = float(own.share @ scale.log())
-        noise = max(noise, float(told[0].max()) - jacobian)
+        drift = _drift(own, scale, problem.condition_of[own.places].double())
+        noise = max(noise, float(told[0].max()) - jacobian, float(told[0][0]) - jacobian + drift)
         steps = [_Steps(own, scale, form) for form in forms]
         fits += [(float(told[0][0]) - jacobian + one.gained, k > 0, one) for k, one in enumerate(steps)]
     likely, gain, best = max(fits, key=lambda one: one[0])
@@ -81,7 +87,23 @@ def jumps(problem: Problem, own: Replicates, unit: Tensor) -> list[Jump]:
         return []
     heights = best.heights if gain else best.heights / best.sd
     rows = problem.condition_of[own.places[best.starts]] + 1
-    return [Jump(row, height, gain) for row, height in zip(rows.tolist(), heights.tolist(), strict=True)]
+    large = heights.abs() >= SMALL * heights.abs().max()
+    return [Jump(row, height, gain) for row, height in zip(rows[large].tolist(), heights[large].tolist(), strict=True)]
+
+
+def _drift(own: Replicates, scale: Tensor, row: Tensor) -> float:
+    """Log-likelihood that a smooth drift along the rows ``(n,)`` adds, less what it costs."""
+    n, off = len(row), own.off / scale
+    at, best = (row - row[0]) / float(row[-1] - row[0] or 1.0), 0.0
+    powers = torch.stack([at**k for k in range(1, POWERS + 1)], dim=1)
+    forms = [powers[:, :k] for k in range(1, POWERS + 1)]
+    forms += [torch.exp(-at / share)[:, None] for share in FADING]
+    for form in forms:
+        design = own.beyond_means(form / scale[:, None])
+        left = off - design @ torch.linalg.lstsq(design, off[:, None], driver="gelsd").solution[:, 0]
+        share = max(float(left.square().sum() / off.square().sum().clamp_min(1e-300)), ROUNDED)
+        best = max(best, -0.5 * own.freedom * math.log(share) - 0.5 * COST * form.shape[1] * math.log(n))
+    return best
 
 
 class _Steps:
@@ -98,9 +120,7 @@ class _Steps:
         off, form = own.off / scale, form / scale
         n, whole = len(off), float(off.square().sum())
         start = torch.arange(LEAST, n - LEAST + 1)
-        steps = (torch.arange(n)[:, None] >= start) * form[:, None]
-        mean = torch.zeros(own.means, len(start), dtype=torch.float64).index_add_(0, own.group, steps)
-        steps = steps - (mean / torch.bincount(own.group)[:, None])[own.group]
+        steps = own.beyond_means((torch.arange(n)[:, None] >= start) * form[:, None])
         beyond, left, chosen, best = steps, off, list[int](), (0.0, 0)
         for count in range(1, min(MOST, max(n // EACH, 2)) + 1):
             norm = beyond.square().sum(0)

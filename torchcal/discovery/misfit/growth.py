@@ -33,6 +33,8 @@ TRIMMED = 0.05
 BOTH = 10.0
 #: So many data with outputs that small say how noise is there; below them it is no smaller.
 SAY = 3
+#: How often data that are gross beside noise that grows as they make it are left out of what tells that.
+CLEARED = 3
 #: Least share of a datum's own noise that smooth curves leave of it.
 LEVERAGE = 0.1
 
@@ -77,30 +79,51 @@ def _growing(
     little), and no smaller than where `SAY` data were looked at: of a blank nothing is known but by them.
     """
     unit = torch.ones_like(problem.recording.y)
-    parts = [places[~gross(residual[places])] for places in parts]
     used = f[problem.index[torch.cat(parts)]]
     most = float(used.max())
     if not most > 0:
         return unit, 0.0
-    if replicated is not None:
-        kept = ~gross(replicated.even)
-        size = f[problem.index[replicated.places[kept]]] / most
-        found = _grows(replicated.even[kept], size, float(replicated.freedom - int((~kept).sum())))
-    else:
-        for times in (FASTER, 1) if problem.order is not None else (1,):
-            each = [_fastest(problem, places, residual, design, before, times) for places in parts]
-            size = torch.cat([f[problem.index[p]][inside] for p, (_, inside) in zip(parts, each, strict=True)])
-            left = torch.cat([fast for fast, _ in each])
-            if times > 1 and len(left) < FEWEST:  # of short runs
-                continue
-            independent = INDEPENDENT[times] if problem.order is not None else 1.0
-            found = _grows(left, size / most, independent * len(left), GROWS if times == 1 else 0.0)
-            if found is None:
-                break
-    if found is None:
-        return unit, 0.0
-    power, offset, smallest, gain = found
-    return ((offset + (f / most).clamp_min(smallest)) / (offset + float(used.median()) / most)) ** power, gain
+    power, offset, smallest, gain, shape = 1.0, 0.0, 0.0, 0.0, unit
+    kept = torch.ones(problem.n, dtype=torch.bool)
+    for _ in range(CLEARED):
+        if replicated is not None:
+            held = kept[replicated.places]
+            size = f[problem.index[replicated.places[held]]]
+            found = _grows(replicated.even[held], size / most, float(replicated.freedom - int((~held).sum())))
+        else:
+            found = _as_fast(problem, residual, design, f / most, before, [places[kept[places]] for places in parts])
+        if found is None:
+            return unit, 0.0
+        power, offset, smallest, gain = found
+        shape = (offset + (f / most).clamp_min(smallest)) ** power
+        if replicated is not None:
+            out = gross(replicated.even / shape[problem.index[replicated.places]])
+            out, places = out & kept[replicated.places], replicated.places
+        else:
+            places = torch.cat(parts)
+            out = gross(residual[places] / shape[problem.index[places]]) & kept[places]
+        if not bool(out.any()):  # whatever the noise is
+            break
+        kept[places[out]] = False
+    return shape / (offset + float(used.median()) / most) ** power, gain
+
+
+def _as_fast(
+    problem: Problem, residual: Tensor, design: Tensor, f: Tensor, before: Tensor, parts: list[Tensor]
+) -> tuple[float, float, float, float] | None:
+    """As `_grows` of the fastest part of an output's residual, with outputs in the largest one."""
+    found = None
+    for times in (FASTER, 1) if problem.order is not None else (1,):
+        each = [_fastest(problem, places, residual, design, before, times) for places in parts]
+        size = torch.cat([f[problem.index[p]][inside] for p, (_, inside) in zip(parts, each, strict=True)])
+        left = torch.cat([fast for fast, _ in each])
+        if times > 1 and len(left) < FEWEST:  # of short runs
+            continue
+        independent = INDEPENDENT[times] if problem.order is not None else 1.0
+        found = _grows(left, size, independent * len(left), GROWS if times == 1 else 0.0)
+        if found is None:
+            break
+    return found
 
 
 def _grows(left: Tensor, size: Tensor, told: float, least: float = GROWS) -> tuple[float, float, float, float] | None:

@@ -64,6 +64,11 @@ class Replicates:
         """How far each is from its mean, in what has the variance of independent noise."""
         return self.off / self.share.sqrt()
 
+    def beyond_means(self, columns: Tensor) -> Tensor:
+        """Columns ``(n, k)`` at the replicates, off their means at the conditions."""
+        sums = torch.zeros(self.means, columns.shape[1], dtype=torch.float64).index_add_(0, self.group, columns)
+        return columns - (sums / torch.bincount(self.group)[:, None])[self.group]
+
     def sd(self, problem: Problem, unit: Tensor) -> float:
         """Sd of independent noise, in a unit ``(n_total,)`` that is the same at identical conditions."""
         e = self.off / unit[problem.index[self.places]]

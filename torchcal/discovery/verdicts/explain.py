@@ -203,7 +203,9 @@ def identifiability(search: Search, best: Model | None) -> list[str]:
     unseen, mixed = _untold(search.base)
     if best is not None:
         more = _untold(best.found)
-        unseen, mixed = unseen + more[0], mixed + more[1]
+        scanned = {best.found.problem.parameters[i].name for i in best.intervals or {}}
+        unseen += [name for name in more[0] if name not in scanned]
+        mixed += [names for names in more[1] if not scanned & set(names)]
     rows = [f"{name} has no effect on these data" for name in dict.fromkeys(unseen)]
     rows += [
         f"a common change of {', '.join(group)} moves no datum: only combinations can be told"
