@@ -5,7 +5,9 @@ import pytest
 import torch
 
 import torchcal as tc
+from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.outliers import gross
+from torchcal.errors import SimulatorError
 
 F64 = torch.float64
 
@@ -130,3 +132,24 @@ def test_a_gross_reading_of_one_output_beside_another_one(at, times):
     told = diagnose(simulator, tc.Recording(x=x, y={"y": y, "z": z}), terms)
     assert told.verdict == "consistent"
     assert told.set_aside.nonzero().flatten().tolist() == [at]
+
+
+def test_a_base_that_cannot_be_calibrated_without_outliers_ends_no_diagnosis(monkeypatch):
+    """What is set aside may have been all that told of an initial state: the first search stays."""
+    usual, refused = Search.calibrate_base, []
+
+    def calibrated(search, *given):
+        if search.clean:
+            refused.append(search.problem.n)
+            raise SimulatorError("Expected the solution to settle. Got none.")
+        return usual(search, *given)
+
+    monkeypatch.setattr(Search, "calibrate_base", calibrated)
+    x = torch.linspace(0, 10, 60, dtype=F64)
+    y = 1 + 2 * x + 0.4 * x**2 + 0.3 * torch.randn(60, generator=torch.Generator().manual_seed(2), dtype=F64)
+    y[20] += 1.8
+    line = tc.Simulator(lambda x, p: p["a"] + p["b"] * x, parameters=[tc.Parameter("a"), tc.Parameter("b")])
+    bend = tc.Term("bend", outputs={"y": lambda x, p, y: y + p["q"] * x**2}, parameters=[tc.Parameter("q")])
+    told = diagnose(line, tc.Recording(x=x, y=y), [bend])
+    assert refused
+    assert ["bend"] in [told.terms, *told.tied]
