@@ -101,8 +101,8 @@ def conclude(judged: Judged, asked: Asked, *, interrupted: str = "") -> Diagnosi
     final = base
     if best is not None:
         if not search.exact:
-            shapes = [i for i in best.candidate.own if i not in best.candidate.amplitudes]
-            best.intervals = by_profile(best.found, best.candidate.own, search.stop.is_set) | within(best.found, shapes)
+            best.intervals = by_profile(best.found, best.candidate.own, search.stop.is_set)
+            best.intervals |= within(best.found, best.candidate.shape_places)
         final = explain.fit_record(best.found, best.structure, best.names, best.window, best.intervals)
     lost = is_lost(search, decision)
     _warn(search, lost)

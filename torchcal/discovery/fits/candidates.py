@@ -76,6 +76,11 @@ class Candidate:
         """Names of the parameters that it adds to the base: candidates with the same are one, by whatever name."""
         return frozenset(self.problem.parameters[i].name for i in self.own)
 
+    @property
+    def shape_places(self) -> list[int]:
+        """Places of its own parameters that are no amplitudes: shapes."""
+        return [i for i in self.own if i not in self.amplitudes]
+
     def neutral_at(self, place: int) -> float:
         """The neutral value of one of its own parameters, by its place among all."""
         return float(self.neutral[self.own.index(place)])

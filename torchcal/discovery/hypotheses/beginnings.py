@@ -188,8 +188,7 @@ def farther(
         by_size.setdefault(float(ends[k, place]), k)
     if not by_size:
         return nothing
-    shape = [i for i in candidate.own if i not in candidate.amplitudes]
-    free = [i for i in candidate.free if i not in shape]
+    free = [i for i in candidate.free if i not in candidate.shape_places]
     begin = ends[[*by_size.values()][:BEST]]
     return _each_fitted(problem, w, begin, free, GONE_ON, problem.guess(base.warm, begin))
 

@@ -100,9 +100,8 @@ def _fits(search: Search, wanted: Sequence[Hypothetical]) -> list[Fitted | None]
     for one in wanted:
         candidate, begin = one.candidate, one.begin
         warm = candidate.problem.guess(search.base.warm, begin)
-        shape = [i for i in candidate.own if i not in candidate.amplitudes]
         whitening = search.noise.whitening(candidate.problem)
-        jobs.append(Refit(candidate.problem, whitening, begin, candidate.free, shape, warm, aim))
+        jobs.append(Refit(candidate.problem, whitening, begin, candidate.free, candidate.shape_places, warm, aim))
     names = [" + ".join(term.name for term in one.candidate.terms) for one in wanted]
 
     def take(index: int, fitted: Fitted | None) -> None:

@@ -83,25 +83,20 @@ def _growing(
     most = float(used.max())
     if not most > 0:
         return unit, 0.0
-    power, offset, smallest, gain, shape = 1.0, 0.0, 0.0, 0.0, unit
-    kept = torch.ones(problem.n, dtype=torch.bool)
+    places = torch.cat(parts) if replicated is None else replicated.places
+    scatter = residual[places] if replicated is None else replicated.even
+    at, kept = problem.index[places], torch.ones(problem.n, dtype=torch.bool)
     for _ in range(CLEARED):
-        if replicated is not None:
-            held = kept[replicated.places]
-            size = f[problem.index[replicated.places[held]]]
-            found = _grows(replicated.even[held], size / most, float(replicated.freedom - int((~held).sum())))
+        held = kept[places]
+        if replicated is None:
+            found = _as_fast(problem, residual, design, f / most, before, [part[kept[part]] for part in parts])
         else:
-            found = _as_fast(problem, residual, design, f / most, before, [places[kept[places]] for places in parts])
+            found = _grows(scatter[held], f[at][held] / most, float(replicated.freedom - int((~held).sum())))
         if found is None:
             return unit, 0.0
         power, offset, smallest, gain = found
         shape = (offset + (f / most).clamp_min(smallest)) ** power
-        if replicated is not None:
-            out = gross(replicated.even / shape[problem.index[replicated.places]])
-            out, places = out & kept[replicated.places], replicated.places
-        else:
-            places = torch.cat(parts)
-            out = gross(residual[places] / shape[problem.index[places]]) & kept[places]
+        out = gross(scatter / shape[at]) & held
         if not bool(out.any()):  # whatever the noise is
             break
         kept[places[out]] = False

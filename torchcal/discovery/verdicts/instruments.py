@@ -68,8 +68,8 @@ def _worse_at(model: Model, name: str, value: float) -> float:
     found, candidate = model.found, model.candidate
     place = [q.name for q in found.problem.parameters].index(name)
     begin = found.values.expand(1 + len(candidate.shapes), -1).clone()
-    shapes = [k for k, i in enumerate(candidate.own) if i not in candidate.amplitudes]
-    begin[1:, [candidate.own[k] for k in shapes]] = candidate.shapes[:, shapes]
+    shapes = candidate.shape_places
+    begin[1:, shapes] = candidate.shapes[:, [candidate.own.index(i) for i in shapes]]
     begin[:, place] = value
     held = fit(found.problem, found.whitening, begin, [i for i in found.free if i != place])
     return math.inf if held is None else held.chi2 - found.chi2
