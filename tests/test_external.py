@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcal import Recording, Term, calibrate, diagnose
+from torchcal import Recording, Term, calibrate
 from torchcal.embeddings import Gaussian
 from torchcal.errors import DomainError, ShapeError, SimulatorError
 from torchcal.likelihoods import ABC
@@ -173,26 +173,31 @@ def test_gradient_of_several_outputs(values):
     torch.testing.assert_close(found, slope_of(model.at(X, ["z", "y"]), values), rtol=1e-6, atol=1e-6)
 
 
-def test_parameters_that_vary_with_the_conditions(values):
+@pytest.mark.parametrize(("function", "vectorized"), [(scalar, False), (arrays, True)])
+def test_parameters_that_vary_with_the_conditions(function, vectorized, values):
     def shifted(simulator):
         return lambda v: simulator.function(X, {"a": v[..., :1] * X["t"], "b": v[..., 1:]})
 
-    external, model = shifted(ExternalSimulator(scalar, PARAMETERS)), shifted(Simulator(in_torch, PARAMETERS))
+    external = shifted(ExternalSimulator(function, PARAMETERS, vectorized=vectorized))
+    model = shifted(Simulator(in_torch, PARAMETERS))
     torch.testing.assert_close(external(values), model(values), rtol=1e-14, atol=1e-14)
     torch.testing.assert_close(slope_of(external, values), slope_of(model, values), rtol=1e-6, atol=1e-6)
 
 
-def test_vectorized_functions_refuse_shifted_parameters():
-    simulator = ExternalSimulator(arrays, PARAMETERS, vectorized=True)
-    with pytest.raises(SimulatorError, match="vectorized=False"):
-        simulator.function(X, {"a": X["t"], "b": torch.ones(1).double()})
+def test_a_vectorized_function_is_called_once_for_each_value_of_a_shifted_parameter(values):
+    def mixes(x, p):  # what is at one condition depends on them all
+        calls.append(p["a"])
+        return {"y": p["a"] * np.cumsum(x["t"]), "z": x["s"] ** p["b"]}
 
-
-def test_a_term_that_shifts_a_parameter_of_a_vectorized_function_is_refused_by_its_name():
-    simulator = ExternalSimulator(arrays, PARAMETERS, vectorized=True)
-    term = Term("ageing", shifts={"a": lambda x, p: p["m"] * x["t"]}, parameters=[Parameter("m")])
-    with pytest.raises(DomainError, match=r"^Expected a term without shifts= .*'ageing'.*vectorized=False"):
-        diagnose(simulator, Recording(x=X, y={"y": X["t"]}), [term], progress=False)
+    calls = []
+    simulator = ExternalSimulator(mixes, PARAMETERS, vectorized=True)
+    a = torch.tensor([[1.0, 1.0, 2.0, 2.0], [1.0, math.nan, 3.0, 3.0], [math.nan] * 4]).double()
+    found = simulator.function(X, {"a": a, "b": torch.ones(3, 1).double()})
+    assert sorted(calls) == [1.0, 1.0, 2.0, 3.0]
+    torch.testing.assert_close(found["y"], a * torch.cumsum(X["t"], 0), equal_nan=True)
+    torch.testing.assert_close(found["z"], torch.where(a.isnan(), a, X["s"]), equal_nan=True)
+    backwards = simulator.function(X, {"a": a.flip(0), "b": torch.ones(3, 1).double()})  # the first has no answer
+    torch.testing.assert_close(backwards["y"], found["y"].flip(0), equal_nan=True)
 
 
 def test_gradient_takes_2d_evaluations_a_row_and_only_when_needed(values):

@@ -38,9 +38,10 @@ class ExternalSimulator(Simulator):
     Args:
         function: ``function(x, p)`` with ``p`` a dict of floats. ``x`` is a float, or a dict of them where the
             conditions are named; it returns a number, or a dict of them for several outputs. With ``vectorized``
-            ``x`` holds numpy arrays ``(n,)``, and it returns arrays ``(n,)``. It must give the same numbers for
-            the same arguments. Where it has no answer it may return nan or a masked value; arithmetic errors count
-            as none.
+            ``x`` holds numpy arrays ``(n,)``, and it returns arrays ``(n,)``; where a term's ``shifts`` give every
+            condition a value of its own, it is called with all conditions once for each of these values. It must
+            give the same numbers for the same arguments. Where it has no answer it may return nan or a masked value;
+            arithmetic errors count as none.
         parameters: In the order in which results list them.
         executor: Any ``concurrent.futures.Executor``; None calls the function here. For a process pool the
             function must be defined at the top level of a module. All parameter values of a call go in one map,
@@ -148,11 +149,6 @@ class ExternalSimulator(Simulator):
     def _call(self, x: Conditions, p: dict[str, Tensor]) -> Tensor | dict[str, Tensor]:
         """``function(x, p)`` on tensors: ``p[name]`` is ``(*batch, 1)``, or ``(*batch, n)`` where it varies."""
         values = torch.stack(torch.broadcast_tensors(*(p[name] for name in self.names)), dim=-1)
-        if self.vectorized and values.shape[-2] > 1:
-            raise SimulatorError(
-                "Expected parameters that are the same at all conditions. Got values that vary with them (a "
-                "term's shifts=), which a vectorized function cannot take. Use vectorized=False."
-            )
         rows = values.reshape(-1, *values.shape[-2:])
         job = _Job(self, x, None)
         result = _unflatten(_Differenced.apply(rows, job), values.shape[:-2])
@@ -200,6 +196,9 @@ class _Job:
         """Outputs ``(R, outputs * n)`` at values ``(R, L, d)`` with L = 1 or n."""
         simulator, n = self.simulator, len(self.x)
         count = values.shape[-1]
+        if simulator.vectorized and values.shape[1] > 1:
+            each = [self._each(row) for row in values]
+            return np.stack([one if len(one) == self.width else np.full(self.width, np.nan) for one in each])
         call: ArrayCall | PointCall
         if simulator.vectorized:
             rows = values[:, 0]
@@ -219,6 +218,14 @@ class _Job:
         self.width = len(found) * n
         result = result.reshape(len(found), len(values), n)
         return result.transpose(1, 0, 2).reshape(len(values), self.width)
+
+    def _each(self, values: Array) -> Array:
+        """Outputs ``(outputs * n,)`` of a vectorized function at values of their own for all conditions, ``(n, d)``: of
+        those of every value at all conditions the one where it holds."""
+        unique, inverse = np.unique(values, axis=0, return_inverse=True)
+        found = self(unique[:, None])
+        found = found.reshape(len(unique), -1, len(self.x))
+        return np.asarray(found[inverse.reshape(-1), :, np.arange(len(self.x))].T.reshape(-1))
 
     def _run(self, call: ArrayCall | PointCall, rows: Array) -> Array | None:
         values: list[Value | None] = [None] * len(rows)  # None where there is no number

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from torchcal.errors import DomainError, SimulatorError
 from torchcal.simulators import (
-    ExternalSimulator,
     ODESimulator,
     Parameter,
     Simulator,
@@ -166,12 +165,6 @@ def _extend_static(simulator: Simulator, terms: Sequence[Term]) -> Simulator:
             raise DomainError(
                 f"Expected a term without rates for a static simulator. Got {term.name!r} (give shifts=, outputs= or "
                 "frees=, or write the model as an ODESimulator)."
-            )
-        if term.shifts and isinstance(plain, ExternalSimulator) and plain.vectorized:
-            raise DomainError(
-                "Expected a term without shifts= for a vectorized ExternalSimulator, which takes each parameter as one "
-                f"number for all conditions. Got {term.name!r} (give the simulator vectorized=False, or the code a "
-                "switch: a parameter with a neutral value, which a term frees)."
             )
     parameters = _parameters(simulator, terms)
     if not any(term.shifts or term.outputs for term in terms):
