@@ -393,7 +393,7 @@ def test_no_long_refit_is_gone_on_with_after_ctrl_c(monkeypatch, terminal):
 
     monkeypatch.setattr("torchcal.discovery.hypotheses.refitting.refit_all", refits)
     problem = SimpleNamespace(guess=lambda warm, begin: None)
-    candidate = SimpleNamespace(problem=problem, own=[], amplitudes=[], free=[], terms=[SimpleNamespace(name="a")])
+    candidate = SimpleNamespace(problem=problem, shape_places=[], free=[], terms=[SimpleNamespace(name="a")])
     wanted = [SimpleNamespace(candidate=candidate, begin=None) for _ in range(3)]
     for pressed in (False, True):
         stages.clear()
