@@ -83,9 +83,9 @@ def test_second_terms_are_sought_beside_what_acts_everywhere_too(monkeypatch):
     def next_terms(search, model, most):
         asked.append((model.numbers[0], model.window is None))
         others = [i for i in order if i != model.numbers[0]]
-        return others if model.window is None else others[:1]
+        return dict.fromkeys(others if model.window is None else others[:1])
 
-    def refit_sets(search, sets, prior):
+    def refit_sets(search, sets, prior, beside):
         wanted.extend(pair for pair, _ in sets)
         return []
 

@@ -11,11 +11,10 @@ from torch import Tensor
 from torchcal.discovery.fits.candidates import Candidate
 from torchcal.discovery.fits.fitting import Fitted
 from torchcal.discovery.hypotheses.aliases import merge, merge_sets
-from torchcal.discovery.hypotheses.beginnings import BENT, STRONG, beginnings
-from torchcal.discovery.hypotheses.beside import screened_beside
+from torchcal.discovery.hypotheses.beginnings import BENT, STRONG
+from torchcal.discovery.hypotheses.beside import Beside, screened_beside
 from torchcal.discovery.hypotheses.model import Hypothetical, Model
 from torchcal.discovery.hypotheses.refitting import BETTER, improve, refit_together
-from torchcal.discovery.hypotheses.screen import Screening
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.hypotheses.sets import acting_order, distinct, hypothetical, refit_sets, refitted
 from torchcal.discovery.misfit.residual import Residual
@@ -107,27 +106,26 @@ def _in_its_place(search: Search, lead: Model, prior: float) -> None:
     known: dict[tuple[int, ...], Model] = {
         m.numbers: m for m in search.models if len(m.numbers) == 2 and m.window is None
     }
-    begun: dict[tuple[int, ...], tuple[Residual, Candidate, Screening]] = {}
+    begun: dict[tuple[int, ...], dict[int, Beside]] = {}
     for kept in lead.numbers:
         (other,) = set(lead.numbers) - {kept}
         try:
             there = _without(search, lead, kept)
         except (SimulatorError, DomainError):  # one without the other may lead where nothing works
             continue
-        residual = Residual(there, search.noise, draws=10)
-        every = screened_beside(search, there, residual, (kept,))
-        scores = {j: seen.score(0) for j, (_, seen) in every.items()}
+        every = screened_beside(search, Residual(there, search.noise, draws=10), (kept,))
+        scores = {j: seen.score for j, seen in every.items()}
         able = [j for j in scores if j != other and scores[j] > STANDS_IN * scores.get(other, math.inf)]
         for j in sorted(able, key=lambda j: -scores[j])[:STAND_INS]:
             pair = tuple(sorted((kept, j)))
             if pair not in known or known[pair].weight <= lead.weight - BETTER:
-                begun[pair] = residual, *every[j]
+                begun[pair] = {j: every[j]}
     fresh = distinct(search, [pair for pair in begun if pair not in known])
     wanted = []
-    for pair, (residual, prepared, seen) in begun.items():
-        one = hypothetical(search, pair, prior, None) if pair in known or pair in fresh else None
+    for pair, seen in begun.items():
+        one = hypothetical(search, pair, prior, None, beside=seen) if pair in known or pair in fresh else None
         if one is not None:
-            begin = _reordered(beginnings(residual, seen, 0, prepared, None), prepared, one.candidate)
+            (begin,) = (each.begin(one.candidate) for each in seen.values())
             wanted.append(dataclasses.replace(one, begin=begin))
     fitted = []
     for model in refitted(search, wanted):
@@ -156,12 +154,6 @@ def _standing(candidate: Candidate, model: Model) -> Tensor:
     for k in candidate.free:
         row[k] = known[candidate.problem.parameters[k].name]
     return row
-
-
-def _reordered(rows: Tensor, candidate: Candidate, other: Candidate) -> Tensor:
-    """Values ``(B, P)`` of one candidate's parameters in the order of another's."""
-    names = [q.name for q in candidate.problem.parameters]
-    return rows[:, [names.index(q.name) for q in other.problem.parameters]]
 
 
 def either_way(search: Search, pairs: list[Model]) -> None:

@@ -11,7 +11,7 @@ from torchcal.discovery.fits.candidates import spread_values
 from torchcal.discovery.fits.fitting import refit
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.base import MOST
-from torchcal.discovery.hypotheses.beside import scores_beside
+from torchcal.discovery.hypotheses.beside import screened_beside
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.own_noise import (
     EXPLAINED,
@@ -223,8 +223,8 @@ def _may_explain(search: Search, best: Model, observed: Problem) -> bool:
         return True
     if len(best.numbers) >= search.max_terms:
         return False
-    scores = scores_beside(search, found, Residual(found, search.noise, draws=10), best.numbers)
-    return max((0.5 * score**2 for score, _ in scores), default=0.0) > short
+    every = screened_beside(search, Residual(found, search.noise, draws=10), best.numbers)
+    return max((0.5 * seen.score**2 for seen in every.values()), default=0.0) > short
 
 
 def _well_told(noise: Noise) -> bool:

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchcal.discovery.hypotheses.aliases import merge_sets
 from torchcal.discovery.hypotheses.beginnings import is_far
-from torchcal.discovery.hypotheses.beside import next_terms
+from torchcal.discovery.hypotheses.beside import Beside, next_terms
 from torchcal.discovery.hypotheses.linear_pairs import linear_pairs
 from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
 from torchcal.discovery.hypotheses.search import Search
@@ -51,9 +51,9 @@ def refit_several(search: Search) -> None:
     enough = _enough(search)
     if enough and search.exact:
         return
-    wanted = _pairs_to_try(search, single, enough)
+    wanted, beside = _pairs_to_try(search, single, enough)
     prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))
-    search.models += (fitted := refit_sets(search, list(wanted.items()), prior))
+    search.models += (fitted := refit_sets(search, list(wanted.items()), prior, beside))
     if not enough:
         either_way(search, fitted)
     merge_sets(search)
@@ -71,8 +71,9 @@ def refit_several(search: Search) -> None:
     best = max(pairs, key=lambda m: m.weight)
     if search.examine(best).p_value < 0.01 or search.exact:
         third = math.log(0.2 * PRIOR["several"] / (count * (count - 1) * max(count - 2, 1) / 6))
-        more = distinct(search, [(*best.numbers, j) for j in next_terms(search, best, THIRD)])
-        search.models += refitted(search, [_with_third(search, best, j, third) for *_, j in more])
+        thirds = next_terms(search, best, THIRD)
+        more = distinct(search, [(*best.numbers, j) for j in thirds])
+        search.models += refitted(search, [_with_third(search, best, j, third, thirds[j]) for *_, j in more])
         leader = search.physical_leader
         if leader is not None and len(leader.numbers) == 3:
             one_fewer(search, leader, prior)
@@ -81,8 +82,9 @@ def refit_several(search: Search) -> None:
 
 def _pairs_to_try(
     search: Search, single: Sequence[Model], enough: bool
-) -> dict[tuple[int, ...], tuple[int, int] | None]:
-    """Pairs, each with the columns of the linear search that suggested it, if that did.
+) -> tuple[dict[tuple[int, ...], tuple[int, int] | None], dict[tuple[int, ...], dict[int, Beside]]]:
+    """Pairs, each with the columns of the linear search that suggested it, if that did; and what was seen of one beside
+    the other.
 
     Args:
         single: Models of one term, the likeliest first.
@@ -96,8 +98,9 @@ def _pairs_to_try(
         lead = model.numbers[0]  # in a window merged ones may differ
         leads.setdefault(search.twins[lead] if lead in search.gone else lead, model)
     ahead = list(itertools.islice(leads.items(), 1 if enough else LEADS))
-    beside = [_pairs_with(search, lead, model) for lead, model in ahead]
-    for pair in itertools.chain(*itertools.zip_longest(*beside)):  # the best of each lead first
+    seen: dict[tuple[int, ...], dict[int, Beside]] = {}
+    with_each = [_pairs_with(search, lead, model, seen) for lead, model in ahead]
+    for pair in itertools.chain(*itertools.zip_longest(*with_each)):  # the best of each lead first
         if pair is not None:
             wanted.setdefault(pair, None)
     wanted = {pair: wanted[pair] for pair in distinct(search, wanted)}
@@ -106,14 +109,22 @@ def _pairs_to_try(
         everywhere = [(m.numbers[0], m) for m in single if m.window is None][:LEADS]
         for lead, model in everywhere:
             if (lead, model) not in ahead:
-                more = distinct(search, [*wanted, *_pairs_with(search, lead, model)])[len(wanted) :]
+                more = distinct(search, [*wanted, *_pairs_with(search, lead, model, seen)])[len(wanted) :]
                 wanted.update(dict.fromkeys(more[:MORE]))
-    return wanted
+    return wanted, seen
 
 
-def _pairs_with(search: Search, lead: int, model: Model) -> list[tuple[int, ...]]:
-    """Pairs of a single term and the best second ones at its fit."""
-    return [tuple(sorted((lead, j))) for j in next_terms(search, model, NEXT) if j != lead]
+def _pairs_with(
+    search: Search, lead: int, model: Model, seen: dict[tuple[int, ...], dict[int, Beside]]
+) -> list[tuple[int, ...]]:
+    """Pairs of a single term and the best second ones at its fit, where they are ``seen`` if it acts everywhere."""
+    pairs = []
+    for j, one in next_terms(search, model, NEXT).items():
+        if j != lead:
+            pairs.append(tuple(sorted((lead, j))))
+            if one is not None and model.window is None:
+                seen.setdefault(pairs[-1], {})[j] = one
+    return pairs
 
 
 def _enough(search: Search) -> bool:
@@ -125,7 +136,10 @@ def _enough(search: Search) -> bool:
     return removed(search, best) >= ALL if search.exact else search.examine(best).p_value >= PLAINLY_WHITE
 
 
-def _with_third(search: Search, pair: Model, third: int, prior: float) -> Hypothetical | None:
+def _with_third(
+    search: Search, pair: Model, third: int, prior: float, seen: Beside | None
+) -> Hypothetical | None:
     """A third term beside two, which act in the order in which they do alone."""
     numbers, two = tuple(sorted((*pair.numbers, third))), iter(acting_order(search, pair))
-    return hypothetical(search, numbers, prior, None, order=[i if i == third else next(two) for i in numbers])
+    order = [i if i == third else next(two) for i in numbers]
+    return hypothetical(search, numbers, prior, None, order=order, beside=None if seen is None else {third: seen})

@@ -13,13 +13,17 @@ from torchcal.errors import DomainError
 from torchcal.simulators import Parameter, Trajectories
 from torchcal.terms import Term
 
-__all__ = ["NOTHING", "Anything", "Scale", "check_measured", "drivers_scale", "sized", "with_room"]
+__all__ = [
+    "NOTHING", "Anything", "Scale", "check_measured", "drivers_scale", "sized", "sized_again", "with_room",
+]  # fmt: skip
 
 #: Range of a shape parameter measured on a driver's scale; on that of time it begins at a share of the usual gap
 #: between samples where that is less: lags and delays may be as fast as these show, however long the recording.
 SCALE_RANGE, OF_A_GAP = (0.02, 1.0), 0.1
 #: How many times as far a fit may go that an end of such a range holds back: nobody gave that end.
 WIDER = 4.0
+#: How many times as large a driver must be beside a model as at the base for a shape to be sought there too.
+LARGER = 2.0
 
 
 class Scale(dict[str, float]):
@@ -130,6 +134,28 @@ def sized(term: Term, scale: Scale, recording: Recording) -> Term:
         low, high = _narrowed(low, high, parameter)
         initial = parameter.initial if parameter.initial is not None and low <= parameter.initial <= high else None
         parameters.append(dataclasses.replace(parameter, low=low, high=high, initial=initial, neutral=None))
+    return dataclasses.replace(term, parameters=tuple(parameters))
+
+
+def sized_again(term: Term, given: Term, scale: Scale, recording: Recording) -> Term:
+    """A sized term with shapes that may lie as far as another scale goes, where that goes much farther: on a base that
+    is bent a driver may be far smaller than with the term that was missing.
+
+    Args:
+        term: As `sized` by the base.
+        given: As the user gave it.
+        scale: The other scale.
+        recording: The recording.
+    """
+    if not given.scales:
+        return term
+    again = sized(dataclasses.replace(given, constants=term.constants, formula=term.formula), scale, recording)
+    parameters = [
+        dataclasses.replace(q, high=other.high)
+        if own.high is None and q.high is not None and other.high is not None and other.high > LARGER * q.high > 0
+        else q
+        for q, own, other in zip(term.parameters, given.parameters, again.parameters, strict=True)
+    ]
     return dataclasses.replace(term, parameters=tuple(parameters))
 
 

@@ -1,6 +1,6 @@
 """Several candidates as one hypothesis: what they are together, where their refit begins, and their refits."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -8,6 +8,7 @@ from torch import Tensor
 from torchcal.discovery.fits.candidates import Candidate, prepare, replaces
 from torchcal.discovery.fits.ranges import drivers_scale
 from torchcal.discovery.hypotheses.beginnings import blind_rows
+from torchcal.discovery.hypotheses.beside import Beside
 from torchcal.discovery.hypotheses.linear_pairs import linear_row
 from torchcal.discovery.hypotheses.model import Hypothetical, Model
 from torchcal.discovery.hypotheses.refitting import refit_together
@@ -24,10 +25,13 @@ def hypothetical(
     columns: tuple[int, int] | None,
     *,
     order: Sequence[int] = (),
+    beside: Mapping[int, Beside] | None = None,
 ) -> Hypothetical | None:
     """Some candidates together, begun at the fit of each alone where it has one, and acting in an order, if not as they
-    are listed."""
-    terms = [term for i in order or numbers for term in search.candidates[i].terms]
+    are listed; also where some were seen ``beside`` the others, by their numbers."""
+    beside = beside or {}
+    prepared = {i: beside[i].candidate if i in beside else search.candidates[i] for i in numbers}
+    terms = [term for i in order or numbers for term in prepared[i].terms]
     terms.sort(key=lambda term: not replaces(search.base.problem, search.base.values, term))  # else others are lost
     try:
         candidate = prepare(
@@ -64,7 +68,8 @@ def hypothetical(
                     rows += _unseen(search.candidates[other], row, names)
     if columns is not None:
         rows.append(linear_row(search, candidate, columns))
-    return Hypothetical(numbers, candidate, torch.stack(rows), prior)
+    begin = torch.cat([torch.stack(rows), *(one.begin(candidate) for one in beside.values())])
+    return Hypothetical(numbers, candidate, begin, prior)
 
 
 def _unseen(candidate: Candidate, row: Tensor, names: Sequence[str]) -> list[Tensor]:
@@ -103,10 +108,15 @@ def distinct(search: Search, sets: Iterable[tuple[int, ...]]) -> list[tuple[int,
 
 
 def refit_sets(
-    search: Search, sets: Sequence[tuple[tuple[int, ...], tuple[int, int] | None]], prior: float
+    search: Search,
+    sets: Sequence[tuple[tuple[int, ...], tuple[int, int] | None]],
+    prior: float,
+    beside: Mapping[tuple[int, ...], Mapping[int, Beside]] | None = None,
 ) -> list[Model]:
-    """Refit sets of candidates, each with the columns of the linear search that suggested it."""
-    return refitted(search, [hypothetical(search, numbers, prior, columns) for numbers, columns in sets])
+    """Refit sets of candidates, each with the columns of the linear search that suggested it, and with what was seen of
+    some beside the others."""
+    seen = beside or {}
+    return refitted(search, [hypothetical(search, each, prior, cols, beside=seen.get(each)) for each, cols in sets])
 
 
 def refitted(search: Search, wanted: Sequence[Hypothetical | None]) -> list[Model]:
