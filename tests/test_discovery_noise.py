@@ -1095,3 +1095,30 @@ def test_a_weak_memory_that_a_misfit_feigned_is_given_up_where_samples_are_close
     search.reweigh()
     assert float(search.noise.correlation) == 0.0
     assert search.leader.found.chi2 < 200
+
+
+TEMPERATURE, RATE = (a.ravel() for a in np.meshgrid(np.linspace(280, 360, 9), np.geomspace(1, 1e3, 8), indexing="ij"))
+
+
+def test_what_bends_along_the_sweeps_of_a_grid_is_no_noise_that_grows():
+    # Above 330 K something depends on the logarithm of the shear rate, which no low polynomial of it follows.
+    base = tc.Simulator(lambda x, p: p["lnA"] + p["E"] * (1 / x["T"] - 1 / 320), [
+        tc.Parameter("lnA"), tc.Parameter("E", initial=2000.0),
+    ])  # fmt: skip
+    clean = 2500.0 * (1 / TEMPERATURE - 1 / 320) - 1.0 + 0.1 * np.log(RATE / 30) * (TEMPERATURE > 330)
+    sensors = tc.terms.sensor(outputs=("y",), static=True, drift={"T": 320.0})
+    for seed, terms in ((0, []), (1, sensors)):
+        y = clean + 0.02 * np.random.default_rng(seed).standard_normal(72)
+        d = tc.diagnose(base, tc.Recording(x={"T": TEMPERATURE, "rate": RATE}, y=y), terms, progress=False)
+        assert d.verdict == "unexplained"
+        assert "growing" not in str(d)
+
+
+def test_noise_that_grows_along_the_sweeps_of_a_grid_is_told():
+    base = tc.Simulator(lambda x, p: p["a"] * x["rate"] ** p["n"], [tc.Parameter("a"), tc.Parameter("n", initial=0.5)])
+    found = []
+    for seed in range(4):
+        y = 2.0 * RATE**0.6 * (1 + 0.05 * np.random.default_rng(seed).standard_normal(72))
+        d = tc.diagnose(base, tc.Recording(x={"T": TEMPERATURE, "rate": RATE}, y=y), [], progress=False)
+        found.append((d.verdict, "growing" in str(d)))
+    assert found == [("consistent", True)] * 4

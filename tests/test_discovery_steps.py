@@ -427,3 +427,20 @@ def test_what_all_runs_have_is_placed_in_none_of_them():
     assert torch.equal(part.response(change), torch.cat([torch.zeros(120, 2, dtype=torch.float64), change]))
     assert {place.run for place in alone if place.channel.kind == "output"} == {0, 1, 2}
     assert all(place.evidence < best for place in alone)
+
+
+def test_a_bump_along_the_clock_of_several_conditions_is_seen_on_the_scale_that_it_was_recorded_on():
+    # Times from 0.05 to 8 h span decades, and the cloud is short beside the gaps of their logarithms.
+    rng = np.random.default_rng(7)
+    airmass, colour, time = rng.uniform(1, 2.5, 80), rng.uniform(-0.3, 1.8, 80), np.sort(rng.uniform(0.02, 8, 80))
+    base = tc.Simulator(lambda x, p: p["m"] + p["k"] * x["X"], [tc.Parameter("m"), tc.Parameter("k", low=0.0)])
+    clean = 0.22 * airmass - 0.1 + 0.1 * np.exp(-(((time - 5.3) / 0.3) ** 2))
+    verdicts = []
+    for seed in range(3):
+        y = clean + 0.01 * np.random.default_rng(seed).standard_normal(80)
+        recording = tc.Recording(x={"X": airmass, "colour": colour, "ut": time}, y=y)
+        d = tc.diagnose(base, recording, [], progress=False)
+        verdicts.append(d.verdict)
+    assert verdicts == ["unexplained"] * 3
+    places = [row for row in d.where if row.driver == "ut"]
+    assert any(low < 5.3 < high for row in places for low, high in row.spans)

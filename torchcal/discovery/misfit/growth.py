@@ -106,8 +106,16 @@ def _growing(
 def _as_fast(
     problem: Problem, residual: Tensor, design: Tensor, f: Tensor, before: Tensor, parts: list[Tensor]
 ) -> tuple[float, float, float, float] | None:
-    """As `_grows` of the fastest part of an output's residual, with outputs in the largest one."""
+    """As `_grows` of the fastest part of an output's residual, with outputs in the largest one.
+
+    Smooth curves of several conditions leave what bends along one of them. Noise grows from row to row of a sweep too.
+    """
     found = None
+    if problem.order is None and problem.sweeps is not None:
+        rows = [_off_rows(problem, places, residual) for places in parts]
+        left, size = torch.cat([off for off, _ in rows]), f[problem.index[torch.cat([at for _, at in rows])]]
+        if len(left) >= FEWEST and _grows(left, size, INDEPENDENT[1] * len(left), 0.0) is None:
+            return None
     for times in (FASTER, 1) if problem.order is not None else (1,):
         each = [_fastest(problem, places, residual, design, before, times) for places in parts]
         size = torch.cat([f[problem.index[p]][inside] for p, (_, inside) in zip(parts, each, strict=True)])
@@ -195,6 +203,13 @@ def _off_neighbours(r: Tensor, apart: int) -> float:
     """How far data ``(n,)`` are off the middle between those some places before and behind, on average of most."""
     off = (r[apart:-apart] - 0.5 * (r[: -2 * apart] + r[2 * apart :])).abs().sort().values
     return float(off[: math.ceil((1 - TRIMMED) * len(off))].mean())
+
+
+def _off_rows(problem: Problem, places: Tensor, residual: Tensor) -> tuple[Tensor, Tensor]:
+    """How far data are off the middle between the rows before and behind them in a sweep, and which these are."""
+    r, follows = residual[places], problem.gaps(places).isfinite()
+    inside = follows[1:] & follows[:-1]
+    return (r[1:-1] - 0.5 * (r[:-2] + r[2:]))[inside] / math.sqrt(1.5), places[1:-1][inside]
 
 
 def _fastest(

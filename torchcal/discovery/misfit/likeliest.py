@@ -20,7 +20,7 @@ from torchcal.discovery.misfit.curves import orthonormal
 from torchcal.discovery.misfit.noise import GRID, LEAST, Noise, estimate, least, log_prior, mine, slack
 from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.misfit.steps import sudden_changes
-from torchcal.discovery.misfit.structure import Rough, evidences, responses_of
+from torchcal.discovery.misfit.structure import Rough, evidences, responses_of, together_of
 
 __all__ = ["Tangents", "alone", "density", "log_likelihood", "settled", "with_unknown"]
 
@@ -187,7 +187,8 @@ def with_unknown(
     """
     problem = model.problem
     available = [c for c in channels(problem, model) if c.kind in problem.kinds]
-    looks, sudden = responses_of(problem, available), sudden_changes(problem, available)
+    looks = [*responses_of(problem, available), *together_of(problem, available)]
+    sudden = sudden_changes(problem, available)
 
     def likeliest(peeled: list[Fitted], taken: list[Rough]) -> tuple[Noise, float, Rough | None]:
         """Beside what is unknown, and the waves and sudden changes taken out so far, near what is estimated without."""

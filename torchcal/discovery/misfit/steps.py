@@ -77,7 +77,8 @@ class Sudden:
             below = level.bincount().cumsum(0)
             at = _steps(below, most)
             steps.append(_over_run(problem, places, (level[:, None] >= at).double()))
-            scale = levels.log() if Span.of(values, time=problem.in_time).log else levels
+            log = Span.of(values, time=problem.in_time).log and _uneven(levels.log()) < _uneven(levels)
+            scale = levels.log() if log else levels
             bumps.append(_over_run(problem, places, _filling(_bumps(scale, most)[level])))
             pairs = torch.combinations(torch.arange(len(at))).T
             between.append(pairs[:, below[at[pairs[1]] - 1] - below[at[pairs[0]] - 1] >= LEAST] + before)
@@ -176,6 +177,12 @@ def _steps(below: Tensor, most: int) -> Tensor:
     number = torch.arange(1, len(below))
     before = below[number - 1]
     return _evenly(number[(before >= LEAST) & (below[-1] - before >= LEAST)], most)
+
+
+def _uneven(levels: Tensor) -> float:
+    """How much the gaps between levels differ, in their mean: on the scale that they were chosen on least."""
+    gaps = levels.diff()
+    return float(gaps.std() / gaps.mean())
 
 
 def _bumps(along: Tensor, most: int) -> Tensor:

@@ -5,6 +5,7 @@ every channel against every driver, with oscillations of every output, and of ev
 Probabilities come from simulated noise that went through the same projection.
 """
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -23,10 +24,12 @@ from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.misfit.steps import Sudden
 from torchcal.discovery.misfit.waves import wave_places
 
-__all__ = ["Rough", "Structure", "analyse", "evidences", "responses_of"]
+__all__ = ["Rough", "Structure", "analyse", "evidences", "responses_of", "together_of"]
 
 #: Radial functions along time, and along any other driver: the evidence chooses how many.
 IN_TIME, ALONG = (12, 24, 48), (12, 24)
+#: The same along two conditions together.
+TOGETHER = ((4, 4), (3, 8), (8, 3), (6, 6))
 #: Of more functions than the fewest, how many data there must be for each, in time and among conditions.
 DATA_EACH = (4, 3)
 
@@ -92,6 +95,24 @@ def responses_of(problem: Problem, available: Sequence[Channel]) -> list[_Look]:
             scales = [driver, driver.log()] if Span.of(driver, time=problem.is_time(name)).log else [driver]
             parts = [_features(scale, count) for scale in scales for count in counts]
             found.append(_Look(channel, name, parts, channel.response(torch.cat(parts, dim=1))))
+    return found
+
+
+def together_of(problem: Problem, available: Sequence[Channel]) -> list[_Look]:
+    """Every output along every two of several conditions together: what depends on one may depend on the other too."""
+    found = []
+    for channel in available if not problem.in_time else ():
+        data = int((channel.matrix != 0).sum()) if channel.kind == "output" else 0
+        for (one, first), (other, second) in itertools.combinations(channel.drivers.items(), 2):
+            scales = [each.log() if Span.of(each, time=False).log else each for each in (first, second)]
+            distinct = [len(each.unique()) for each in scales]
+            parts = [
+                (_features(scales[0], a)[:, :, None] * _features(scales[1], b)[:, None]).flatten(1)
+                for a, b in TOGETHER
+                if a <= distinct[0] and b <= distinct[1] and DATA_EACH[1] * a * b <= data
+            ]
+            if parts:
+                found.append(_Look(channel, f"{one}, {other}", parts, channel.response(torch.cat(parts, dim=1))))
     return found
 
 
