@@ -19,7 +19,7 @@ from torchcal.discovery.fits.refits import Refit
 from torchcal.discovery.fits.stop import Stop
 from torchcal.discovery.hypotheses import refitting
 from torchcal.discovery.hypotheses.search import Search
-from torchcal.errors import DomainError, InterruptionWarning
+from torchcal.errors import ConvergenceError, DomainError, InterruptionWarning
 from torchcal.simulators import Trajectories
 
 F64 = torch.float64
@@ -408,3 +408,14 @@ def test_no_long_refit_is_gone_on_with_after_ctrl_c(monkeypatch, terminal):
         assert stages == ([[False] * 3] if pressed else [[False] * 3, [True] * 3])
         assert len(ticks) == (1 if pressed else 6)  # a bar that stands still looks hung
         assert [one is not None for one in found] == ([True, False, False] if pressed else [True] * 3)
+
+
+def test_what_a_black_box_raises_everywhere_is_told():
+    def divides(x, p):
+        return p["a"] * x + 1 / 0
+
+    outside = tc.ExternalSimulator(divides, [tc.Parameter("a", low=0.0, high=5.0)])
+    recording = tc.Recording(x=torch.linspace(0, 1, 10, dtype=torch.float64), y=torch.linspace(0, 2, 10))
+    with pytest.raises(ConvergenceError, match=r"raised ZeroDivisionError there: division by zero\. Give") as raised:
+        tc.diagnose(outside, recording, [], progress=False)
+    assert "runs" not in str(raised.value)

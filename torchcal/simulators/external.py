@@ -137,7 +137,8 @@ class ExternalSimulator(Simulator):
 
         return evaluate
 
-    def _raised(self, x: Conditions, values: Tensor, column: int) -> Exception | None:
+    def raised(self, x: Conditions, values: Tensor, column: int) -> Exception | None:
+        """What the function raises at parameters ``(d,)`` and an output, of what stands for no answer; or None."""
         names = tuple(x) if isinstance(x, Mapping) else None
         columns = list(x.values()) if isinstance(x, Mapping) else [x]
         points = torch.stack([torch.as_tensor(c).detach().to("cpu", torch.float64) for c in columns], dim=-1)

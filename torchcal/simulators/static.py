@@ -299,7 +299,7 @@ class Simulator:
         if not bool(finite.any()):
             row, column = (int(i) for i in (~torch.isfinite(together)).nonzero()[0])
             point = {name: float(v) for name, v in zip(self.names, values[row], strict=True)}
-            cause = self._raised(x, values[row], column)
+            cause = self.raised(x, values[row], column)
             why = "" if cause is None else f" The function raised {type(cause).__name__} there: {cause}."
             raise SimulatorError(
                 f"Expected finite outputs. Got {float(together[row, column])} at output number {column} "
@@ -320,7 +320,7 @@ class Simulator:
             )
         return together.shape[-1]
 
-    def _raised(self, x: Conditions, values: Tensor, column: int) -> Exception | None:
+    def raised(self, x: Conditions, values: Tensor, column: int) -> Exception | None:
         """What a simulator raised where NaN stands for it, at parameters ``(d,)`` and an output; None where nothing."""
         return None
 

@@ -96,11 +96,14 @@ def calibrate_base(
     else:
         found = fit(problem, problem.whitening(rough, outputs), begin, free)
     if found is None:
+        cause = problem.simulator.raised(recording.x, begin[0], 0)
+        why = "" if cause is None else f" The function raised {type(cause).__name__} there: {cause}."
+        runs = ", and look at the runs' initial values" if problem.in_time else ""
         raise ConvergenceError(
             f"Expected finite outputs of the base at one of {num_starts} starting values at least. Got none, the first "
-            f"with {point_of(problem, begin[0], free)}. Give initial= near the truth, or bounds, to the parameters (a "
-            "rate is about 1 over the time in which something happens), and look at the runs' initial values."
-        )
+            f"with {point_of(problem, begin[0], free)}.{why} Give initial= near the truth, or bounds, to the "
+            f"parameters (a rate is about 1 over the time in which something happens){runs}."
+        ) from cause
     found = _unwound(_sharpen(found))
     found = found if exact or clean else _unfollowed(found, begin, rough, outputs)
     found, units = _grown(found, unit)
