@@ -146,7 +146,7 @@ def test_steps_that_were_chosen_for_another_orbit_are_not_kept_for_this_one():
     assert ((lean.y - problem.y).abs() <= 2 * allowed).all()
 
 
-@pytest.mark.parametrize("why", ["magnified", "wrong", "as many", "lost"])
+@pytest.mark.parametrize("why", ["magnified", "wrong", "as many", "lost", "elsewhere"])
 def test_steps_stay_short_where_longer_ones_would_not_do(in_short_steps, why, monkeypatch):
     found, allowed = in_short_steps
     simulator = found.problem.simulator
@@ -160,6 +160,11 @@ def test_steps_stay_short_where_longer_ones_would_not_do(in_short_steps, why, mo
             return dataclasses.replace(again, y=again.y + 3 * allowed)
 
         monkeypatch.setattr(sharpening, "_in_steps_of", wrong)
+    if why == "elsewhere":  # another minimum, to which a fit falls where longer steps do not solve what it begins with
+        near = sharpening._in_steps_of
+        monkeypatch.setattr(
+            sharpening, "_in_steps_of", lambda *given: dataclasses.replace(near(*given), chi2=1.1 * found.chi2 + 1)
+        )
     if why == "as many":
         monkeypatch.setattr(sharpening, "spared", lambda *given: simulator)
     if why == "lost":

@@ -11,9 +11,12 @@ from scipy.integrate import solve_ivp
 import torchcal as tc
 from torchcal.discovery import several
 from torchcal.discovery.fits.problem import Problem
+from torchcal.discovery.fits.ranges import Scale, sized, sized_again
 from torchcal.discovery.hypotheses.aliases import merge
+from torchcal.discovery.hypotheses.beginnings import beginnings
+from torchcal.discovery.hypotheses.beside import next_terms
 from torchcal.discovery.hypotheses.search import Search
-from torchcal.discovery.hypotheses.sets import distinct, refit_sets
+from torchcal.discovery.hypotheses.sets import distinct, hypothetical, refit_sets
 from torchcal.discovery.rivals import _swapped, one_fewer, with_stand_ins
 from torchcal.discovery.rounds import settle
 from torchcal.discovery.several import refit_several
@@ -502,3 +505,68 @@ def test_sets_that_add_the_same_are_one():
     assert distinct(search, sets) == [(1, 3), (0, 4), (2, 3)]
     search.failed = {2}
     assert distinct(search, sets)[0] == (0, 1)  # of what could not be fitted another set is tried
+
+
+@pytest.mark.parametrize(("own", "size", "wanted"), [
+    ({}, 40.0, (0.04, 40.0)), ({}, 3.0, (0.04, 2.0)), ({}, 0.1, (0.04, 2.0)), ({"high": 1.5}, 40.0, (0.04, 1.5)),
+    ({"low": 0.5}, 40.0, (0.5, 40.0)),
+])  # fmt: skip
+def test_a_threshold_may_lie_as_far_as_its_driver_goes_with_what_was_missing(own, size, wanted):
+    given = tc.Term(
+        "overflow", equation="S", rate=lambda t, s, p, u: -p["a"] * torch.relu(s["S"] - p["rim"]) / p["S0"],
+        parameters=[tc.Parameter("a", low=0.0), tc.Parameter("rim", **own)], scales={"rim": "S"}, constants={"S0": "S"},
+        formula="dS/dt ∋ -a max(S - rim, 0)/S0",
+    )  # fmt: skip
+    recording = tc.Recording(x=X, y=X)
+    at_base = sized(given, Scale({"S": 2.0}, {}), recording)
+    again = sized_again(at_base, given, Scale({"S": size}, {}), recording)
+    rim = again.parameters[1]
+    assert (rim.low, rim.high) == wanted
+    assert again.constants == {"S0": 2.0}  # what its amplitude is measured in stays
+    assert again.formula == at_base.formula
+
+
+def test_pairs_begin_where_the_second_term_was_seen_beside_the_first():
+    # With the root alone the cube's best threshold is another one than beside the square, and of another sign.
+    y = noisy(2 * X + 0.3 * X**2 - 0.5 * (X - 2.4).relu())
+    kink = tc.Term(
+        "kink", outputs={"y": lambda x, p, y: y + p["a"] * (x["x"] - p["x0"]).relu()},
+        parameters=[tc.Parameter("a", neutral=0.0), tc.Parameter("x0")], scales={"x0": "x"},
+    )  # fmt: skip
+    base = tc.Simulator(lambda x, p: {"y": p["m"] * x["x"]}, [tc.Parameter("m")])
+    problem = Problem.of(base, tc.Recording(x={"x": X}, y={"y": y}, noise=0.02))
+    search = Search(problem, [term("square"), kink], {}, 0, 3, 2, lambda text: None)
+    search.calibrate_base()
+    search, _ = settle(search, problem, 0.99)
+    seen = next_terms(search, search.plain[0], 3)
+    assert [*seen] == [1]
+    without, there = (hypothetical(search, (0, 1), -4.0, None, beside=beside) for beside in (None, seen))
+    names = [q.name for q in there.candidate.problem.parameters]
+    more = dict(zip(names, there.begin[len(without.begin) :].T.tolist(), strict=True))
+    assert torch.equal(there.begin[: len(without.begin)], without.begin)
+    assert max(abs(x0 - 2.4) for x0 in more["kink.x0"][:2]) < 0.3
+    assert -0.7 < min(more["kink.a"]) < -0.3
+    assert max(abs(a - search.plain[0].found.by_name["square.a"]) for a in more["square.a"]) < 0.3
+    (pair,) = refit_sets(search, [((0, 1), None)], -4.0, {(0, 1): seen})
+    assert abs(pair.found.by_name["kink.x0"] - 2.4) < 0.1
+    search.base = dataclasses.replace(search.base, chi2=search.problem.n)  # where the base is not bent it tells enough
+    assert next_terms(search, search.plain[0], 3) == {1: None}
+
+
+def test_a_parameter_stays_where_making_up_for_an_effect_would_take_it_beyond_its_bounds():
+    base = tc.Simulator(lambda x, p: {"y": p["m"] * (1 - torch.exp(-p["c"] * x["x"]))}, [
+        tc.Parameter("m"), tc.Parameter("c", low=0.1, high=9.0),
+    ])  # fmt: skip
+    y = noisy(2 - 2 * torch.exp(-12.0 * X) + 0.3 * X.sqrt())
+    problem = Problem.of(base, tc.Recording(x={"x": X}, y={"y": y}, noise=0.02))
+    search = Search(problem, [term("root")], {}, 0, 3, 1, lambda text: None)
+    search.calibrate_base()
+    search.screen_all()
+    c = float(search.base.values[1])
+    assert c < 9.0
+    rows = beginnings(search.residual, search.screening, 0, search.candidates[0], None)
+    little, whole, stays = rows  # a small share of the linear estimate, and all of it
+    assert c < float(little[1]) < 9.0 < float(whole[1])
+    assert float(stays[1]) == c
+    assert float(stays[2]) == float(whole[2]) != 0
+    assert float(stays[0]) != float(search.base.values[0])  # that makes up for it alone

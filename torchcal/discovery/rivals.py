@@ -42,7 +42,7 @@ STANDS_IN, STAND_INS, IN_TURN = 0.7, 5, 3
 def leading_pairs(search: Search) -> list[Model]:
     """The leading pairs, the likeliest first."""
     pairs = [m for m in search.models if m.physical and len(m.numbers) == 2]
-    best = max(m.weight for m in pairs)
+    best = max((m.weight for m in pairs), default=0.0)
     return sorted((m for m in pairs if m.weight > best - CLOSE), key=lambda m: -m.weight)[:AGAIN]
 
 

@@ -61,8 +61,8 @@ def refit_several(search: Search) -> None:
     if best is not None and len(best.numbers) == 2:
         with_look_alikes(search, set(wanted), prior)
         with_stand_ins(search, prior)
-        for pair in leading_pairs(search):
-            alone_again(search, pair)
+    for pair in leading_pairs(search):  # whatever leads: it must not do so for a rival that got stuck
+        alone_again(search, pair)
     if isinstance(search.problem.recording.noise, Tensor):  # else a smaller noise makes physics of any small misfit
         search.reweigh()
     pairs = [m for m in search.models if len(m.numbers) == 2 and m.window is None]

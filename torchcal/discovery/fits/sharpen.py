@@ -32,6 +32,8 @@ CONVERGING = 4.0
 #: Share of the error that is allowed up to which steps are made longer, lest those of a model with one more term err,
 #: and of their number that must be enough.
 ROOM, FEWER = 0.1, 0.6
+#: Share of χ², and χ², by which a fit in longer steps may be worse: what is more is another minimum.
+WORSE = (0.01, 1.0)
 
 
 def accurate(found: Fitted, sd: Tensor) -> bool:
@@ -136,7 +138,9 @@ def _spared(found: Fitted, half: Tensor, allowed: Tensor, states: Tensor) -> Fit
     if fewer.num_steps > FEWER * simulator.num_steps:
         return None
     again = _in_steps_of(fewer, found)
-    if again is None or magnified(fewer, again.values[None], fewer.solve(again.values[None], again.warm)):
+    if again is None or again.chi2 > found.chi2 + WORSE[0] * found.chi2 + WORSE[1]:
+        return None
+    if magnified(fewer, again.values[None], fewer.solve(again.values[None], again.warm)):
         return None
     # Against the shorter steps at hand: where the fit has moved, these may err too.
     finer = simulator.outputs_of(again.values[None], simulator.solve(again.values[None]))[0, problem.index]

@@ -193,15 +193,19 @@ def farther(
     return _each_fitted(problem, w, begin, free, GONE_ON, problem.guess(base.warm, begin))
 
 
-def make_up(base: Fitted, candidate: Candidate, row: Tensor, effect: Tensor) -> Tensor:
-    """A candidate's starting values, moved to first order so that the base makes up for an effect ``(n,)``."""
-    w = base.whitening
-    slope = w(base.jacobian)
+def make_up(
+    base: Fitted, candidate: Candidate, row: Tensor, effect: Tensor, stay: Tensor | None = None
+) -> Tensor:
+    """A candidate's starting values, moved to first order so that the base makes up for an effect ``(n,)``: all of the
+    base's free parameters, or those that are not to ``stay`` where they are, bool ``(P,)``."""
+    w, columns = base.whitening, _columns(base, candidate)
+    moves = [k for k, i in enumerate(columns) if stay is None or not bool(stay[i])]
+    slope = w(base.jacobian)[:, moves]
     unit = slope.norm(dim=0).clamp_min(1e-300)
     # Along directions that move no datum the parameters stay where they are.
     change = torch.linalg.lstsq(slope / unit, w(effect[:, None]), rcond=1e-7, driver="gelsd").solution[:, 0] / unit
     moved = row.clone()
-    moved[_columns(base, candidate)] -= change
+    moved[[columns[k] for k in moves]] -= change
     return moved
 
 
@@ -292,22 +296,30 @@ def _columns(base: Fitted, candidate: Candidate) -> list[int]:
     return [places[base.problem.parameters[i].name] for i in base.free]
 
 
-def _step_along(base: Fitted, candidate: Candidate, shape: int, amplitude: int, size: float) -> Tensor:
-    """The base's estimate with an amplitude of some size, and the rest moved to make up for it."""
+def _step_along(
+    base: Fitted, candidate: Candidate, shape: int, amplitude: int, size: float, stay: Tensor | None = None
+) -> Tensor:
+    """The base's estimate with an amplitude of some size, and the rest, but what is to ``stay``, moved to make up for
+    it."""
     row = candidate.begin.clone()
     row[candidate.own] = candidate.shapes[shape]
     row[candidate.amplitudes[amplitude]] += size
-    return make_up(base, candidate, row, size * candidate.tangents[shape, :, amplitude])
+    return make_up(base, candidate, row, size * candidate.tangents[shape, :, amplitude], stay)
 
 
 def _linear(residual: Residual, screening: Screening, number: int, candidate: Candidate) -> Tensor:
-    """The linear estimate of a candidate at its best shapes."""
+    """The linear estimate of a candidate at its best shapes.
+
+    A parameter that is hardly known may be moved beyond its bounds: at the end there the model is another one. At the
+    best shape it begins where that stays, too.
+    """
     usable = screening.usable(number)
     if len(usable) == 0:
         return blind_rows(candidate)
     rows, used = [], set()
     # The tangents of an effect that is far from small say little of which shape it has.
     far = is_far(residual.found)
+    (low, high), columns = candidate.problem.limits(), _columns(residual.found, candidate)
     for column in usable[screening.z[usable].argsort(descending=True)].tolist():
         g = int(screening.shape[column])
         if g in used:
@@ -317,6 +329,9 @@ def _linear(residual: Residual, screening: Screening, number: int, candidate: Ca
         signed = float(screening.columns[:, column] @ residual.e) / float(screening.norm[column])
         for factor in STEPS if len(used) == 1 or far else STEPS[:1]:
             rows.append(_step_along(residual.found, candidate, g, a, factor * signed))
+            outside = (rows[-1] < low) | (rows[-1] > high)
+            if len(used) == 1 and bool(outside[columns].any()):
+                rows.append(_step_along(residual.found, candidate, g, a, factor * signed, outside))
         if len(used) == (SHAPES_FAR if far else SHAPES):
             break
     return torch.stack(rows)
