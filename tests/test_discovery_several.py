@@ -526,7 +526,7 @@ def test_a_threshold_may_lie_as_far_as_its_driver_goes_with_what_was_missing(own
     assert again.formula == at_base.formula
 
 
-def test_pairs_begin_where_the_second_term_was_seen_beside_the_first():
+def test_pairs_begin_where_the_second_term_was_seen_beside_the_first(monkeypatch):
     # With the root alone the cube's best threshold is another one than beside the square, and of another sign.
     y = noisy(2 * X + 0.3 * X**2 - 0.5 * (X - 2.4).relu())
     kink = tc.Term(
@@ -549,6 +549,14 @@ def test_pairs_begin_where_the_second_term_was_seen_beside_the_first():
     assert max(abs(a - search.plain[0].found.by_name["square.a"]) for a in more["square.a"]) < 0.3
     (pair,) = refit_sets(search, [((0, 1), None)], -4.0, {(0, 1): seen})
     assert abs(pair.found.by_name["kink.x0"] - 2.4) < 0.1
+    as_it_was = search.candidates[1]
+    larger = Scale({"x": 30.0, "y": 30.0}, {})
+    monkeypatch.setattr("torchcal.discovery.hypotheses.beside.drivers_scale", lambda problem, found: larger)
+    next_terms(search, search.plain[0], 3)
+    wide = search.candidates[1]  # for what is refitted alone, too
+    assert wide.terms[0].parameters[1].high == 30.0
+    assert wide.problem.limits()[1][-1] == 30.0 > float(as_it_was.problem.limits()[1][-1])
+    assert torch.equal(wide.tangents, as_it_was.tangents)
     search.base = dataclasses.replace(search.base, chi2=search.problem.n)  # where the base is not bent it tells enough
     assert next_terms(search, search.plain[0], 3) == {1: None}
 

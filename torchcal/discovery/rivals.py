@@ -123,7 +123,7 @@ def _in_its_place(search: Search, lead: Model, prior: float) -> None:
     fresh = distinct(search, [pair for pair in begun if pair not in known])
     wanted = []
     for pair, seen in begun.items():
-        one = hypothetical(search, pair, prior, None, beside=seen) if pair in known or pair in fresh else None
+        one = hypothetical(search, pair, prior, None) if pair in known or pair in fresh else None
         if one is not None:
             (begin,) = (each.begin(one.candidate) for each in seen.values())
             wanted.append(dataclasses.replace(one, begin=begin))

@@ -21,6 +21,9 @@ __all__ = ["ExternalSimulator"]
 
 Array = NDArray[np.float64]
 
+#: Numbers that a vectorized function returns, at most about, of which those that a shift asks for are taken.
+AT_ONCE = 10_000_000
+
 
 class ExternalSimulator(Simulator):
     r"""A model in any other code, called with plain numbers and differentiated by central differences.
@@ -44,9 +47,10 @@ class ExternalSimulator(Simulator):
             arithmetic errors count as none.
         parameters: In the order in which results list them.
         executor: Any ``concurrent.futures.Executor``; None calls the function here. For a process pool the
-            function must be defined at the top level of a module. All parameter values of a call go in one map,
-            identical ones once. When a worker dies, what it was doing is repeated; a process pool, which breaks then,
-            is replaced by one of the same kind for as long as it is kept.
+            function must be defined at the top level of a module. All parameter values of a call go in one map
+            (shifted ones of a vectorized function in as few as memory allows), identical ones once. When a worker
+            dies, what it was doing is repeated; a process pool, which breaks then, is replaced by one of the same kind
+            for as long as it is kept.
         vectorized: Whether one call does all conditions.
         step: Relative step of the differences. The default errs by 1e-8 of f''' (truncation) and 1e4 times
             the function's own noise: take a larger one for a code whose last digits are not reproducible.
@@ -197,9 +201,10 @@ class _Job:
         """Outputs ``(R, outputs * n)`` at values ``(R, L, d)`` with L = 1 or n."""
         simulator, n = self.simulator, len(self.x)
         count = values.shape[-1]
-        if simulator.vectorized and values.shape[1] > 1:
-            each = [self._each(row) for row in values]
-            return np.stack([one if len(one) == self.width else np.full(self.width, np.nan) for one in each])
+        if simulator.vectorized and values.shape[1] > 1 and len(values):
+            parts = [self._each(part) for part in np.array_split(values, -(-values.size * n // (AT_ONCE * count)))]
+            width = max(part.shape[1] for part in parts)  # a part without any answer does not know how many outputs
+            return np.concatenate([p if p.shape[1] == width else np.full((len(p), width), np.nan) for p in parts])
         call: ArrayCall | PointCall
         if simulator.vectorized:
             rows = values[:, 0]
@@ -221,12 +226,13 @@ class _Job:
         return result.transpose(1, 0, 2).reshape(len(values), self.width)
 
     def _each(self, values: Array) -> Array:
-        """Outputs ``(outputs * n,)`` of a vectorized function at values of their own for all conditions, ``(n, d)``: of
-        those of every value at all conditions the one where it holds."""
-        unique, inverse = np.unique(values, axis=0, return_inverse=True)
-        found = self(unique[:, None])
-        found = found.reshape(len(unique), -1, len(self.x))
-        return np.asarray(found[inverse.reshape(-1), :, np.arange(len(self.x))].T.reshape(-1))
+        """Outputs ``(R, outputs * n)`` of a vectorized function at values of their own for all conditions, ``(R, n,
+        d)``: of those of every value at all conditions the one where it holds."""
+        length, n, count = values.shape
+        unique, inverse = np.unique(values.reshape(-1, count), axis=0, return_inverse=True)
+        found = self(unique[:, None]).reshape(len(unique), -1, n)
+        own = found[inverse.reshape(length, n), :, np.arange(n)]  # (R, n, outputs)
+        return np.asarray(own.transpose(0, 2, 1).reshape(length, -1))
 
     def _run(self, call: ArrayCall | PointCall, rows: Array) -> Array | None:
         values: list[Value | None] = [None] * len(rows)  # None where there is no number

@@ -26,7 +26,10 @@ from torchcal.simulators.static import asks_for_numbers
 from torchcal.terms import Term, extend
 from torchcal.terms.term import neutral_of
 
-__all__ = ["Candidate", "base_columns", "call_once", "prepare", "replaces", "spread_values", "usual_starts", "widened"]
+__all__ = [
+    "Candidate", "base_columns", "call_once", "prepare", "replaces", "spread_values", "usual_starts", "widened",
+    "with_terms",
+]  # fmt: skip
 
 #: Share of the data's spread that a candidate adds when it is tried.
 A_LITTLE = 0.03
@@ -189,6 +192,11 @@ def widened(base: Problem, candidate: Candidate, held_back: Sequence[str], given
                 q = with_room(q, own[name])
             parameters.append(q)
         terms.append(dataclasses.replace(term, parameters=tuple(parameters)))
+    return with_terms(base, candidate, terms)
+
+
+def with_terms(base: Problem, candidate: Candidate, terms: Sequence[Term]) -> Candidate:
+    """A candidate with the same terms in other ranges."""
     problem = base.with_simulator(extend(base.simulator, terms))
     return dataclasses.replace(candidate, terms=tuple(terms), problem=problem)
 

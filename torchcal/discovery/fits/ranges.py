@@ -138,8 +138,8 @@ def sized(term: Term, scale: Scale, recording: Recording) -> Term:
 
 
 def sized_again(term: Term, given: Term, scale: Scale, recording: Recording) -> Term:
-    """A sized term with shapes that may lie as far as another scale goes, where that goes much farther: on a base that
-    is bent a driver may be far smaller than with the term that was missing.
+    """A sized term with shapes that may lie as far as another scale goes, where that goes much farther, else itself: on
+    a base that is bent a driver may be far smaller than with the term that was missing.
 
     Args:
         term: As `sized` by the base.
@@ -156,7 +156,8 @@ def sized_again(term: Term, given: Term, scale: Scale, recording: Recording) -> 
         else q
         for q, own, other in zip(term.parameters, given.parameters, again.parameters, strict=True)
     ]
-    return dataclasses.replace(term, parameters=tuple(parameters))
+    same = all(one is other for one, other in zip(parameters, term.parameters, strict=True))
+    return term if same else dataclasses.replace(term, parameters=tuple(parameters))
 
 
 def _with_numbers(term: Term, scale: Scale) -> Term:

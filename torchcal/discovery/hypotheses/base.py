@@ -96,7 +96,8 @@ def calibrate_base(
     else:
         found = fit(problem, problem.whitening(rough, outputs), begin, free)
     if found is None:
-        cause = problem.simulator.raised(recording.x, begin[0], 0)
+        bad = (~problem.evaluate(begin[:1], [])[0][0].isfinite()).nonzero()[:1, 0]
+        cause = problem.simulator.raised(recording.x, begin[0], int(problem.index[bad])) if len(bad) else None
         why = "" if cause is None else f" The function raised {type(cause).__name__} there: {cause}."
         runs = ", and look at the runs' initial values" if problem.in_time else ""
         raise ConvergenceError(

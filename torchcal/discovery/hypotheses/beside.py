@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from torchcal.discovery.fits.candidates import Candidate, prepare
+from torchcal.discovery.fits.candidates import Candidate, prepare, with_terms
 from torchcal.discovery.fits.ranges import drivers_scale, sized_again
 from torchcal.discovery.hypotheses.aliases import copies
 from torchcal.discovery.hypotheses.beginnings import STRONG, beginnings
@@ -42,10 +42,11 @@ class Beside:
         """Of its best shape."""
         return self.screening.score(0)
 
-    def begin(self, both: Candidate) -> Tensor:
-        """Starting values ``(B, P)`` of the model and it together: at the fit, with linear estimates of what is new."""
+    def begin(self, both: Candidate, most: int | None = None) -> Tensor:
+        """Starting values ``(B, P)`` of the model and it together, the ``most`` promising ones: at the fit, with linear
+        estimates of what is new."""
         names = [q.name for q in self.candidate.problem.parameters]
-        rows = beginnings(self.residual, self.screening, 0, self.candidate, None)
+        rows = beginnings(self.residual, self.screening, 0, self.candidate, None)[:most]
         return rows[:, [names.index(q.name) for q in both.problem.parameters]]
 
 
@@ -64,7 +65,8 @@ def next_terms(search: Search, model: Model, most: int) -> dict[int, Beside | No
 
 
 def screened_beside(search: Search, residual: Residual, numbers: Sequence[int]) -> dict[int, Beside]:
-    """The candidates that are not in a model and say something new at a fit of it, by their numbers.
+    """The candidates that are not in a model and say something new at a fit of it, by their numbers. Their ranges grow
+    to where their drivers are there.
 
     Merged ones are among them where the base is bent, whose tangents tell less, and their score is another one there.
     """
@@ -78,6 +80,8 @@ def screened_beside(search: Search, residual: Residual, numbers: Sequence[int]) 
         search.tick(f"screen {other.name} after {', '.join(search.candidates[i].name for i in numbers)}")
         try:
             term = sized_again(other.terms[0], search.terms[j], scale, search.problem.recording)
+            if term is not other.terms[0]:  # and so it may wherever it is refitted from now on, alone or with others
+                search.candidates[j] = with_terms(search.base.problem, other, [term])
             prepared = prepare(found.problem, found, [term], search.fixed, scale)
         except (SimulatorError, DomainError):
             continue

@@ -17,6 +17,9 @@ from torchcal.errors import DomainError, SimulatorError
 
 __all__ = ["acting_order", "distinct", "hypothetical", "refit_sets", "refitted"]
 
+#: Of the starts that a term has beside others, those that are tried with the starts from each alone.
+BESIDE = 2
+
 
 def hypothetical(
     search: Search,
@@ -29,9 +32,7 @@ def hypothetical(
 ) -> Hypothetical | None:
     """Some candidates together, begun at the fit of each alone where it has one, and acting in an order, if not as they
     are listed; also where some were seen ``beside`` the others, by their numbers."""
-    beside = beside or {}
-    prepared = {i: beside[i].candidate if i in beside else search.candidates[i] for i in numbers}
-    terms = [term for i in order or numbers for term in prepared[i].terms]
+    terms = [term for i in order or numbers for term in search.candidates[i].terms]
     terms.sort(key=lambda term: not replaces(search.base.problem, search.base.values, term))  # else others are lost
     try:
         candidate = prepare(
@@ -68,7 +69,7 @@ def hypothetical(
                     rows += _unseen(search.candidates[other], row, names)
     if columns is not None:
         rows.append(linear_row(search, candidate, columns))
-    begin = torch.cat([torch.stack(rows), *(one.begin(candidate) for one in beside.values())])
+    begin = torch.cat([torch.stack(rows), *(one.begin(candidate, BESIDE) for one in (beside or {}).values())])
     return Hypothetical(numbers, candidate, begin, prior)
 
 

@@ -182,7 +182,7 @@ def _steps(below: Tensor, most: int) -> Tensor:
 def _uneven(levels: Tensor) -> float:
     """How much the gaps between levels differ, in their mean: on the scale that they were chosen on least."""
     gaps = levels.diff()
-    return float(gaps.std() / gaps.mean())
+    return float(gaps.std(correction=0) / gaps.mean())
 
 
 def _bumps(along: Tensor, most: int) -> Tensor:
