@@ -10,7 +10,7 @@ import torchcal as tc
 from torchcal.discovery.fits.fitting import fit
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.misfit.outliers import spikes
-from torchcal.discovery.verdicts import instruments
+from torchcal.discovery.verdicts import by_share, instruments
 from torchcal.errors import ConvergenceWarning
 
 F64 = torch.float64
@@ -242,3 +242,19 @@ def test_an_outlier_among_replicates_is_found():
     y = x + 0.1 * torch.randn(42, generator=torch.Generator().manual_seed(0), dtype=F64)
     y[16] += 2.0
     assert spikes_in(x, y) == [16]
+
+
+@pytest.mark.parametrize(("own", "likelier", "share", "named"), [
+    (("a",), [("a", "b"), ("a", "c")], 0.995, True), (("a",), [("a", "b")], 0.995, False),
+    (("a", "b"), [("a", "b", "c")], 0.995, True), (("a", "b"), [("a", "b", "c")], 0.98, False),
+    (("a", "b"), [("a", "c")], 0.995, False), (("a", "b"), [("a", "b", "c"), ("d",)], 0.995, False),
+])  # fmt: skip
+def test_what_holds_whatever_else_acts_is_a_name(own, likelier, share, named, monkeypatch):
+    def model(names, *, sensor=False):
+        terms = [SimpleNamespace(is_sensor=sensor) for _ in names]
+        return SimpleNamespace(names=names, numbers=names, window=None, candidate=SimpleNamespace(terms=terms))
+
+    monkeypatch.setattr(by_share.explain, "removed", lambda search, model: share)
+    others = [model(names) for names in likelier]
+    assert by_share._holds_whatever_else(None, model(own), others) == named
+    assert not by_share._holds_whatever_else(None, model(own, sensor=True), others)

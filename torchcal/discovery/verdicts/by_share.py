@@ -98,7 +98,7 @@ def nearly(search: Search, ranked: list[Model], mask: Tensor | None, decision: D
             if _far_before(search, mine):
                 shared = best
             break
-        if size == 1 and _holds_whatever_else(search, best, likelier) and _far_before(search, mine):
+        if _holds_whatever_else(search, best, likelier) and _far_before(search, mine):
             shared = best
     if shared is not None:
         decision.verdict, decision.best, decision.nearly = "named", shared, True
@@ -108,13 +108,13 @@ def nearly(search: Search, ranked: list[Model], mask: Tensor | None, decision: D
 def _holds_whatever_else(search: Search, model: Model, likelier: Sequence[Model]) -> bool:
     """Whether physics that removes nearly all is there, whatever else may be, by all likelier hypotheses.
 
-    They add terms to it that act everywhere: one or another, as three bend to almost anything. A window of its own
-    speaks against it, and what changes the output alone bends to much.
+    They add terms to it that act everywhere: to one term one or another, to two a third, as three bend to almost
+    anything. A window of its own speaks against it, and what changes the output alone bends to much.
     """
     more = all(m.window is None and set(model.names) < set(m.names) for m in likelier)
     return (
         more
-        and sum(len(m.numbers) == 2 for m in likelier) > 1
+        and (len(model.numbers) > 1 or sum(len(m.numbers) == 2 for m in likelier) > 1)
         and not any(term.is_sensor for term in model.candidate.terms)
         and explain.removed(search, model) >= SURELY
     )
