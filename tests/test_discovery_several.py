@@ -161,6 +161,7 @@ def test_a_term_that_raises_at_sizes_far_off_keeps_its_first_fit():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Only .* of the base's starting values")
 def test_a_term_that_a_far_bent_base_hides_is_found_from_the_base_of_another():
     """A spring on what is modelled as a mass without one: its tangent there has the wrong sign."""
     t = np.linspace(0, 60, 181)
