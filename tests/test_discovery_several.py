@@ -188,8 +188,10 @@ def test_a_term_that_a_far_bent_base_hides_is_found_from_the_base_of_another():
 
 
 @pytest.mark.slow
-def test_a_pair_is_tried_beside_three_different_terms():
-    """A rocket that burns its propellant, with drag: one drag in three windows had left no place for the other."""
+def test_a_pair_is_tried_where_one_term_of_three_shapes_does_as_well():
+    """A rocket that burns its propellant, with drag: a branch that begins stretched had been named, the pair not tried.
+
+    It leaves 0.15 m of what is missing, a tenth of the noise."""
     t = np.linspace(0, 20, 81)
     z = solve_ivp(
         lambda t, s: [s[1], 20 / (1 - 0.02 * t) - 9.81 - 5e-4 * abs(s[1]) * s[1]], (0, 20), [0, 0], t_eval=t,
@@ -215,8 +217,10 @@ def test_a_pair_is_tried_beside_three_different_terms():
     run = tc.Run(time=t, outputs={"z": z}, initial={"z": 0.0, "v": 0.0})
     recording = tc.Recording(runs=[run], units={"time": "s", "z": "m"})
     d = tc.diagnose(base, recording, terms, seed=0, progress=False)
-    known = [row.terms for row in d.ranking if row.terms != ("none of these",)]
-    assert set(known[0]) == {"propellant burnt", "quadratic drag"}
+    assert d.verdict == "ambiguous"
+    assert {"propellant burnt", "quadratic drag"} in [{*tied} for tied in d.tied]
+    evidence = {frozenset(row.terms): row.log_evidence for row in reversed(d.ranking)}
+    assert evidence[frozenset({"propellant burnt", "quadratic drag"})] > evidence[frozenset({"viscoelastic branch"})]
     assert str(d).split("\n")[0].count(", or ") <= 6  # five of them and how many others, and none of them
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from torchcal.discovery.hypotheses.aliases import merge_sets
-from torchcal.discovery.hypotheses.beginnings import is_far
+from torchcal.discovery.hypotheses.beginnings import STRONG, is_far
 from torchcal.discovery.hypotheses.beside import Beside, next_terms
 from torchcal.discovery.hypotheses.linear_pairs import linear_pairs
 from torchcal.discovery.hypotheses.model import PRIOR, Hypothetical, Model
@@ -26,8 +26,8 @@ from torchcal.discovery.verdicts.verdict import PLAINLY_WHITE
 
 __all__ = ["refit_several"]
 
-#: Pairs that are refitted at most; where one term leaves noise alone.
-MOST, FEWER = 20, 10
+#: Pairs that are refitted at most; where one term leaves noise alone, and the base is not bent.
+MOST, FEWER = 30, 10
 #: Single terms beside which second ones are sought: of all, and of those that act everywhere; and how many more pairs
 #: are refitted for each of these that is not among the three best of all.
 LEADS, MORE = 3, 2
@@ -42,7 +42,8 @@ FROM_LINEAR, FROM_FAR = 8, 3
 def refit_several(search: Search) -> None:
     """Pairs from the linear search at the base, and second terms after the best single ones; then thirds.
 
-    Where one term leaves noise alone, two may do what it does: fewer of them are tried.
+    Where one term leaves noise alone, two may do what it does: fewer of them are tried, unless the base is bent, where
+    two that act together are seen badly and one with several shapes may copy them.
     """
     single = sorted((m for m in search.models if len(m.numbers) == 1), key=lambda m: -m.weight)
     count = len(search.candidates)
@@ -51,7 +52,7 @@ def refit_several(search: Search) -> None:
     enough = _enough(search)
     if enough and search.exact:
         return
-    wanted, beside = _pairs_to_try(search, single, enough)
+    wanted, beside = _pairs_to_try(search, single, enough and search.base.chi2 <= STRONG * search.problem.n)
     prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))
     search.models += (fitted := refit_sets(search, list(wanted.items()), prior, beside))
     if not enough:
@@ -81,14 +82,14 @@ def refit_several(search: Search) -> None:
 
 
 def _pairs_to_try(
-    search: Search, single: Sequence[Model], enough: bool
+    search: Search, single: Sequence[Model], few: bool
 ) -> tuple[dict[tuple[int, ...], tuple[int, int] | None], dict[tuple[int, ...], dict[int, Beside]]]:
     """Pairs, each with the columns of the linear search that suggested it, if that did; and what was seen of one beside
     the other.
 
     Args:
         single: Models of one term, the likeliest first.
-        enough: Whether one term that acts everywhere leaves noise alone.
+        few: Whether few will do.
     """
     wanted: dict[tuple[int, ...], tuple[int, int] | None] = {}
     for columns in linear_pairs(search, FROM_FAR if is_far(search.base) else FROM_LINEAR):
@@ -97,15 +98,15 @@ def _pairs_to_try(
     for model in single:
         lead = model.numbers[0]  # in a window merged ones may differ
         leads.setdefault(search.twins[lead] if lead in search.gone else lead, model)
-    ahead = list(itertools.islice(leads.items(), 1 if enough else LEADS))
+    ahead = list(itertools.islice(leads.items(), 1 if few else LEADS))
     seen: dict[tuple[int, ...], dict[int, Beside]] = {}
     with_each = [_pairs_with(search, lead, model, seen) for lead, model in ahead]
     for pair in itertools.chain(*itertools.zip_longest(*with_each)):  # the best of each lead first
         if pair is not None:
             wanted.setdefault(pair, None)
     wanted = {pair: wanted[pair] for pair in distinct(search, wanted)}
-    wanted = dict(itertools.islice(wanted.items(), FEWER if enough else MOST))
-    if not enough:  # a term in a window bends to what two do together, and these act everywhere
+    wanted = dict(itertools.islice(wanted.items(), FEWER if few else MOST))
+    if not few:  # a term in a window bends to what two do together, and these act everywhere
         everywhere = [(m.numbers[0], m) for m in single if m.window is None][:LEADS]
         for lead, model in everywhere:
             if (lead, model) not in ahead:

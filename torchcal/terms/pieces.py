@@ -57,7 +57,8 @@ def shape(name: str, unit: str, low: float | None = None, high: float | None = N
 
 
 def start(usual: float, low: float = -0.25, high: float = 1.25, name: str = "start") -> Parameter:
-    """Where a hidden state begins, as a share of what its term says: usually there, elsewhere only where data tell.
+    """Where a hidden state begins, as a share of what its term says: usually there, or at nothing, as what is switched
+    on when the recording begins; elsewhere only where data tell.
 
     There is room beyond what physics allows, so that noise does not push an estimate against a bound.
     """

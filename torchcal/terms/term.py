@@ -70,8 +70,8 @@ class Term:
             Parameters in ``p`` are as the terms before have shifted them; in ``rates`` and ``outputs`` as all have.
         frees: Dormant parameters of the simulator that it frees.
         parameters: Its own parameters. A shape of a term with hidden states that is given a neutral value says
-            where these usually begin: an estimate costs as much evidence as it is apart from that, and no more than any
-            other parameter.
+            where these usually begin: an estimate costs as much evidence as it is apart from that, or from 0, where
+            nothing has begun yet, and no more than any other parameter.
         formula: One line, as a scientist writes it.
         description: One plain sentence.
         scales: For shape parameters without two bounds: the state, input, condition or output (``"t"`` for time) on

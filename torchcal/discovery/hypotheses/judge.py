@@ -56,9 +56,9 @@ def judge(model: Model, base: Fitted) -> None:
 
 
 def _away(model: Model) -> dict[str, float]:
-    """What it would cost in log density to have hidden states begin where they usually do, by the names of the shapes
-    that say where: as much as these cost at most, since the term without them is a hypothesis too. Nothing where no
-    datum depends on it, as of a lag that follows nothing yet.
+    """What it would cost in log density to have hidden states begin where they usually do, or at nothing, by the names
+    of the shapes that say where: as much as these cost at most, since the term without them is a hypothesis too.
+    Nothing where no datum depends on it, as of a lag that follows nothing yet.
 
     An effect has to be there, and to be seen.
     """
@@ -78,7 +78,7 @@ def _away(model: Model) -> dict[str, float]:
             continue
         for i, at in usual.items():
             seen = bool(found.jacobian[:, column[i]].any())
-            away = (float(found.values[i]) - at) / max(float(sd[i]), 1e-300)
+            away = min((float(found.values[i]) - one for one in (at, 0.0)), key=abs) / max(float(sd[i]), 1e-300)
             costs[candidate.problem.parameters[i].name] = 0.5 * away**2 if seen else 0.0
     return costs
 

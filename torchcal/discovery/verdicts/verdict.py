@@ -331,7 +331,10 @@ def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) 
             worth = [m for m in physical if m.window is None and not m.note and _is_worth(decision, m)]
             nested = [m for m in worth if m not in holding and m.content > best.content]
             more = [m for m in worth if m in holding and best.window is not None and len(m.names) > len(best.names)]
-            decision.tied_models = [best, *sorted([*more, *nested], key=lambda m: -decision.probability[id(m)])]
+            rivals = [m for m in physical if m not in holding and _is_worth(decision, m) and not m.note]
+            rivals = [m for m in rivals if m not in nested and decision.probability[id(m)] > decision.none]
+            others = sorted([*more, *nested, *rivals], key=lambda m: -decision.probability[id(m)])
+            decision.tied_models = [best, *others]
             decision.tied = [list(names) for names in dict.fromkeys(m.names for m in decision.tied_models)]
         if decision.doubt or not nested or _none_is_likely(decision, physical):
             decision.tied.append(list(NONE))
