@@ -416,6 +416,6 @@ def test_what_a_black_box_raises_at_all_parameters_is_told():
 
     outside = tc.ExternalSimulator(divides, [tc.Parameter("a", low=0.0, high=5.0)])
     recording = tc.Recording(x=torch.linspace(0, 1, 10, dtype=torch.float64), y=torch.linspace(0, 2, 10))
-    with pytest.raises(ConvergenceError, match=r"raised ZeroDivisionError there: division by zero\. Give") as raised:
+    with pytest.raises(ConvergenceError, match=r"raised ZeroDivisionError: division by zero\. Give") as raised:
         tc.diagnose(outside, recording, [], progress=False)
     assert "runs" not in str(raised.value)

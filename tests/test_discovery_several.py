@@ -545,14 +545,14 @@ def test_pairs_begin_where_the_second_term_was_seen_beside_the_first(monkeypatch
     search, _ = settle(search, problem, 0.99)
     seen = next_terms(search, search.plain[0], 3)
     assert [*seen] == [1]
-    without, there = (hypothetical(search, (0, 1), -4.0, None, beside=beside) for beside in (None, seen))
+    without, there = (hypothetical(search, (0, 1), -4.0, None, beside=beside) for beside in ((), [seen[1]]))
     names = [q.name for q in there.candidate.problem.parameters]
     more = dict(zip(names, there.begin[len(without.begin) :].T.tolist(), strict=True))
     assert torch.equal(there.begin[: len(without.begin)], without.begin)
     assert max(abs(x0 - 2.4) for x0 in more["kink.x0"][:2]) < 0.3
     assert -0.7 < min(more["kink.a"]) < -0.3
     assert max(abs(a - search.plain[0].found.by_name["square.a"]) for a in more["square.a"]) < 0.3
-    (pair,) = refit_sets(search, [((0, 1), None)], -4.0, {(0, 1): seen})
+    (pair,) = refit_sets(search, [((0, 1), None)], -4.0, {(0, 1): [seen[1]]})
     assert abs(pair.found.by_name["kink.x0"] - 2.4) < 0.1
     as_it_was = search.candidates[1]
     larger = Scale({"x": 30.0, "y": 30.0}, {})

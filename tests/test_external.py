@@ -427,7 +427,7 @@ def test_where_no_point_has_an_answer_the_reason_is_named(kind, pool):
         divides, [Parameter("a", low=1.0, high=2.0)], vectorized=kind == "vectorized",
         executor=pool if kind == "pool" else None,
     )  # fmt: skip
-    with pytest.raises(SimulatorError, match=r"none of 3 .* raised ZeroDivisionError there: float division") as caught:
+    with pytest.raises(SimulatorError, match=r"none of 3 .* raised ZeroDivisionError: float division") as caught:
         simulator.check(where, torch.tensor([[1.0], [1.5], [2.0]]).double())
     assert isinstance(caught.value.__cause__, ZeroDivisionError)
 
@@ -442,7 +442,7 @@ def test_a_calibration_without_any_answer_says_why():
 
     x = torch.linspace(1.0, 2.0, 5, dtype=torch.float64)
     simulator = ExternalSimulator(half, [Parameter("a", low=1.0, high=2.0)])
-    with pytest.raises(SimulatorError, match="raised ValueError there: math domain error"):
+    with pytest.raises(SimulatorError, match="raised ValueError: math domain error"):
         calibrate(simulator, Recording(x=x, y={"z": x, "y": x}), num_samples=0)
 
 

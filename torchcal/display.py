@@ -7,7 +7,7 @@ from typing import Any
 
 __all__ = [
     "DECADES", "FAR", "IN_BASE", "ITSELF", "NONE", "PATIENCE", "between", "error_unit", "percent", "placed", "raised",
-    "rate_unit", "unit_of", "units_of", "up_to", "version", "with_unit",
+    "raised_there", "rate_unit", "unit_of", "units_of", "up_to", "version", "with_unit",
 ]  # fmt: skip
 
 NONE = ("none of these",)
@@ -160,6 +160,11 @@ def raised(error: BaseException) -> str:
     'ValueError: Not so'
     """
     return f"{type(error).__name__}: {error}".rstrip(". ")
+
+
+def raised_there(error: BaseException | None) -> str:
+    """The sentence, with a space before it, that tells what was raised at a point named before; nothing for None."""
+    return "" if error is None else f" There the function raised {raised(error)}."
 
 
 def version(package: str) -> str:

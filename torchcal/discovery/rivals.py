@@ -106,7 +106,7 @@ def _in_its_place(search: Search, lead: Model, prior: float) -> None:
     known: dict[tuple[int, ...], Model] = {
         m.numbers: m for m in search.models if len(m.numbers) == 2 and m.window is None
     }
-    begun: dict[tuple[int, ...], dict[int, Beside]] = {}
+    begun: dict[tuple[int, ...], Beside] = {}
     for kept in lead.numbers:
         (other,) = set(lead.numbers) - {kept}
         try:
@@ -119,14 +119,13 @@ def _in_its_place(search: Search, lead: Model, prior: float) -> None:
         for j in sorted(able, key=lambda j: -scores[j])[:STAND_INS]:
             pair = tuple(sorted((kept, j)))
             if pair not in known or known[pair].weight <= lead.weight - BETTER:
-                begun[pair] = {j: every[j]}
+                begun[pair] = every[j]
     fresh = distinct(search, [pair for pair in begun if pair not in known])
     wanted = []
     for pair, seen in begun.items():
         one = hypothetical(search, pair, prior, None) if pair in known or pair in fresh else None
         if one is not None:
-            (begin,) = (each.begin(one.candidate) for each in seen.values())
-            wanted.append(dataclasses.replace(one, begin=begin))
+            wanted.append(dataclasses.replace(one, begin=seen.begin(one.candidate)))
     fitted = []
     for model in refitted(search, wanted):
         old = known.get(model.numbers)

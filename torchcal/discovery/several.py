@@ -52,9 +52,9 @@ def refit_several(search: Search) -> None:
     enough = _enough(search)
     if enough and search.exact:
         return
-    wanted, beside = _pairs_to_try(search, single, enough and search.base.chi2 <= STRONG * search.problem.n)
+    wanted, seen = _pairs_to_try(search, single, enough and search.base.chi2 <= STRONG * search.problem.n)
     prior = math.log(PRIOR["several"] / (0.5 * count * (count - 1)))
-    search.models += (fitted := refit_sets(search, list(wanted.items()), prior, beside))
+    search.models += (fitted := refit_sets(search, list(wanted.items()), prior, seen))
     if not enough:
         either_way(search, fitted)
     merge_sets(search)
@@ -83,7 +83,7 @@ def refit_several(search: Search) -> None:
 
 def _pairs_to_try(
     search: Search, single: Sequence[Model], few: bool
-) -> tuple[dict[tuple[int, ...], tuple[int, int] | None], dict[tuple[int, ...], dict[int, Beside]]]:
+) -> tuple[dict[tuple[int, ...], tuple[int, int] | None], dict[tuple[int, ...], list[Beside]]]:
     """Pairs, each with the columns of the linear search that suggested it, if that did; and what was seen of one beside
     the other.
 
@@ -99,8 +99,7 @@ def _pairs_to_try(
         lead = model.numbers[0]  # in a window merged ones may differ
         leads.setdefault(search.twins[lead] if lead in search.gone else lead, model)
     ahead = list(itertools.islice(leads.items(), 1 if few else LEADS))
-    seen: dict[tuple[int, ...], dict[int, Beside]] = {}
-    with_each = [_pairs_with(search, lead, model, seen) for lead, model in ahead]
+    with_each = [_pairs_with(search, lead, model) for lead, model in ahead]
     for pair in itertools.chain(*itertools.zip_longest(*with_each)):  # the best of each lead first
         if pair is not None:
             wanted.setdefault(pair, None)
@@ -110,22 +109,22 @@ def _pairs_to_try(
         everywhere = [(m.numbers[0], m) for m in single if m.window is None][:LEADS]
         for lead, model in everywhere:
             if (lead, model) not in ahead:
-                more = distinct(search, [*wanted, *_pairs_with(search, lead, model, seen)])[len(wanted) :]
+                with_each.append(_pairs_with(search, lead, model))
+                more = distinct(search, [*wanted, *with_each[-1]])[len(wanted) :]
                 wanted.update(dict.fromkeys(more[:MORE]))
+    seen: dict[tuple[int, ...], list[Beside]] = {}
+    for pair, one in itertools.chain.from_iterable(found.items() for found in with_each):
+        if one is not None:
+            seen.setdefault(pair, []).append(one)
     return wanted, seen
 
 
-def _pairs_with(
-    search: Search, lead: int, model: Model, seen: dict[tuple[int, ...], dict[int, Beside]]
-) -> list[tuple[int, ...]]:
-    """Pairs of a single term and the best second ones at its fit, where they are ``seen`` if it acts everywhere."""
-    pairs = []
-    for j, one in next_terms(search, model, NEXT).items():
-        if j != lead:
-            pairs.append(tuple(sorted((lead, j))))
-            if one is not None and model.window is None:
-                seen.setdefault(pairs[-1], {})[j] = one
-    return pairs
+def _pairs_with(search: Search, lead: int, model: Model) -> dict[tuple[int, ...], Beside | None]:
+    """Pairs of a single term and the best second ones at its fit; each as seen there, if that acts everywhere."""
+    return {
+        tuple(sorted((lead, j))): one if model.window is None else None
+        for j, one in next_terms(search, model, NEXT).items() if j != lead
+    }  # fmt: skip
 
 
 def _enough(search: Search) -> bool:
@@ -143,4 +142,4 @@ def _with_third(
     """A third term beside two, which act in the order in which they do alone."""
     numbers, two = tuple(sorted((*pair.numbers, third))), iter(acting_order(search, pair))
     order = [i if i == third else next(two) for i in numbers]
-    return hypothetical(search, numbers, prior, None, order=order, beside=None if seen is None else {third: seen})
+    return hypothetical(search, numbers, prior, None, order=order, beside=() if seen is None else (seen,))

@@ -12,7 +12,7 @@ from torch.autograd import forward_ad
 
 from torchcal.checks import whole
 from torchcal.data import Recording
-from torchcal.display import raised
+from torchcal.display import raised, raised_there
 from torchcal.errors import DomainError, ShapeError, SimulatorError, TorchcalError
 from torchcal.simulators.careful import careful
 from torchcal.simulators.dual import Still, still
@@ -300,11 +300,11 @@ class Simulator:
             row, column = (int(i) for i in (~torch.isfinite(together)).nonzero()[0])
             point = {name: float(v) for name, v in zip(self.names, values[row], strict=True)}
             cause = self.raised(x, values[row], column)
-            why = "" if cause is None else f" The function raised {type(cause).__name__} there: {cause}."
             raise SimulatorError(
                 f"Expected finite outputs. Got {float(together[row, column])} at output number {column} "
                 f"for parameters {point}, and none of {len(values)} parameter values gave finite outputs "
-                f"everywhere.{why} Check the simulator there, or narrow the parameters' bounds or give initial=."
+                f"everywhere.{raised_there(cause)} Check the simulator there, or narrow the parameters' bounds or "
+                "give initial=."
             ) from cause
         good = finite.nonzero()[:2, 0].repeat(2)[:2]
         with torch.no_grad():

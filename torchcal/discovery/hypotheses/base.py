@@ -16,6 +16,7 @@ from torchcal.discovery.fits.trial import check_finite, point_of
 from torchcal.discovery.misfit.growth import growth
 from torchcal.discovery.misfit.noise import Noise, estimate
 from torchcal.discovery.misfit.outliers import lone_values, spikes
+from torchcal.display import raised_there
 from torchcal.errors import ConvergenceError, DomainError, SimulatorError
 from torchcal.simulators import Trajectories, focused, may_change, step_errors, workable
 
@@ -98,12 +99,11 @@ def calibrate_base(
     if found is None:
         bad = (~problem.evaluate(begin[:1], [])[0][0].isfinite()).nonzero()[:1, 0]
         cause = problem.simulator.raised(recording.x, begin[0], int(problem.index[bad])) if len(bad) else None
-        why = "" if cause is None else f" The function raised {type(cause).__name__} there: {cause}."
         runs = ", and look at the runs' initial values" if problem.in_time else ""
         raise ConvergenceError(
             f"Expected finite outputs of the base at one of {num_starts} starting values at least. Got none, the first "
-            f"with {point_of(problem, begin[0], free)}.{why} Give initial= near the truth, or bounds, to the "
-            f"parameters (a rate is about 1 over the time in which something happens){runs}."
+            f"with {point_of(problem, begin[0], free)}.{raised_there(cause)} Give initial= near the truth, or bounds, "
+            f"to the parameters (a rate is about 1 over the time in which something happens){runs}."
         ) from cause
     found = _unwound(_sharpen(found))
     found = found if exact or clean else _unfollowed(found, begin, rough, outputs)

@@ -28,10 +28,10 @@ def hypothetical(
     columns: tuple[int, int] | None,
     *,
     order: Sequence[int] = (),
-    beside: Mapping[int, Beside] | None = None,
+    beside: Sequence[Beside] = (),
 ) -> Hypothetical | None:
     """Some candidates together, begun at the fit of each alone where it has one, and acting in an order, if not as they
-    are listed; also where some were seen ``beside`` the others, by their numbers."""
+    are listed; also where some were seen ``beside`` the others."""
     terms = [term for i in order or numbers for term in search.candidates[i].terms]
     terms.sort(key=lambda term: not replaces(search.base.problem, search.base.values, term))  # else others are lost
     try:
@@ -69,7 +69,7 @@ def hypothetical(
                     rows += _unseen(search.candidates[other], row, names)
     if columns is not None:
         rows.append(linear_row(search, candidate, columns))
-    begin = torch.cat([torch.stack(rows), *(one.begin(candidate, BESIDE) for one in (beside or {}).values())])
+    begin = torch.cat([torch.stack(rows), *(one.begin(candidate, BESIDE) for one in beside)])
     return Hypothetical(numbers, candidate, begin, prior)
 
 
@@ -112,12 +112,12 @@ def refit_sets(
     search: Search,
     sets: Sequence[tuple[tuple[int, ...], tuple[int, int] | None]],
     prior: float,
-    beside: Mapping[tuple[int, ...], Mapping[int, Beside]] | None = None,
+    beside: Mapping[tuple[int, ...], Sequence[Beside]] | None = None,
 ) -> list[Model]:
     """Refit sets of candidates, each with the columns of the linear search that suggested it, and with what was seen of
     some beside the others."""
     seen = beside or {}
-    return refitted(search, [hypothetical(search, each, prior, cols, beside=seen.get(each)) for each, cols in sets])
+    return refitted(search, [hypothetical(search, each, prior, cols, beside=seen.get(each, ())) for each, cols in sets])
 
 
 def refitted(search: Search, wanted: Sequence[Hypothetical | None]) -> list[Model]:
