@@ -574,8 +574,8 @@ def test_a_faulty_sensor_is_named():
 @pytest.mark.slow
 def test_a_hidden_state_is_named():
     library = named(tc.terms.mechanics(), "quadratic drag", "cubic stiffness", "bias force", "viscoelastic branch")
-    body, _, x = spring(named(library, "viscoelastic branch"),
-                        **{"viscoelastic branch__k": 0.8, "viscoelastic branch__tau": 1.5})  # fmt: skip
+    planted = {"viscoelastic branch__k": 0.8, "viscoelastic branch__tau": 1.5, "viscoelastic branch__start": 0.0}
+    body, _, x = spring(named(library, "viscoelastic branch"), **planted)
     d = quiet(body, tc.Recording(runs=[run_of(x)], noise=0.02), library)
     assert d.verdict == "named"
     assert d.terms == ["viscoelastic branch"]

@@ -1,5 +1,6 @@
 """Stiff models: implicit steps against SciPy, their exact derivatives, and when they are taken."""
 
+import dataclasses
 import json
 import math
 from types import SimpleNamespace
@@ -554,6 +555,23 @@ def test_a_few_times_as_many_explicit_steps_are_taken_rather_than_implicit_ones(
         assert simulator.implicit == implicit
         assert simulator.num_steps <= 4 * bound.num_steps
         assert not magnified(simulator, values, simulator.solve(values))
+
+
+@pytest.mark.parametrize(("shorter", "implicit"), [(1, False), (8, True)])
+def test_implicit_steps_replace_many_times_as_many_explicit_ones(shorter, implicit):
+    """Steps that a fit's way had shortened, before what fades became faster still: the data ask for no such ones."""
+    t = np.linspace(0, 60, 121)
+    model = tc.ODESimulator(lambda t, s, p, u: {"N": p["k"] * (1.0 - s["N"])}, ["N"], [tc.Parameter("k", low=0.0)])
+    recording = tc.Recording(runs=[run_of(t, {"N": 1.0}, ("N",))], noise=0.02)
+    bound = model.bind(recording).refined(shorter)
+    values, allowed = tensor(5.5 * shorter)[None], torch.full((len(t),), 1e-3, dtype=F64)
+    problem = Problem.of(model, recording).with_simulator(bound)
+    found = fit(problem, problem.whitening(allowed, torch.zeros(1, dtype=F64)), values, [0])
+    sharp, error = sharpen(dataclasses.replace(found, values=values[0]), lambda now: allowed, rounds=3)
+    assert error == 0.0
+    for simulator in (settled(bound, values, allowed), sharp.problem.simulator):
+        assert simulator.implicit == implicit
+        assert simulator.num_steps == (120 if implicit else 2 * bound.num_steps)
 
 
 @pytest.mark.slow

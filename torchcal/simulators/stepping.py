@@ -40,8 +40,9 @@ GROWTH = 2.0
 #: Size of h λ from which on explicit steps may magnify what fades; steps on end that do, by which factor in log all
 #: together, until it matters; how many parameter values are looked at; and how often they are halved for that alone.
 UNSTABLE, ON_END, MAGNIFIED, LOOKED_AT, CALMING = 2.5, 3, 7.0, 4, 4
-#: Halvings for that up to which explicit steps take less time than implicit ones.
-FEW_HALVINGS = 2
+#: Halvings for that up to which explicit steps take less time than as many implicit ones before; and the number of
+#: explicit steps that take the time of an implicit one (of two to three states: 8 alone, 5 in a batch of eight).
+FEW_HALVINGS, DEARER = 2, 6
 #: How many times as fast as at those values a fit may want what fades to be: where steps magnified it there, χ² would
 #: rise as at a bound that is none.
 FASTER = 1.5
@@ -115,15 +116,23 @@ def settled(
 
 
 def settled_implicitly(
-    simulator: Trajectories, values: Tensor, allowed: Tensor, *, rounds: int = ROUNDS
+    simulator: Trajectories,
+    values: Tensor,
+    allowed: Tensor,
+    *,
+    rounds: int = ROUNDS,
+    instead: Trajectories | None = None,
 ) -> Trajectories | None:
-    """The same with implicit steps, where these settle on a finite solution, else None; arguments as of `settled`, and
-    how often they are chosen at most."""
+    """The same with implicit steps, where these settle on a finite solution, else None.
+
+    Arguments are those of `settled`, how often they are chosen at most, and explicit steps ``instead`` of which they
+    must take less time, if there are any that do."""
     implicit, work = _implicitly(simulator), _Work()
-    here = None if implicit is None else _through(implicit, values, work)
+    many = MANY if instead is None else instead.num_steps // DEARER
+    here = None if implicit is None or implicit.num_steps > many else _through(implicit, values, work)
     excess: list[float] = []
     for _ in range(rounds):
-        if here is None or here.simulator.num_steps > MANY:
+        if here is None or here.simulator.num_steps > many:
             return None
         halved = here.simulator.refined(2)
         finer = _through(halved, values, work)
@@ -266,12 +275,15 @@ def _finite(simulator: Trajectories, values: Tensor) -> bool:
 
 
 def calmed(simulator: Trajectories, values: Tensor, allowed: Tensor, states: Tensor) -> Trajectories:
-    """The same, or where its explicit steps magnify what fades, with a few times as many that do not; else with
-    implicit ones; else with many more; itself where there are none. Arguments are those of `settled`, and its solved
-    states."""
+    """The same, or where its explicit steps magnify what fades, with a few times as many that do not, or fewer implicit
+    ones that take less time; else with any implicit ones; else with many more; itself where there are none. Arguments
+    are those of `settled`, and its solved states."""
+    few = shortened(simulator, values, states, few=True)
+    if few is simulator:
+        return few
     return (
-        shortened(simulator, values, states, few=True)
-        or settled_implicitly(simulator, values, allowed)
+        settled_implicitly(simulator, values, allowed, instead=few)
+        or few
         or shortened(simulator, values, states)
         or simulator
     )

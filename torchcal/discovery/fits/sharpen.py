@@ -159,20 +159,24 @@ def _calm(found: Fitted, allowed: Tensor, states: Tensor, rounds: int) -> Fitted
     if not isinstance(simulator, Trajectories) or not magnified(simulator, found.values[None], states):
         return found
     calm = shortened(simulator, found.values[None], states, few=True)
-    if calm is None and (again := _implicit(found, allowed, rounds)) is not None:
+    again = _implicit(found, allowed, rounds, instead=calm)
+    if again is not None:
         return again
     calm = calm or shortened(simulator, found.values[None], states)
     return found if calm is None else _in_steps_of(calm, found) or found
 
 
-def _implicit(found: Fitted, allowed: Tensor, rounds: int) -> Fitted | None:
-    """The fit with implicit steps; None where these do not settle either, there or where the fit ends."""
+def _implicit(
+    found: Fitted, allowed: Tensor, rounds: int, instead: Trajectories | None = None
+) -> Fitted | None:
+    """The fit with implicit steps; None where these do not settle either, there or where the fit ends, or take more
+    time than explicit ones ``instead`` of which they are tried."""
     problem, simulator = found.problem, found.problem.simulator
     if not isinstance(simulator, Trajectories):
         return None
     most = problem.recording.spread.clone()
     most[problem.index] = allowed
-    other = settled_implicitly(simulator, found.values[None], most, rounds=rounds)
+    other = settled_implicitly(simulator, found.values[None], most, rounds=rounds, instead=instead)
     if other is None:
         return None
     again = _in_steps_of(other, found)
