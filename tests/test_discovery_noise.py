@@ -1112,6 +1112,24 @@ def test_what_bends_along_the_sweeps_of_a_grid_is_no_noise_that_grows():
         d = tc.diagnose(base, tc.Recording(x={"T": TEMPERATURE, "rate": RATE}, y=y), terms, progress=False)
         assert d.verdict == "unexplained"
         assert "growing" not in str(d)
+        first, *others = d.where
+        assert (first.target, first.driver, first.spans, first.together) == ("y", "T and rate", (), True)
+        assert first.share > 0.9
+        assert all(row.share < 0.8 and not row.together for row in others)
+        assert "varies with T and rate together: a smooth" in " ".join(str(d).split())
+        alone = next(row for row in others if row.target == "y")
+        assert f"and one along {alone.driver} alone {100 * alone.share:.0f} %" in " ".join(str(d).split())
+
+
+@pytest.mark.parametrize("change", [lambda T, rate: 0.1 * np.log(rate) ** 2, lambda T, rate: (T - 320) ** 2 / 4000])
+def test_what_one_of_two_conditions_does_is_not_told_of_both(change):
+    base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x["T"] + p["c"] * x["rate"].log(), [
+        tc.Parameter(name) for name in "abc"
+    ])  # fmt: skip
+    y = 0.1 + change(TEMPERATURE, RATE) + 0.02 * np.random.default_rng(0).standard_normal(72)
+    d = tc.diagnose(base, tc.Recording(x={"T": TEMPERATURE, "rate": RATE}, y=y), [], progress=False)
+    assert d.verdict == "unexplained"
+    assert not any(row.together for row in d.where)
 
 
 def test_noise_that_grows_along_the_sweeps_of_a_grid_is_told():

@@ -213,7 +213,7 @@ class Location:
         kind: ``"equation"``, ``"output"`` or ``"parameter"``.
         target: Name of that equation (its state), output or parameter.
         driver: What the mismatch varies with: a condition, ``"t"``, a state, an input, or ``"run"``, counted from 0.
-        spans: Ranges of the driver in which it sits, as far as that is sure, ``((low, high), …)``.
+        spans: Ranges of the driver in which it sits, as far as that is sure, ``((low, high), …)``; none along two.
         share: Share of the misfit beyond noise that a change there, varying with the driver, can remove.
         evidence: Log evidence of an unknown change there, smooth, an oscillation or in steps, against none.
         period: Of an oscillation, in units of the driver; None of any other change.
@@ -224,6 +224,7 @@ class Location:
         also: Kinds and targets of what else some terms together act on: what varies with the driver is then what they
             do together.
         at: The levels of another condition at which it changes alone, in words; empty where it does at all.
+        together: Whether it varies with two conditions together, ``"a and b"``, as along neither alone.
     """
 
     kind: str
@@ -239,6 +240,7 @@ class Location:
     run: int | None = None
     also: tuple[tuple[str, str], ...] = ()
     at: str = ""
+    together: bool = False
 
     @property
     def called(self) -> str:

@@ -60,6 +60,13 @@ def where_in_words(d: Any) -> str:
             f"The mismatch sits in the {place.called} and varies with {place.driver}{largest}: "
             f"adding {what} there{'' if d.terms else ', say,'} {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
         )
+    if place.together:
+        alone = next((row for row in d.where[1:] if (row.kind, row.target) == (place.kind, place.target)), None)
+        less = "" if alone is None else f", and one along {alone.driver} alone {share_in_words(max(alone.share, 0.0))}"
+        return (
+            f"The mismatch sits in the {place.called} and varies with {place.driver} together: a smooth change there "
+            f"{_does(place)}{less}.{_embedded(d)}"
+        )
     if place.edges:
         side = "on one side"
         if len(place.edges) > 1:

@@ -24,7 +24,7 @@ from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.misfit.steps import Sudden
 from torchcal.discovery.misfit.waves import wave_places
 
-__all__ = ["Rough", "Structure", "analyse", "evidences", "responses_of", "together_of"]
+__all__ = ["Rough", "Structure", "analyse", "evidences", "places_together", "responses_of", "together_of"]
 
 #: Radial functions along time, and along any other driver: the evidence chooses how many.
 IN_TIME, ALONG = (12, 24, 48), (12, 24)
@@ -112,8 +112,19 @@ def together_of(problem: Problem, available: Sequence[Channel]) -> list[_Look]:
                 if a <= distinct[0] and b <= distinct[1] and DATA_EACH[1] * a * b <= data
             ]
             if parts:
-                found.append(_Look(channel, f"{one}, {other}", parts, channel.response(torch.cat(parts, dim=1))))
+                found.append(_Look(channel, f"{one} and {other}", parts, channel.response(torch.cat(parts, dim=1))))
     return found
+
+
+def places_together(residual: Residual) -> list[Place]:
+    """The likeliest smooth change of every output along every two conditions together, the likeliest of all first."""
+    problem, best = residual.found.problem, dict[int, Place]()
+    looks = together_of(problem, channels(problem, residual.found))
+    for key, look, change in _changes(residual, looks, residual.e[:, None]):
+        place = change.place(look.channel, look.driver, residual)
+        if key not in best or place.evidence > best[key].evidence:
+            best[key] = place
+    return sorted(best.values(), key=lambda place: -place.evidence)
 
 
 def _counts(problem: Problem, data: int, driver: str) -> list[int]:
