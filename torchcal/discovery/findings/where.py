@@ -181,7 +181,7 @@ def locate(
 
 def _together(search: Search, rows: Sequence[Location]) -> list[Location]:
     """A change along two conditions together, where no other place tells as much and no term says better where."""
-    if search.exact or any(row.terms for row in rows):
+    if search.problem.in_time or any(row.terms for row in rows):
         return []
     for place in places_together(search.residual)[:1]:
         known = max((row.evidence for row in rows), default=LEAST_EVIDENCE)
