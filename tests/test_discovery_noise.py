@@ -608,6 +608,44 @@ def test_an_instrument_that_hardly_shows_what_it_measures_is_no_name(offset, gai
     assert told is None or told in " ".join(str(d).split())
 
 
+def test_an_instrument_that_saturates_below_most_data_is_no_name_beside_another_term():
+    """Heat pumps lose in one corner, cold and hot, which is in no list: a saturation by 72 % from below 85 % of the data on
+    and a loss with the lift follow that as well."""
+    rng, n = np.random.default_rng(1012), 120
+    cold, hot, load = rng.uniform(-15, 15, n), rng.uniform(30, 60, n), rng.uniform(0.2, 1, n)
+    clean = 0.45 * (hot + 273.15) / (hot - cold) * (1 - 0.004 * np.maximum(hot - 45, 0) * np.maximum(-cold, 0))
+    base = tc.Simulator(
+        lambda x, p: {"COP": p["eta"] * (x["hot"] + 273.15) / (x["hot"] - x["cold"])},
+        [tc.Parameter("eta", low=0.0, high=1.0, initial=0.4)],
+    )
+    c = [tc.Parameter("c", low=0.0)]
+    terms = [
+        tc.Term("cycling", outputs={"COP": lambda x, p, y: y * (1 - p["c"] * (1 - x["load"]))}, parameters=c),
+        tc.Term("lift", outputs={"COP": lambda x, p, y: y * (1 - p["c"] * (x["hot"] - x["cold"] - 30))}, parameters=c),
+        *tc.terms.sensor(("COP",), static=True),
+    ]
+    x, y = {"cold": cold, "hot": hot, "load": load}, clean + 0.158 * rng.normal(size=n)
+    d = tc.diagnose(base, tc.Recording(x=x, y={"COP": y}, noise=0.158), terms, seed=0, progress=False)
+    assert d.verdict == "ambiguous"
+    assert d.tied == [["lift", "saturation of COP"], ["none of these"]]
+    assert "COP shows less than 40% of what the true value varies by" in " ".join(str(d).split())
+
+
+def test_an_instrument_that_saturates_above_most_data_is_a_name_beside_another_term():
+    """It shows less than 40 % of the variation as well, and all of it below a fifth of the range."""
+    x = np.linspace(0, 4.5, 90)
+    y = np.exp(x) + 6.0 * np.sin(x)
+    y = np.where(y > 20, 20 + 0.05 * (y - 20), y) + 0.1 * np.random.default_rng(0).standard_normal(90)
+    base = tc.Simulator(lambda x, p: torch.exp(p["m"] * x), [tc.Parameter("m", initial=1.0)])
+    terms = [
+        tc.Term("swing", outputs={"y": lambda x, p, y: y + p["b"] * x.sin()}, parameters=[tc.Parameter("b")]),
+        *tc.terms.sensor(("y",), static=True),
+    ]
+    d = tc.diagnose(base, tc.Recording(x=x, y=y, noise=0.1), terms, seed=0, progress=False)
+    assert d.verdict == "named"
+    assert set(d.terms) == {"swing", "saturation of y"}
+
+
 LOSS = tc.ODESimulator(
     rates=lambda t, s, p, u: {"n": -p["k"] * s["n"]},
     states={"n": "1"},
