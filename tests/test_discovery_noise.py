@@ -609,7 +609,7 @@ def test_an_instrument_that_hardly_shows_what_it_measures_is_no_name(offset, gai
 
 
 def test_an_instrument_that_saturates_below_most_data_is_no_name_beside_another_term():
-    """Heat pumps lose in one corner, cold and hot, which is in no list: a saturation by 72 % from below 85 % of the data on
+    """Heat pumps lose in one corner, cold and hot, which is in no list: a saturation by 72 % below 85 % of the data
     and a loss with the lift follow that as well."""
     rng, n = np.random.default_rng(1012), 120
     cold, hot, load = rng.uniform(-15, 15, n), rng.uniform(30, 60, n), rng.uniform(0.2, 1, n)
