@@ -26,8 +26,8 @@ __all__ = [
 FALL, ROUNDING = 2.0, 1e-3
 #: Variation that an instrument may add, in that of what it measures: with more it is another model of the thing.
 ADDED = 1.0
-#: Share of what the true value varies by that an instrument shows at least, beside other terms, in all and at half of
-#: the data: alone it may be set to another range, and what saturates shows less beyond some value.
+#: Share of what the true value varies by that an instrument shows at least, beside other terms, at half of the data:
+#: alone it may be set to another range, and what saturates shows less beyond some value.
 SHOWN = 0.4
 #: Share of the range of the true values by which it is looked at beyond them.
 BEYOND = 0.2
@@ -170,9 +170,7 @@ def no_instrument(search: Search, model: Model) -> str:
             drifts = curve or (problem.in_time and reading.is_of_value(and_time=True))
             if drifts and float((shown - true[here]).std()) > ADDED * float(true[here].std()):
                 return f"By it the reading of {name} varies more by the instrument's error than by the true value."
-            little = float(shown.std()) < SHOWN * float(true[here].std())
-            little = little and float(_slope(reading, true[here]).median()) < SHOWN
-            if little and curve and len(model.candidate.terms) > 1:
+            if curve and len(model.candidate.terms) > 1 and float(_slope(reading, true[here]).median()) < SHOWN:
                 return (
                     f"By it the reading of {name} shows less than {SHOWN:.0%} of what the true value varies by, as "
                     "that of hardly any instrument does."
