@@ -15,7 +15,7 @@ from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit import outliers
 from torchcal.discovery.verdicts import doubts, instruments, verdict
 from torchcal.discovery.verdicts.decision import Decision
-from torchcal.discovery.verdicts.verdict import _worth_telling
+from torchcal.discovery.verdicts.verdict import _rivals, _worth_telling
 from torchcal.errors import ConvergenceWarning
 
 F64 = torch.float64
@@ -568,3 +568,13 @@ def test_without_noise_what_is_no_physics_has_no_probability():
     assert d.verdict == "unexplained"
     assert {row.terms: row.probability for row in d.ranking}[("none of these",)] == 1.0
     assert all(row.probability == 0 for row in d.ranking if row.terms != ("none of these",))
+
+
+def test_a_rival_is_told_once_and_without_what_adds_to_it():
+    told = (("b", 0.08), ("b", 0.07), ("b c", 0.06), ("d", 0.06), ("e", 0.04), ("f", 0.09))
+    models = [SimpleNamespace(names=tuple(names.split()), note="no" * (names == "f")) for names, _ in told]
+    probability = {id(model): share for model, (_, share) in zip(models, told, strict=True)}
+    decision = SimpleNamespace(none=0.05, probability=probability)
+    assert _rivals(decision, models[::-1]) == [models[0], models[3]]
+    decision.none = 0.07
+    assert _rivals(decision, models) == [models[0]]

@@ -1159,7 +1159,10 @@ def test_what_bends_along_the_sweeps_of_a_grid_is_no_noise_that_grows():
         assert f"and one along {alone.driver} alone {100 * alone.share:.0f} %" in " ".join(str(d).split())
 
 
-@pytest.mark.parametrize("change", [lambda T, rate: 0.1 * np.log(rate) ** 2, lambda T, rate: (T - 320) ** 2 / 4000])
+@pytest.mark.parametrize("change", [
+    lambda T, rate: 0.1 * np.log(rate) ** 2, lambda T, rate: (T - 320) ** 2 / 4000,
+    lambda T, rate: (T - 320) ** 2 / 8000 + 0.03 * np.log(rate) ** 2,  # each by itself
+])  # fmt: skip
 def test_what_one_of_two_conditions_does_is_not_told_of_both(change):
     base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x["T"] + p["c"] * x["rate"].log(), [
         tc.Parameter(name) for name in "abc"
@@ -1168,6 +1171,20 @@ def test_what_one_of_two_conditions_does_is_not_told_of_both(change):
     d = tc.diagnose(base, tc.Recording(x={"T": TEMPERATURE, "rate": RATE}, y=y), [], progress=False)
     assert d.verdict == "unexplained"
     assert not any(row.together for row in d.where)
+
+
+def test_a_change_along_two_conditions_is_told_of_these_and_not_of_what_is_read(tmp_path):
+    """The output and one of them say as much as the two: but those are what an experiment sets."""
+    base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x["T"] + p["c"] * x["rate"].log(), [
+        tc.Parameter(name) for name in "abc"
+    ])  # fmt: skip
+    y = 0.05 * (TEMPERATURE - 320) + 0.3 * np.log(RATE) + 0.2 * np.sin((TEMPERATURE - 320) / 12 + np.log(RATE))
+    y = y + 0.02 * np.random.default_rng(0).standard_normal(72)
+    d = tc.diagnose(base, tc.Recording(x={"T": TEMPERATURE, "rate": RATE}, y=y), [], progress=False)
+    assert (d.where[0].driver, d.where[0].together) == ("T and rate", True)
+    assert "The missing change" not in str(d) or f"against {d.missing.driver} alone spans" in " ".join(str(d).split())
+    d.report(tmp_path / "page.html")
+    assert "both together" in (tmp_path / "page.html").read_text()
 
 
 def test_noise_that_grows_along_the_sweeps_of_a_grid_is_told():

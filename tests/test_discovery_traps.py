@@ -697,6 +697,8 @@ def late(gain, start, sd, jacobian, states=("late",)):
 def test_a_shape_at_its_usual_value_costs_no_more_than_it_would_to_have_it_there():
     seen = [[1.0, 2.0, 0.5, 1.0], [1.0, 0.0, 0.1, 0.0]]
     assert late(2.0, 1.06, 0.03, seen) == {"lag.start": pytest.approx(2.0)}
+    assert late(2.0, 0.06, 0.03, seen) == {"lag.start": pytest.approx(2.0)}  # where nothing has begun is as usual
+    assert late(2.0, 0.5, 0.03, seen) == {"lag.start": pytest.approx(0.5 * (0.5 / 0.03) ** 2)}
     assert late(2.0, 1.06, 0.03, seen, states={}) == {}  # an exponent, say, is a parameter like any other
     unseen = [[1.0, 2.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0]]
     assert late(2.0, 0.3, 0.03, unseen) == {"lag.start": 0.0}

@@ -159,7 +159,7 @@ def raised(error: BaseException) -> str:
     >>> raised(ValueError("Not so."))
     'ValueError: Not so'
     """
-    return f"{type(error).__name__}: {error}".rstrip(". ")
+    return f"{type(error).__name__}: {error}".rstrip(":. ")
 
 
 def raised_there(error: BaseException | None) -> str:

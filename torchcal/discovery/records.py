@@ -224,7 +224,7 @@ class Location:
         also: Kinds and targets of what else some terms together act on: what varies with the driver is then what they
             do together.
         at: The levels of another condition at which it changes alone, in words; empty where it does at all.
-        together: Whether it varies with two conditions together, ``"a and b"``, as along neither alone.
+        together: Whether it varies with two conditions together, ``"a and b"``, more than with each of them by itself.
     """
 
     kind: str

@@ -188,6 +188,8 @@ def _spans(item: Any) -> str:
     """Where a location's change is large, or the period of an oscillation."""
     if item.period is not None:
         return f"everywhere, with a period of {in_digits(item.period)}"
+    if item.together:
+        return "both together"
     return ", ".join(between(item.spans, "…", item.extent)).replace("-", "−") or "everywhere"
 
 

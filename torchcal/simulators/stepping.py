@@ -41,7 +41,8 @@ GROWTH = 2.0
 #: together, until it matters; how many parameter values are looked at; and how often they are halved for that alone.
 UNSTABLE, ON_END, MAGNIFIED, LOOKED_AT, CALMING = 2.5, 3, 7.0, 4, 4
 #: Halvings for that up to which explicit steps take less time than as many implicit ones before; and the number of
-#: explicit steps that take the time of an implicit one (of two to three states: 8 alone, 5 in a batch of eight).
+#: explicit steps that take the time of an implicit one, with derivatives (two states in four runs: 8, and 5 in a batch
+#: of eight; the more states, the more).
 FEW_HALVINGS, DEARER = 2, 6
 #: How many times as fast as at those values a fit may want what fades to be: where steps magnified it there, χ² would
 #: rise as at a bound that is none.
@@ -125,8 +126,13 @@ def settled_implicitly(
 ) -> Trajectories | None:
     """The same with implicit steps, where these settle on a finite solution, else None.
 
-    Arguments are those of `settled`, how often they are chosen at most, and explicit steps ``instead`` of which they
-    must take less time, if there are any that do."""
+    Args:
+        simulator: In time.
+        values: As of `settled`.
+        allowed: As of `settled`.
+        rounds: How often steps are chosen at most.
+        instead: Explicit steps that do, if there are any: implicit ones must take less time than these.
+    """
     implicit, work = _implicitly(simulator), _Work()
     many = MANY if instead is None else instead.num_steps // DEARER
     here = None if implicit is None or implicit.num_steps > many else _through(implicit, values, work)

@@ -217,6 +217,7 @@ def unexplained(d: Any) -> list[str]:
         size = with_unit(f"{float(d.missing.rate.max() - d.missing.rate.min()):.3g}", d.missing.unit)
         along = "from run to run" if d.missing.driver == RUN else f"against {d.missing.driver}"
         along += "" if d.missing.run is None else f" in run {d.missing.run}"
+        along += " alone" if d.where and d.where[0].together else ""
         what = "part of the rate of" if d.missing.kind == "equation" else "change of"
         parts.append(
             f"The missing {what} {d.missing.target} {along} spans {size} from its lowest to its highest value, beside "

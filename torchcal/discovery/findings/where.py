@@ -11,7 +11,7 @@ from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.places import Place
 from torchcal.discovery.misfit.steps import SURER, in_one_run, stepwise
-from torchcal.discovery.misfit.structure import places_together
+from torchcal.discovery.misfit.structure import place_together
 from torchcal.discovery.records import Location, MissingRate, NeededShift, Table
 from torchcal.discovery.verdicts.explain import removed
 from torchcal.errors import TorchcalError
@@ -35,7 +35,7 @@ PART = 0.5
 #: Share of a place up to which a name hardly acts there.
 MEETS = 0.25
 #: Log evidence, and share of the misfit, by which a change along two conditions together must do better than any along
-#: one to be told.
+#: one, and than the sum of one along each, to be told.
 LIKELIER, MORE = 5.0, 0.05
 #: Log evidence from which on a place is listed, and how many are.
 LEAST_EVIDENCE, LISTED = 2.0, 8
@@ -180,14 +180,17 @@ def locate(
 
 
 def _together(search: Search, rows: Sequence[Location]) -> list[Location]:
-    """A change along two conditions together, where no other place tells as much and no term says better where."""
+    """A change along two conditions together, where no other place tells as much, nor one along each of the two, and no
+    term says better where."""
     if search.problem.in_time or any(row.terms for row in rows):
         return []
-    for place in places_together(search.residual)[:1]:
-        known = max((row.evidence for row in rows), default=LEAST_EVIDENCE)
-        share = max((row.share for row in rows), default=0.0)
-        if place.evidence > known + LIKELIER and place.share > share + MORE:
-            return [Location(*_key(place), (), place.share, place.evidence, together=True)]
+    found = place_together(search.residual, search.structure.channels)
+    if found is None:
+        return []
+    place, each = found
+    known = [(other.evidence, other.share) for other in rows] + [(each.evidence, each.share)]
+    if all(place.evidence > evidence + LIKELIER and place.share > share + MORE for evidence, share in known):
+        return [Location(*_key(place), (), place.share, place.evidence, together=True)]
     return []
 
 

@@ -160,7 +160,8 @@ def _calm(found: Fitted, allowed: Tensor, states: Tensor, rounds: int) -> Fitted
         return found
     calm = shortened(simulator, found.values[None], states, few=True)
     again = _implicit(found, allowed, rounds, instead=calm)
-    if again is not None:
+    # Coarser steps than those at hand have to do where the fit ends, too.
+    if again is not None and (calm is None or bool(((halved(again) - again.y).abs() <= allowed).all())):
         return again
     calm = calm or shortened(simulator, found.values[None], states)
     return found if calm is None else _in_steps_of(calm, found) or found
@@ -169,8 +170,8 @@ def _calm(found: Fitted, allowed: Tensor, states: Tensor, rounds: int) -> Fitted
 def _implicit(
     found: Fitted, allowed: Tensor, rounds: int, instead: Trajectories | None = None
 ) -> Fitted | None:
-    """The fit with implicit steps; None where these do not settle either, there or where the fit ends, or take more
-    time than explicit ones ``instead`` of which they are tried."""
+    """The fit with implicit steps; None where these do not settle either, there or where the fit ends. Where there are
+    explicit steps that do, in whose stead they would be taken, they must take less time than these."""
     problem, simulator = found.problem, found.problem.simulator
     if not isinstance(simulator, Trajectories):
         return None

@@ -23,8 +23,9 @@ from torchcal.discovery.misfit.places import SIZES, Change, Place, evidence_of
 from torchcal.discovery.misfit.residual import Residual
 from torchcal.discovery.misfit.steps import Sudden
 from torchcal.discovery.misfit.waves import wave_places
+from torchcal.display import ITSELF
 
-__all__ = ["Rough", "Structure", "analyse", "evidences", "places_together", "responses_of", "together_of"]
+__all__ = ["Rough", "Structure", "analyse", "evidences", "place_together", "responses_of", "together_of"]
 
 #: Radial functions along time, and along any other driver: the evidence chooses how many.
 IN_TIME, ALONG = (12, 24, 48), (12, 24)
@@ -99,32 +100,60 @@ def responses_of(problem: Problem, available: Sequence[Channel]) -> list[_Look]:
 
 
 def together_of(problem: Problem, available: Sequence[Channel]) -> list[_Look]:
-    """Every output along every two of several conditions together: what depends on one may depend on the other too."""
+    """Every output along every two of several conditions, and itself, together: what depends on one may depend on the
+    other too."""
     found = []
-    for channel in available if not problem.in_time else ():
-        data = int((channel.matrix != 0).sum()) if channel.kind == "output" else 0
-        for (one, first), (other, second) in itertools.combinations(channel.drivers.items(), 2):
-            scales = [each.log() if Span.of(each, time=False).log else each for each in (first, second)]
-            distinct = [len(each.unique()) for each in scales]
-            parts = [
-                (_features(scales[0], a)[:, :, None] * _features(scales[1], b)[:, None]).flatten(1)
-                for a, b in TOGETHER
-                if a <= distinct[0] and b <= distinct[1] and DATA_EACH[1] * a * b <= data
-            ]
-            if parts:
-                found.append(_Look(channel, f"{one} and {other}", parts, channel.response(torch.cat(parts, dim=1))))
+    for channel, names in _pairs(problem, available):
+        parts = _products(channel, names)
+        if parts:
+            found.append(_Look(channel, " and ".join(names), parts, channel.response(torch.cat(parts, dim=1))))
     return found
 
 
-def places_together(residual: Residual) -> list[Place]:
-    """The likeliest smooth change of every output along every two conditions together, the likeliest of all first."""
-    problem, best = residual.found.problem, dict[int, Place]()
-    looks = together_of(problem, channels(problem, residual.found))
-    for key, look, change in _changes(residual, looks, residual.e[:, None]):
-        place = change.place(look.channel, look.driver, residual)
-        if key not in best or place.evidence > best[key].evidence:
-            best[key] = place
-    return sorted(best.values(), key=lambda place: -place.evidence)
+def _pairs(problem: Problem, available: Sequence[Channel]) -> list[tuple[Channel, tuple[str, str]]]:
+    """Every output of a static simulation with every two of its drivers."""
+    outputs = [channel for channel in available if channel.kind == "output" and not problem.in_time]
+    return [(channel, names) for channel in outputs for names in itertools.combinations(channel.drivers, 2)]
+
+
+def _products(channel: Channel, names: tuple[str, str]) -> list[Tensor]:
+    """Products ``(K, m)`` of radial functions along two drivers, fewer and more, as many as there are data for."""
+    data, scales = int((channel.matrix != 0).sum()), _scales(channel, names)
+    distinct = [len(each.unique()) for each in scales]
+    return [
+        (_features(scales[0], a)[:, :, None] * _features(scales[1], b)[:, None]).flatten(1)
+        for a, b in TOGETHER
+        if a <= distinct[0] and b <= distinct[1] and DATA_EACH[1] * a * b <= data
+    ]
+
+
+def _scales(channel: Channel, names: tuple[str, str]) -> list[Tensor]:
+    """The values of two drivers, their logarithms where these lie over decades."""
+    return [each.log() if Span.of(each, time=False).log else each for each in (channel.drivers[one] for one in names)]
+
+
+def place_together(residual: Residual, available: Sequence[Channel]) -> tuple[Place, Place] | None:
+    """The likeliest smooth change of an output along two conditions together, and the likeliest sum of one along each
+    of them; None where none is looked for."""
+    best: tuple[Place, Place] | None = None
+    for channel, names in _pairs(residual.found.problem, available):
+        if any(name.endswith(ITSELF) for name in names):
+            continue
+        each = torch.cat([_features(one, min(ALONG[0], len(one.unique()))) for one in _scales(channel, names)], dim=1)
+        both, driver = _products(channel, names), " and ".join(names)
+        product, apart = (_best_of(residual, channel, driver, parts) for parts in (both, [each]))
+        if product is not None and apart is not None and (best is None or product.evidence > best[0].evidence):
+            best = product, apart
+    return best
+
+
+def _best_of(residual: Residual, channel: Channel, driver: str, parts: list[Tensor]) -> Place | None:
+    """The likeliest change of a channel that some functions of its drivers give, each ``(K, m)``."""
+    if not parts:
+        return None
+    look = _Look(channel, driver, parts, channel.response(torch.cat(parts, dim=1)))
+    places = [change.place(channel, driver, residual) for *_, change in _changes(residual, [look], residual.e[:, None])]
+    return max(places, key=lambda place: place.evidence, default=None)
 
 
 def _counts(problem: Problem, data: int, driver: str) -> list[int]:

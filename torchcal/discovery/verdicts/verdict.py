@@ -331,9 +331,10 @@ def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) 
             worth = [m for m in physical if m.window is None and not m.note and _is_worth(decision, m)]
             nested = [m for m in worth if m not in holding and m.content > best.content]
             more = [m for m in worth if m in holding and best.window is not None and len(m.names) > len(best.names)]
-            rivals = [m for m in physical if m not in holding and _is_worth(decision, m) and not m.note]
-            rivals = [m for m in rivals if m not in nested and decision.probability[id(m)] > decision.none]
-            others = sorted([*more, *nested, *rivals], key=lambda m: -decision.probability[id(m)])
+            others = sorted(
+                [*more, *nested, *_rivals(decision, [m for m in physical if m not in holding and m not in nested])],
+                key=lambda m: -decision.probability[id(m)],
+            )
             decision.tied_models = [best, *others]
             decision.tied = [list(names) for names in dict.fromkeys(m.names for m in decision.tied_models)]
         if decision.doubt or not nested or _none_is_likely(decision, physical):
@@ -341,6 +342,17 @@ def _name(search: Search, decision: Decision, best: Model, mask: Tensor | None) 
         return
     decision.verdict, decision.best = "named", shown
     prove(search, decision, mask)
+
+
+def _rivals(decision: Decision, others: Sequence[Model]) -> list[Model]:
+    """Of some models those that are likely, and likelier than something unknown, without those that are another one of
+    these in a window, or add to it."""
+    likely = [m for m in others if not m.note and _is_worth(decision, m)]
+    found: list[Model] = []
+    for model in sorted(likely, key=lambda m: -decision.probability[id(m)]):
+        if decision.probability[id(model)] > decision.none and not any({*m.names} <= {*model.names} for m in found):
+            found.append(model)
+    return found
 
 
 def _wherever(search: Search, best: Model) -> Model:
