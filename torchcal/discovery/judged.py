@@ -154,9 +154,9 @@ def _no_noise_of_each(search: Search) -> bool:
 
 
 def _explained_by_place(search: Search) -> bool:
-    """Whether an unknown change in one place leaves no more than the noise that was given; and of few data, of which
-    some change leaves hardly anything, is likelier than a larger noise."""
-    places, n, chi2 = search.structure.places, search.problem.n, search.base.chi2
+    """Whether an unknown change in one place, or along two conditions, leaves no more than the noise that was given;
+    and of few data, of which some change leaves hardly anything, is likelier than a larger noise."""
+    places, n, chi2 = [*search.structure.places, *(search.structure.together or ())], search.problem.n, search.base.chi2
     freedom = max(n - len(search.base.free), 1)
     share = max((place.share for place in places), default=0.0)
     left = 1 + (1 - share) * (chi2 / freedom - 1)

@@ -11,7 +11,6 @@ from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.places import Place
 from torchcal.discovery.misfit.steps import SURER, in_one_run, stepwise
-from torchcal.discovery.misfit.structure import place_together
 from torchcal.discovery.records import Location, MissingRate, NeededShift, Table
 from torchcal.discovery.verdicts.explain import removed
 from torchcal.errors import TorchcalError
@@ -184,10 +183,9 @@ def _together(search: Search, rows: Sequence[Location]) -> list[Location]:
     term says better where."""
     if search.problem.in_time or any(row.terms for row in rows):
         return []
-    found = place_together(search.residual, search.structure.channels)
-    if found is None:
+    if search.structure.together is None:
         return []
-    place, each = found
+    place, each = search.structure.together
     known = [(other.evidence, other.share) for other in rows] + [(each.evidence, each.share)]
     if all(place.evidence > evidence + LIKELIER and place.share > share + MORE for evidence, share in known):
         return [Location(*_key(place), (), place.share, place.evidence, together=True)]

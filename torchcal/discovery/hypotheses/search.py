@@ -150,7 +150,7 @@ class Search:
         nulls = [self.screening.null, self.structure.null_best, local_null]
         seen = [
             max((self.screening.score(i) for i in range(len(self.candidates))), default=0.0),
-            max((p.evidence for p in self.structure.places if p.channel.kind in self.problem.kinds), default=0.0),
+            self.structure.seen,
             max((w.z for w in self.local), default=0.0),
         ]
         self.p_detect, self.least = _joint(nulls, seen)

@@ -25,7 +25,7 @@ from torchcal.discovery.misfit.steps import Sudden
 from torchcal.discovery.misfit.waves import wave_places
 from torchcal.display import ITSELF
 
-__all__ = ["Rough", "Structure", "analyse", "evidences", "place_together", "responses_of", "together_of"]
+__all__ = ["Rough", "Structure", "analyse", "evidences", "responses_of", "together_of"]
 
 #: Radial functions along time, and along any other driver: the evidence chooses how many.
 IN_TIME, ALONG = (12, 24, 48), (12, 24)
@@ -40,13 +40,18 @@ class Structure:
     """What an analysis of a residual found.
 
     Attributes:
-        places: By falling evidence.
+        places: Along one driver each, by falling evidence.
+        together: The likeliest smooth change of an output along two conditions together, and the likeliest sum of one
+            along each of them; None where none is looked for.
+        seen: The largest evidence of what counts for the test.
         p_value: Probability of so much structure by noise alone.
         channels: All of them.
         null_best: Largest evidence in each simulated residual.
     """
 
     places: list[Place]
+    together: tuple[Place, Place] | None
+    seen: float
     p_value: float
     channels: list[Channel]
     null_best: Tensor
@@ -132,28 +137,42 @@ def _scales(channel: Channel, names: tuple[str, str]) -> list[Tensor]:
     return [each.log() if Span.of(each, time=False).log else each for each in (channel.drivers[one] for one in names)]
 
 
-def place_together(residual: Residual, available: Sequence[Channel]) -> tuple[Place, Place] | None:
-    """The likeliest smooth change of an output along two conditions together, and the likeliest sum of one along each
-    of them; None where none is looked for."""
+def _together(
+    residual: Residual, available: Sequence[Channel], residuals: Tensor
+) -> tuple[tuple[Place, Place] | None, list[Tensor]]:
+    """As `Structure.together`, and the evidence of every change along two conditions in each simulated residual."""
     best: tuple[Place, Place] | None = None
+    nulls: list[Tensor] = []
     for channel, names in _pairs(residual.found.problem, available):
         if any(name.endswith(ITSELF) for name in names):
             continue
         each = torch.cat([_features(one, min(ALONG[0], len(one.unique()))) for one in _scales(channel, names)], dim=1)
-        both, driver = _products(channel, names), " and ".join(names)
-        product, apart = (_best_of(residual, channel, driver, parts) for parts in (both, [each]))
-        if product is not None and apart is not None and (best is None or product.evidence > best[0].evidence):
-            best = product, apart
-    return best
+        product, apart = (
+            _best_of(residual, channel, " and ".join(names), parts, residuals)
+            for parts in (_products(channel, names), [each])
+        )
+        if product is None or apart is None:
+            continue
+        nulls += [product[1], apart[1]]
+        if best is None or product[0].evidence > best[0].evidence:
+            best = product[0], apart[0]
+    return best, nulls
 
 
-def _best_of(residual: Residual, channel: Channel, driver: str, parts: list[Tensor]) -> Place | None:
-    """The likeliest change of a channel that some functions of its drivers give, each ``(K, m)``."""
+def _best_of(
+    residual: Residual, channel: Channel, driver: str, parts: list[Tensor], residuals: Tensor
+) -> tuple[Place, Tensor] | None:
+    """The likeliest change of a channel that some functions of its drivers give, each ``(K, m)``, and the largest
+    evidence of any in each simulated residual; None where the base's parameters make up for all of them."""
     if not parts:
         return None
     look = _Look(channel, driver, parts, channel.response(torch.cat(parts, dim=1)))
-    places = [change.place(channel, driver, residual) for *_, change in _changes(residual, [look], residual.e[:, None])]
-    return max(places, key=lambda place: place.evidence, default=None)
+    changes = [change for *_, change in _changes(residual, [look], residuals)]
+    if not changes:
+        return None
+    null = torch.stack([evidence_of(change.null, change.s)[0] for change in changes]).amax(0)
+    places = [change.place(channel, driver, residual) for change in changes]
+    return max(places, key=lambda place: place.evidence), null
 
 
 def _counts(problem: Problem, data: int, driver: str) -> list[int]:
@@ -254,9 +273,11 @@ def analyse(residual: Residual, *, every: bool = False) -> Structure:
         if place.channel.kind in kinds:
             nulls[-len(places)] = simulated
     places.sort(key=lambda place: -place.evidence)
-    if not nulls:
-        return Structure(places, 1.0, available, torch.zeros(1, dtype=torch.float64))
-    null = torch.stack(list(nulls.values())).amax(0)
-    seen = max((p.evidence for p in places if p.channel.kind in kinds), default=0.0)
+    together, more = _together(residual, available, both)
+    if not nulls and not more:
+        return Structure(places, together, 0.0, 1.0, available, torch.zeros(1, dtype=torch.float64))
+    null = torch.stack([*nulls.values(), *more]).amax(0)
+    counting = [p.evidence for p in places if p.channel.kind in kinds] + [p.evidence for p in together or ()]
+    seen = max(counting, default=0.0)
     p_value = (1.0 + float((null >= seen).sum())) / (1.0 + len(null))
-    return Structure(places, p_value, available, null)
+    return Structure(places, together, seen, p_value, available, null)

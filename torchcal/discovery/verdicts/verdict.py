@@ -67,7 +67,7 @@ def _unknown(search: Search, structure: Structure, *, calibrated: bool) -> float
     Calibrated, it is held against what noise alone gives: at most −1/(e p ln p) for a probability p (Sellke, Bayarri &
     Berger 2001), and beyond the largest simulated value the surplus.
     """
-    places = [place.evidence for place in _counting(search, structure)]
+    places = [place.evidence for place in (*_counting(search, structure), *(structure.together or ()))]
     if not places:
         return -math.inf
     seen = max(places)
