@@ -4,6 +4,7 @@ Every tolerance follows from the number of seeds: five standard errors, or the b
 """
 
 import dataclasses
+import itertools
 import math
 import re
 import types
@@ -1037,7 +1038,7 @@ def test_a_change_of_few_data_is_no_explanation_where_a_larger_noise_is_likelier
     places = [types.SimpleNamespace(evidence=one, share=share) for one in (evidence, 3.0, 1.0)]
     base = types.SimpleNamespace(chi2=chi2, free=[0, 1])
     search = types.SimpleNamespace(
-        structure=types.SimpleNamespace(places=places), base=base, problem=types.SimpleNamespace(n=n)
+        structure=types.SimpleNamespace(places=places, together=None), base=base, problem=types.SimpleNamespace(n=n)
     )
     assert _explained_by_place(search) is explained
 
@@ -1171,6 +1172,24 @@ def test_what_one_of_two_conditions_does_is_not_told_of_both(change):
     d = tc.diagnose(base, tc.Recording(x={"T": TEMPERATURE, "rate": RATE}, y=y), [], progress=False)
     assert d.verdict == "unexplained"
     assert not any(row.together for row in d.where)
+
+
+@pytest.mark.parametrize(("noise", "seen"), [(0.02, 8), (None, 6)])
+def test_what_depends_on_two_conditions_together_is_seen_where_it_is_no_larger_than_noise(noise, seen):
+    """Their product, at kappa = 1 where the sd is given and 1.5 where not: there is nothing along either alone."""
+    base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x["T"] + p["c"] * x["rate"].log(), [
+        tc.Parameter(name) for name in "abc"
+    ])  # fmt: skip
+    clean = 0.5 + 0.02 * (TEMPERATURE - 320) + 0.1 * np.log(RATE)
+    change = np.sin((TEMPERATURE - 320) / 30) * np.sin(np.log(RATE))
+    size = 0.02 * (1.0 if noise else 1.5) / np.sqrt(np.mean(change**2))
+    verdicts = {0.0: [], size: []}
+    for (factor, found), seed in itertools.product(verdicts.items(), range(8)):
+        y = clean + factor * change + 0.02 * np.random.default_rng(seed).standard_normal(72)
+        recording = tc.Recording(x={"T": TEMPERATURE, "rate": RATE}, y=y, noise=noise)
+        found.append(tc.diagnose(base, recording, [], progress=False).verdict)
+    assert verdicts[size].count("unexplained") >= seen
+    assert verdicts[0.0].count("consistent") == 8
 
 
 def test_a_change_along_two_conditions_is_told_of_these_and_not_of_what_is_read(tmp_path):

@@ -302,7 +302,7 @@ def test_what_swings_a_parameter_speaks_for_something_unknown():
 
     places = [place("parameter", 204.0, 30.6), place("parameter", 190.0), place("equation", 181.0)]
     search = SimpleNamespace(problem=SimpleNamespace(kinds=("equation", "output")))
-    found = verdict._unknown(search, SimpleNamespace(places=places), calibrated=False)
+    found = verdict._unknown(search, SimpleNamespace(places=places, together=None), calibrated=False)
     assert found == pytest.approx(204.0 - np.log(2))
 
 
