@@ -1152,7 +1152,7 @@ def test_what_bends_along_the_sweeps_of_a_grid_is_no_noise_that_grows():
         assert d.verdict == "unexplained"
         assert "growing" not in str(d)
         first, *others = d.where
-        assert (first.target, first.driver, first.spans, first.together) == ("y", "T and rate", (), True)
+        assert (first.target, first.driver, first.spans, first.together) == ("y", "T and rate", (), ("T", "rate"))
         assert first.share > 0.9
         assert all(row.share < 0.8 and not row.together for row in others)
         assert "varies with T and rate together: a smooth" in " ".join(str(d).split())
@@ -1200,10 +1200,12 @@ def test_a_change_along_two_conditions_is_told_of_these_and_not_of_what_is_read(
     y = 0.05 * (TEMPERATURE - 320) + 0.3 * np.log(RATE) + 0.2 * np.sin((TEMPERATURE - 320) / 12 + np.log(RATE))
     y = y + 0.02 * np.random.default_rng(0).standard_normal(72)
     d = tc.diagnose(base, tc.Recording(x={"T": TEMPERATURE, "rate": RATE}, y=y), [], progress=False)
-    assert (d.where[0].driver, d.where[0].together) == ("T and rate", True)
+    assert (d.where[0].driver, d.where[0].together) == ("T and rate", ("T", "rate"))
     assert "The missing change" not in str(d) or f"against {d.missing.driver} alone spans" in " ".join(str(d).split())
     d.report(tmp_path / "page.html")
-    assert "both together" in (tmp_path / "page.html").read_text()
+    page = (tmp_path / "page.html").read_text()
+    assert "both together" in page
+    assert "Mismatch along T and rate together" in page
 
 
 def test_noise_that_grows_along_the_sweeps_of_a_grid_is_told():

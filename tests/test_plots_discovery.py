@@ -1134,3 +1134,22 @@ def test_colours_differ_in_grey(pair):
 def test_what_has_not_what_is_drawn_is_told(draw, told, item):
     with pytest.raises(DomainError, match=rf"Expected (each of )?{told}: .* of a diagnosis.*Got (int|list|str)"):
         draw(item)
+
+
+def test_residuals_over_two_conditions_point_to_the_side_of_the_data():
+    a, b = (one.flatten() for one in torch.meshgrid(torch.arange(3.0), torch.logspace(0, 3, 4), indexing="ij"))
+    y = torch.zeros(12, dtype=torch.float64)
+    y[0], y[5], y[11] = 1.0, -0.5, float("nan")
+    recording = Recording(x={"a": a, "b": b}, y={"y": y}, noise=0.1, missing=True)
+    aside = torch.arange(12) == 7
+    ax = plots.joint_map(recording, torch.full_like(y, 0.05), ("a", "b"), set_aside=aside)
+    drawn = {one.get_label(): one.get_offsets().tolist() for one in ax.collections}
+    assert drawn["data above the base"] == [[0.0, 1.0]]
+    assert drawn["data below the base"] == [[1.0, pytest.approx(10.0)]]
+    assert len(drawn["data below the base, within 2 noise sd"]) == 8
+    assert ax.lines[0].get_xydata().tolist() == [[1.0, pytest.approx(1000.0)]]
+    assert (ax.get_xscale(), ax.get_yscale()) == ("linear", "log")
+    assert "0.95" in ax.get_title(loc="right")
+    for wrong, options in ((("a", "c"), {}), (("a", "b"), {"output": "z"})):
+        with pytest.raises(DomainError, match="check the spelling"):
+            plots.joint_map(recording, torch.zeros_like(y), wrong, **options)

@@ -224,7 +224,7 @@ class Location:
         also: Kinds and targets of what else some terms together act on: what varies with the driver is then what they
             do together.
         at: The levels of another condition at which it changes alone, in words; empty where it does at all.
-        together: Whether it varies with two conditions together, ``"a and b"``, more than with each of them by itself.
+        together: The two conditions where it varies with both together, more than with each by itself; else none.
     """
 
     kind: str
@@ -240,7 +240,7 @@ class Location:
     run: int | None = None
     also: tuple[tuple[str, str], ...] = ()
     at: str = ""
-    together: bool = False
+    together: tuple[str, ...] = ()
 
     @property
     def called(self) -> str:

@@ -188,7 +188,7 @@ def _together(search: Search, rows: Sequence[Location]) -> list[Location]:
     place, each = search.structure.together
     known = [(other.evidence, other.share) for other in rows] + [(each.evidence, each.share)]
     if all(place.evidence > evidence + LIKELIER and place.share > share + MORE for evidence, share in known):
-        return [Location(*_key(place), (), place.share, place.evidence, together=True)]
+        return [Location(*_key(place), (), place.share, place.evidence, together=place.together)]
     return []
 
 

@@ -39,6 +39,7 @@ class Place:
         period: Of an oscillation, in units of the driver; None of any other change.
         edges: Of a change in steps, where these are.
         run: Of a change in one run of several alone, which, counted from 0.
+        together: Of a change along two conditions, these.
     """
 
     channel: Channel
@@ -50,6 +51,7 @@ class Place:
     period: float | None = None
     edges: tuple[float, ...] = ()
     run: int | None = None
+    together: tuple[str, ...] = ()
 
 
 def evidence_of(u: Tensor, s: Tensor) -> tuple[Tensor, Tensor]:

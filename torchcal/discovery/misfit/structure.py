@@ -5,6 +5,7 @@ every channel against every driver, with oscillations of every output, and of ev
 Probabilities come from simulated noise that went through the same projection.
 """
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -148,8 +149,7 @@ def _together(
             continue
         each = torch.cat([_features(one, min(ALONG[0], len(one.unique()))) for one in _scales(channel, names)], dim=1)
         product, apart = (
-            _best_of(residual, channel, " and ".join(names), parts, residuals)
-            for parts in (_products(channel, names), [each])
+            _best_of(residual, channel, names, parts, residuals) for parts in (_products(channel, names), [each])
         )
         if product is None or apart is None:
             continue
@@ -160,19 +160,20 @@ def _together(
 
 
 def _best_of(
-    residual: Residual, channel: Channel, driver: str, parts: list[Tensor], residuals: Tensor
+    residual: Residual, channel: Channel, names: tuple[str, str], parts: list[Tensor], residuals: Tensor
 ) -> tuple[Place, Tensor] | None:
-    """The likeliest change of a channel that some functions of its drivers give, each ``(K, m)``, and the largest
+    """The likeliest change of a channel that some functions of two drivers give, each ``(K, m)``, and the largest
     evidence of any in each simulated residual; None where the base's parameters make up for all of them."""
     if not parts:
         return None
+    driver = " and ".join(names)
     look = _Look(channel, driver, parts, channel.response(torch.cat(parts, dim=1)))
     changes = [change for *_, change in _changes(residual, [look], residuals)]
     if not changes:
         return None
     null = torch.stack([evidence_of(change.null, change.s)[0] for change in changes]).amax(0)
     places = [change.place(channel, driver, residual) for change in changes]
-    return max(places, key=lambda place: place.evidence), null
+    return dataclasses.replace(max(places, key=lambda place: place.evidence), together=names), null
 
 
 def _counts(problem: Problem, data: int, driver: str) -> list[int]:

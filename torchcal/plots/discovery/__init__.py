@@ -10,7 +10,7 @@ from torchcal.plots.discovery.limits import detection_limits
 from torchcal.plots.discovery.overview import FigurePart, discovery_overview, figure_parts
 from torchcal.plots.discovery.pieces import ACCEPTED, BASE, HELD_OUT, MOST_POINTS
 from torchcal.plots.discovery.proof import held_out, held_out_scores
-from torchcal.plots.discovery.residuals import driver_values, residual_map
+from torchcal.plots.discovery.residuals import driver_values, joint_map, residual_map
 from torchcal.plots.discovery.shifts import missing_rate, needed_shift
 
 __all__ = [
@@ -26,6 +26,7 @@ __all__ = [
     "figure_parts",
     "held_out",
     "held_out_scores",
+    "joint_map",
     "missing_rate",
     "needed_shift",
     "ranking",

@@ -16,7 +16,7 @@ from torchcal.plots.discovery.limits import detection_limits
 from torchcal.plots.discovery.panels import panels_of
 from torchcal.plots.discovery.pieces import Look, as_numbers, draw_figure_key, join_terms, plain
 from torchcal.plots.discovery.proof import held_out, held_out_scores
-from torchcal.plots.discovery.residuals import driver_values, residual_map
+from torchcal.plots.discovery.residuals import driver_values, joint_map, residual_map
 from torchcal.plots.discovery.shifts import missing_rate, needed_shift
 from torchcal.plots.selection import conditions_of
 
@@ -180,7 +180,20 @@ def figure_parts(diagnosis: Any) -> list[FigurePart]:
             f" Shaded: where the {_change(best)} is largest. What that does to the output may be largest elsewhere: "
             "later, or where no calibrated parameter takes it up."
         )
-    parts.append(FigurePart("residuals", name, said, mismatch, 6.0, 3.8))
+    both = tuple(getattr(where[0], "together", ())) if where else ()
+
+    def both_ways(fig: Any) -> None:
+        joint_map(
+            recording, base, both, output=where[0].target, noise=diagnosis.noise, units=units,
+            set_aside=getattr(diagnosis, "set_aside", None), ax=fig.subplots(),
+        )  # fmt: skip
+
+    if both:
+        by = " and ".join(plain(one, TITLED, middle=True) for one in both)
+        said = f"What the base leaves of the data, over {' and '.join(both)}: triangles point to the side of the data."
+        parts.append(FigurePart("residuals", f"Mismatch along {by} together", said, both_ways, 6.0, 3.8))
+    else:
+        parts.append(FigurePart("residuals", name, said, mismatch, 6.0, 3.8))
 
     hypotheses = list(diagnosis.ranking)
     if hypotheses:

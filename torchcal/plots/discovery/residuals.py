@@ -222,6 +222,80 @@ def residual_map(
     return ax
 
 
+def joint_map(
+    recording: Recording,
+    before: Any,
+    conditions: tuple[str, str],
+    *,
+    output: str | None = None,
+    noise: Any = None,
+    set_aside: Any = None,
+    ax: "Axes | None" = None,
+    units: Mapping[str, str] | None = None,
+    labels: Mapping[str, str] | None = None,
+) -> "Axes":
+    """Residuals of the base over two conditions: triangles that point up where the data are above it, down where below.
+
+    Their height goes with the residual; those within ±2 noise sd are open.
+
+    Args:
+        recording: The data.
+        before: Fitted outputs of the base, ``(n_total,)``, or anything that has them as ``prediction``.
+        conditions: What is on the abscissa and on the ordinate.
+        output: The first by default.
+        noise: As of `residual_map`.
+        set_aside: Mask ``(n_total,)`` of data that were taken for outliers: crosses.
+        ax: Where to draw; a new figure by default.
+        units: Units by name, beside the recording's.
+        labels: How to write names on the axes, by name.
+
+    Returns:
+        The axes.
+
+    Raises:
+        DomainError: If the output or a condition does not exist.
+        ShapeError: If the fit and the recording do not fit.
+    """
+    look = Look(units={**recording.units, **(units or {})}, labels=labels or {})
+    columns = conditions_of(recording.x, recording)
+    for name in conditions:
+        if name not in columns:
+            raise DomainError(f"Expected conditions among {list(columns)}. Got {name!r} (check the spelling).")
+    output = recording.outputs[0] if output is None else output
+    if output not in recording.outputs:
+        raise DomainError(f"Expected output among {list(recording.outputs)}. Got {output!r} (check the spelling).")
+    part, mask = places_of(recording, output), as_mask(set_aside, recording)
+    off = (recording.y.cpu().numpy() - curves_of(recording, before, None, None)[0].values)[part]
+    a, b = (columns[name] for name in conditions)
+    aside = np.zeros(len(off), dtype=bool) if mask is None else mask[part]
+    shown = np.isfinite(off) & np.isfinite(a) & np.isfinite(b) & ~aside
+    ax = style.new_axes(ax)
+    sd = _noise_of(noise, recording, output)
+    small = np.zeros(len(off), dtype=bool) if sd is None else np.abs(off) <= 2 * sd
+    largest = float(np.abs(off[shown]).max()) if shown.any() else 1.0
+    area = 6.0 + 110.0 * (np.abs(off) / (largest or 1.0)) ** 2
+    for above, marker, color, word in ((True, "^", style.MAP, "above"), (False, "v", style.POSTERIOR, "below")):
+        for open_ in (False, True):
+            rows = shown & ((off > 0) == above) & (small == open_)
+            if rows.any():
+                ax.scatter(
+                    a[rows], b[rows], s=area[rows], marker=marker, linewidths=0.9, edgecolors=color,
+                    facecolors="none" if open_ else color, zorder=3,
+                    label=f"data {word} the base" + (", within 2 noise sd" if open_ else ""),
+                )  # fmt: skip
+    if (crossed := aside & np.isfinite(a) & np.isfinite(b)).any():
+        ax.plot(a[crossed], b[crossed], "x", ms=5, mew=1.1, color="0.25", zorder=5, label="set aside as outliers")
+    for values, scale in ((a, ax.set_xscale), (b, ax.set_yscale)):
+        if is_log(values):
+            scale("log")
+    finish(ax, look.axis(conditions[0]), look.axis(conditions[1]), "")
+    ax.margins(0.08)
+    unit = look.unit(output)
+    ax.set_title(f"largest residual {largest:.3g}{f' {unit}' if unit else ''}", fontsize="small", loc="right")
+    draw_key(ax)
+    return ax
+
+
 def _widened(spans: Sequence[tuple[float, float]], levels: np.ndarray) -> list[tuple[float, float]]:
     """Spans of a single level of the driver, which have no width, half way to the next levels."""
     steps = np.sqrt(levels[1:] * levels[:-1]) if is_log(levels) else (levels[1:] + levels[:-1]) / 2
