@@ -1192,6 +1192,21 @@ def test_what_depends_on_two_conditions_together_is_seen_where_it_is_no_larger_t
     assert verdicts[0.0].count("consistent") == 8
 
 
+def test_two_conditions_are_looked_at_together_among_few_data_and_at_two_levels_and_not_where_one_is_constant():
+    base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x["u"] + p["c"] * x["v"], [tc.Parameter(one) for one in "abc"])
+    rng = np.random.default_rng(0)
+    u, v, two, e = rng.uniform(0, 1, 40), rng.uniform(0, 1, 40), rng.integers(0, 2, 40), rng.standard_normal(40)
+    y = 1 + u - v + 0.05 * e
+    for x, change, told in (
+        ({"u": u, "v": v}, 0.5 * np.sin(5 * u) * np.sin(5 * v), ("u", "v")),
+        ({"u": u, "v": v, "k": two}, 0.3 * (two - 0.5) * np.sin(6 * u), ("u", "k")),
+        ({"u": u, "v": v, "k": np.ones(40)}, 0.0, ()),
+    ):
+        d = tc.diagnose(base, tc.Recording(x=x, y=y + change, noise=0.05), [], progress=False)
+        assert d.verdict == ("unexplained" if told else "consistent")
+        assert (d.where[0].together if told else ()) == told
+
+
 def test_a_change_along_two_conditions_is_told_of_these_and_not_of_what_is_read(tmp_path):
     """The output and one of them say as much as the two: but those are what an experiment sets."""
     base = tc.Simulator(lambda x, p: p["a"] + p["b"] * x["T"] + p["c"] * x["rate"].log(), [

@@ -8,7 +8,7 @@ Probabilities come from simulated noise that went through the same projection.
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -30,8 +30,8 @@ __all__ = ["Rough", "Structure", "analyse", "evidences", "responses_of", "togeth
 
 #: Radial functions along time, and along any other driver: the evidence chooses how many.
 IN_TIME, ALONG = (12, 24, 48), (12, 24)
-#: The same along two conditions together.
-TOGETHER = ((4, 4), (3, 8), (8, 3), (6, 6))
+#: The same along two conditions together, and of few data, where these are looked for beside noise that is known.
+TOGETHER, FEW_TOGETHER = ((4, 4), (3, 8), (8, 3), (6, 6)), ((2, 2), (3, 3))
 #: Of more functions than the fewest, how many data there must be for each, in time and among conditions.
 DATA_EACH = (4, 3)
 
@@ -110,7 +110,9 @@ def together_of(problem: Problem, available: Sequence[Channel]) -> list[_Look]:
     other too."""
     found = []
     for channel, names in _pairs(problem, available):
-        parts = _products(channel, names)
+        scales = _scales(channel, names)
+        distinct = [len(each.unique()) for each in scales]
+        parts = _products(channel, scales, [(a, b) for a, b in TOGETHER if a <= distinct[0] and b <= distinct[1]])
         if parts:
             found.append(_Look(channel, " and ".join(names), parts, channel.response(torch.cat(parts, dim=1))))
     return found
@@ -122,14 +124,13 @@ def _pairs(problem: Problem, available: Sequence[Channel]) -> list[tuple[Channel
     return [(channel, names) for channel in outputs for names in itertools.combinations(channel.drivers, 2)]
 
 
-def _products(channel: Channel, names: tuple[str, str]) -> list[Tensor]:
-    """Products ``(K, m)`` of radial functions along two drivers, fewer and more, as many as there are data for."""
-    data, scales = int((channel.matrix != 0).sum()), _scales(channel, names)
-    distinct = [len(each.unique()) for each in scales]
+def _products(channel: Channel, scales: Sequence[Tensor], counts: Iterable[tuple[int, int]]) -> list[Tensor]:
+    """Products ``(K, m)`` of so many radial functions along two drivers, where there are data for as many."""
+    data = int((channel.matrix != 0).sum())
     return [
         (_features(scales[0], a)[:, :, None] * _features(scales[1], b)[:, None]).flatten(1)
-        for a, b in TOGETHER
-        if a <= distinct[0] and b <= distinct[1] and DATA_EACH[1] * a * b <= data
+        for a, b in counts
+        if DATA_EACH[1] * a * b <= data
     ]
 
 
@@ -145,11 +146,15 @@ def _together(
     best: tuple[Place, Place] | None = None
     nulls: list[Tensor] = []
     for channel, names in _pairs(residual.found.problem, available):
-        if any(name.endswith(ITSELF) for name in names):
+        scales = _scales(channel, names)
+        distinct = [len(each.unique()) for each in scales]
+        if any(name.endswith(ITSELF) for name in names) or min(distinct) < 2:
             continue
-        each = torch.cat([_features(one, min(ALONG[0], len(one.unique()))) for one in _scales(channel, names)], dim=1)
+        counts = dict.fromkeys((min(a, distinct[0]), min(b, distinct[1])) for a, b in (*FEW_TOGETHER, *TOGETHER))
+        each = torch.cat([_features(one, min(ALONG[0], n)) for one, n in zip(scales, distinct, strict=True)], dim=1)
         product, apart = (
-            _best_of(residual, channel, names, parts, residuals) for parts in (_products(channel, names), [each])
+            _best_of(residual, channel, names, parts, residuals)
+            for parts in (_products(channel, scales, counts), [each])
         )
         if product is None or apart is None:
             continue

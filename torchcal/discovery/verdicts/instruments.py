@@ -26,9 +26,9 @@ __all__ = [
 FALL, ROUNDING = 2.0, 1e-3
 #: Variation that an instrument may add, in that of what it measures: with more it is another model of the thing.
 ADDED = 1.0
-#: Share of what the true value varies by that an instrument shows at least, beside other terms, at half of the data:
+#: Share of what the true value varies by that an instrument shows at least, beside other terms, at so many of the data:
 #: alone it may be set to another range, and what saturates shows less beyond some value.
-SHOWN = 0.4
+SHOWN, AT_MOST = 0.4, 2 / 3
 #: Share of the range of the true values by which it is looked at beyond them.
 BEYOND = 0.2
 #: Noise sd, together, by which a reading must leave a straight line at the recorded values, but for so many of them.
@@ -170,7 +170,8 @@ def no_instrument(search: Search, model: Model) -> str:
             drifts = curve or (problem.in_time and reading.is_of_value(and_time=True))
             if drifts and float((shown - true[here]).std()) > ADDED * float(true[here].std()):
                 return f"By it the reading of {name} varies more by the instrument's error than by the true value."
-            if curve and len(model.candidate.terms) > 1 and float(_slope(reading, true[here]).median()) < SHOWN:
+            beside_others = curve and len(model.candidate.terms) > 1
+            if beside_others and float(_slope(reading, true[here]).quantile(AT_MOST)) < SHOWN:
                 return (
                     f"By it the reading of {name} shows less than {SHOWN:.0%} of what the true value varies by, as "
                     "that of hardly any instrument does."
