@@ -70,7 +70,7 @@ def located(term, *, inside=(), named=True):
              ("equation", "R"): 10.0}  # fmt: skip
     places = [Place(channel(*key), "t", evidence, 0.5, T, T) for key, evidence in kinds.items()]
     search = SimpleNamespace(
-        structure=SimpleNamespace(places=places), unnamed=None,
+        structure=SimpleNamespace(places=places, together=None), unnamed=None,
         problem=SimpleNamespace(in_time=True, recording=SimpleNamespace(outputs=("y",))),
     )
     model = SimpleNamespace(

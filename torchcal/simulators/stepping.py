@@ -40,9 +40,9 @@ GROWTH = 2.0
 #: Size of h λ from which on explicit steps may magnify what fades; steps on end that do, by which factor in log all
 #: together, until it matters; how many parameter values are looked at; and how often they are halved for that alone.
 UNSTABLE, ON_END, MAGNIFIED, LOOKED_AT, CALMING = 2.5, 3, 7.0, 4, 4
-#: Halvings for that up to which explicit steps take less time than as many implicit ones before; and the number of
-#: explicit steps that take the time of an implicit one, with derivatives (two states in four runs: 8, and 5 in a batch
-#: of eight; the more states, the more).
+#: Halvings for that up to which explicit steps take less time than implicit ones as long as those before; and how many
+#: explicit steps take the time of an implicit one, with derivatives (two states in four runs: 8, and 5 in a batch of
+#: eight; the more states, the more).
 FEW_HALVINGS, DEARER = 2, 6
 #: How many times as fast as at those values a fit may want what fades to be: where steps magnified it there, χ² would
 #: rise as at a bound that is none.

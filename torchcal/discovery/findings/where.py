@@ -181,9 +181,7 @@ def locate(
 def _together(search: Search, rows: Sequence[Location]) -> list[Location]:
     """A change along two conditions together, where no other place tells as much, nor one along each of the two, and no
     term says better where."""
-    if search.problem.in_time or any(row.terms for row in rows):
-        return []
-    if search.structure.together is None:
+    if search.structure.together is None or any(row.terms for row in rows):
         return []
     place, each = search.structure.together
     known = [(other.evidence, other.share) for other in rows] + [(each.evidence, each.share)]

@@ -167,9 +167,7 @@ def _calm(found: Fitted, allowed: Tensor, states: Tensor, rounds: int) -> Fitted
     return found if calm is None else _in_steps_of(calm, found) or found
 
 
-def _implicit(
-    found: Fitted, allowed: Tensor, rounds: int, instead: Trajectories | None = None
-) -> Fitted | None:
+def _implicit(found: Fitted, allowed: Tensor, rounds: int, instead: Trajectories | None = None) -> Fitted | None:
     """The fit with implicit steps; None where these do not settle either, there or where the fit ends. Where there are
     explicit steps that do, in whose stead they would be taken, they must take less time than these."""
     problem, simulator = found.problem, found.problem.simulator

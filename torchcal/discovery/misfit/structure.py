@@ -177,8 +177,8 @@ def _best_of(
     if not changes:
         return None
     null = torch.stack([evidence_of(change.null, change.s)[0] for change in changes]).amax(0)
-    places = [change.place(channel, driver, residual) for change in changes]
-    return dataclasses.replace(max(places, key=lambda place: place.evidence), together=names), null
+    best = max(changes, key=lambda change: float(evidence_of(change.along[:, None], change.s)[0]))
+    return dataclasses.replace(best.place(channel, driver, residual), together=names), null
 
 
 def _counts(problem: Problem, data: int, driver: str) -> list[int]:

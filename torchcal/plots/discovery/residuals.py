@@ -1,7 +1,7 @@
 """Where the mismatch sits: residuals against what they vary with."""
 
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -141,8 +141,7 @@ def residual_map(
         scaled = (y - fits[0].values) / recording.spread.cpu().numpy()
         scaled = scaled if mask is None else np.where(mask, np.nan, scaled)
         output = max(recording.outputs, key=lambda name: finite(rms(scaled[places_of(recording, name)]), -1.0))
-    elif output not in recording.outputs:
-        raise DomainError(f"Expected output among {list(recording.outputs)}. Got {output!r} (check the spelling).")
+    _known(output, "output", recording.outputs)
     columns = conditions_of(recording.x, recording)
     if driver is None:
         driver = "time" if "time" in columns else next(iter(columns))
@@ -259,11 +258,9 @@ def joint_map(
     look = Look(units={**recording.units, **(units or {})}, labels=labels or {})
     columns = conditions_of(recording.x, recording)
     for name in conditions:
-        if name not in columns:
-            raise DomainError(f"Expected conditions among {list(columns)}. Got {name!r} (check the spelling).")
+        _known(name, "conditions", columns)
     output = recording.outputs[0] if output is None else output
-    if output not in recording.outputs:
-        raise DomainError(f"Expected output among {list(recording.outputs)}. Got {output!r} (check the spelling).")
+    _known(output, "output", recording.outputs)
     part, mask = places_of(recording, output), as_mask(set_aside, recording)
     off = (recording.y.cpu().numpy() - curves_of(recording, before, None, None)[0].values)[part]
     a, b = (columns[name] for name in conditions)
@@ -294,6 +291,12 @@ def joint_map(
     ax.set_title(f"largest residual {largest:.3g}{f' {unit}' if unit else ''}", fontsize="small", loc="right")
     draw_key(ax)
     return ax
+
+
+def _known(name: str, what: str, names: Collection[str]) -> None:
+    """Raises a `DomainError` where a name is none of those that there are."""
+    if name not in names:
+        raise DomainError(f"Expected {what} among {list(names)}. Got {name!r} (check the spelling).")
 
 
 def _widened(spans: Sequence[tuple[float, float]], levels: np.ndarray) -> list[tuple[float, float]]:
