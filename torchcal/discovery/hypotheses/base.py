@@ -112,7 +112,8 @@ def calibrate_base(
         whole = found, units
         for _ in range(ROUNDS):
             given = recording.noise if isinstance(recording.noise, Tensor) else None
-            bad = spikes(found.problem, found.residual / units[found.problem.index], given)
+            here = units[found.problem.index]
+            bad = spikes(found.problem, found.residual / here, given, found.jacobian / here[:, None])
             if not bool(bad.any()):
                 break
             keep = found.problem.keep.clone()

@@ -24,6 +24,8 @@ APART = 0.1
 UNEVEN = 2.0
 #: Share of the largest sample below which a bend is rounding.
 ROUNDED = 1e-12
+#: Columns of a robust fit at most, in its number of data.
+MOST_COLUMNS = 0.4
 #: Share of supposed outliers with another one as nearest neighbour above which they are no outliers.
 TOGETHER = 0.4
 #: How many times as far off as all others a few data are that are outliers whatever the noise is; the share that they
@@ -36,11 +38,12 @@ DWARFED = 0.02
 CHANCE, IN_ROW, BESIDE = 0.1, 0.02, 2
 
 
-def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
+def spikes(problem: Problem, residual: Tensor, sd: Tensor | None, tangents: Tensor | None = None) -> Tensor:
     """Used data that stick out alone from their neighbours, bool ``(n,)``.
 
     Along one order they are compared with two neighbours on either side. Among several conditions the
-    residual of a robust smooth fit takes its place.
+    residual of a robust smooth fit takes its place. Where that finds none, the ``tangents`` ``(n, P)`` of the fit that
+    left it are fitted too: two data among few have drawn it to them.
     """
     found = torch.zeros(problem.n, dtype=torch.bool)
     for places in problem.sequences:
@@ -50,9 +53,13 @@ def spikes(problem: Problem, residual: Tensor, sd: Tensor | None) -> Tensor:
         if sd is not None:
             r = r / sd[problem.index[places]]
         if problem.order is None:
-            left, scale = _robust_left(smooth_columns(problem, places, ranks=True), r)
-            high, far = (_high(values, sd is not None) for values in (left, left / scale))
-            found[places] = _first(high & far, left / scale) if not _clustered(problem, places, high, left) else False
+            curves = smooth_columns(problem, places, ranks=True)[:, : max(1, len(places) // 8)]
+            found[places] = _off_curves(problem, places, curves, r, sd is not None)
+            if tangents is not None and not bool(found[places].any()):
+                slope = tangents[places] if sd is None else tangents[places] / sd[problem.index[places]][:, None]
+                curves = torch.cat([curves, slope / slope.norm(dim=0).clamp_min(1e-300)], dim=1)
+                if curves.shape[1] <= MOST_COLUMNS * len(places):
+                    found[places] = _off_curves(problem, places, curves, r, sd is not None)
             continue
         at = problem.order[problem.condition_of[places]].double()
         # A curve leaves its neighbours' range nowhere, but bends everywhere.
@@ -122,6 +129,13 @@ def lone_values(problem: Problem) -> Tensor:
         beside[[0, -1]] = True
         found[places] = out & ~beside
     return found
+
+
+def _off_curves(problem: Problem, places: Tensor, curves: Tensor, r: Tensor, known: bool) -> Tensor:
+    """Which data of a sequence ``(m,)`` a robust fit of curves misses by far, but not where they lie together."""
+    left, scale = _robust_left(curves, r)
+    high, far = (_high(values, known) for values in (left, left / scale))
+    return torch.zeros_like(high) if _clustered(problem, places, high, left) else _first(high & far, left / scale)
 
 
 def _twins(r: Tensor, far: Tensor) -> Tensor:
@@ -332,7 +346,6 @@ def _robust_left(columns: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
     At an edge the fit follows a datum that it takes in, and is uncertain where it leaves one out: the variance is near
     1 + q (1 − 2 w²), with w the datum's weight and q the variance of the curve.
     """
-    columns = columns[:, : max(1, len(values) // 8)]
     weight = torch.ones_like(values)
     left = values - values.median()
     for _ in range(10):
