@@ -292,7 +292,7 @@ def test_neighbours_on_one_curve_of_a_grid_that_are_set_aside_are_told(apart):
     told = [line for line in d.symptoms if "are neighbours, output 'y' at a = 2.57" in line]
     assert len(told) == (not apart)
     if told:  # 13 on each of 3 curves, and 2 on each of 14, of 42 * 41 / 2 pairs
-        assert "probability of 0.075" in told[0]
+        assert "probability of 0.078" in told[0]
 
 
 def test_both_data_at_one_level_of_a_grid_that_are_set_aside_are_told():
@@ -318,14 +318,14 @@ def test_two_neighbours_alone_that_are_set_aside_are_told(noise):
     (told,) = [line for line in d.symptoms if "neighbours" in line]
     where = "output 'y' at x = 5.306 and output 'y' at x = 5.51, off by +"
     assert told.startswith(f"two that were set aside as outliers are neighbours, {where}")
-    assert "probability of 0.039" in told  # 1 - exp(-2/50)
+    assert "probability of 0.04" in told  # 1 - exp(-2/50)
     y[[5, 40]] += 0.9  # of four on that side two are neighbours with a probability of 0.2
     d = tc.diagnose(DECAY, tc.Recording(x=x, y=y, noise=noise), LIBRARY, seed=0, progress=False)
     assert d.set_aside.nonzero()[:, 0].tolist() == [5, 26, 27, 40]
     assert not [line for line in d.symptoms if "neighbours" in line]
 
 
-@pytest.mark.parametrize(("count", "apart", "chance"), [(12, [], "0.15"), (16, [], "0.12"), (16, [3], None)])
+@pytest.mark.parametrize(("count", "apart", "chance"), [(12, [], "0.17"), (16, [], "0.12"), (16, [3], None)])
 def test_two_neighbours_of_few_data_that_are_set_aside_are_told_unless_there_are_other_outliers(count, apart, chance):
     x = torch.linspace(0, 1, count, dtype=F64)
     y = 1 + 2 * x + draw(count, 0.1, 1)

@@ -348,6 +348,39 @@ def test_a_datum_at_the_edge_of_two_conditions_is_rarely_an_outlier_by_chance():
     assert seen <= 6 + 3 * 6**0.5  # three standard deviations of a Poisson number
 
 
+def plane(seed, n):
+    """Data on a plane over two conditions and the logarithm of a third, with white noise of 0.05."""
+    rng = np.random.default_rng(seed)
+    a, b, w = rng.uniform(0, 1, n), 10 ** rng.uniform(0, 3, n), rng.uniform(-1, 1, n)
+    base = tc.Simulator(
+        lambda x, p: p["m"] + p["k"] * x["a"] + p["c"] * torch.log(x["b"]) + 0 * x["w"],
+        [tc.Parameter("m"), tc.Parameter("k"), tc.Parameter("c")],
+    )
+    return base, {"a": a, "b": b, "w": w}, 1 + 2 * a + 0.3 * np.log(b) + 0.05 * rng.standard_normal(n)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("noise", [0.05, None])
+def test_two_gross_readings_among_few_data_are_set_aside(seed, noise):
+    base, x, y = plane(seed, 18)
+    w = np.argsort(x["w"])
+    off = sorted(w[[4, 12]].tolist())
+    y[off] += 0.6  # 12 sd, to which the fit is drawn
+    d = diagnose(base, tc.Recording(x=x, y=y, noise=noise), tc.terms.sensor(outputs=("y",), static=True))
+    assert d.verdict == "consistent"
+    assert {*off} <= {*d.set_aside.nonzero()[:, 0].tolist()}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_lowest_of_one_of_several_conditions_are_no_outliers(seed):
+    base, x, y = plane(seed, 80)
+    lowest = np.argsort(x["a"])[:3]
+    y[lowest] += [1.6, 0.7, 0.5]  # found one after the other, none of them lay beside another one
+    d = diagnose(base, tc.Recording(x=x, y=y, noise=0.05), [])
+    assert d.verdict == "unexplained"
+    assert not d.set_aside.any()
+
+
 @pytest.mark.slow
 def test_a_smooth_misfit_that_an_initial_state_takes_up_is_no_outlier():
     # Without the first sample the unknown initial state takes up what a quadratic loss does: nothing would be missing.

@@ -15,7 +15,7 @@ from torchcal.discovery.fits.starts import follow_slopes, starts
 from torchcal.discovery.fits.trial import check_finite, point_of
 from torchcal.discovery.misfit.growth import growth
 from torchcal.discovery.misfit.noise import Noise, estimate
-from torchcal.discovery.misfit.outliers import lone_values, spikes
+from torchcal.discovery.misfit.outliers import clustered, lone_values, spikes
 from torchcal.display import raised_there
 from torchcal.errors import ConvergenceError, DomainError, SimulatorError
 from torchcal.simulators import Trajectories, focused, may_change, step_errors, workable
@@ -118,7 +118,7 @@ def calibrate_base(
                 break
             keep = found.problem.keep.clone()
             keep[found.problem.index[bad]] = False
-            if float(keep.sum()) < (1 - MOST) * whole[0].problem.n:  # so many are none
+            if float(keep.sum()) < (1 - MOST) * whole[0].problem.n or _lie_together(whole[0].problem, found, keep):
                 found, units = whole
                 break
             found, units = _grown(_again(found, keep, begin if _drawn(found, bad) else begin[:0]), unit)
@@ -136,6 +136,16 @@ def calibrate_base(
     if isinstance(base.problem.simulator, Trajectories):
         check_finite(base)
     return base, noise
+
+
+def _lie_together(whole: Problem, found: Fitted, keep: Tensor) -> bool:
+    """Whether what is set aside lies together among several conditions: one after the other it may have seemed not
+    to."""
+    if whole.order is not None:
+        return False
+    left = whole.y - whole.evaluate(found.values[None], [], found.warm)[0][0]
+    out = ~keep[whole.index]
+    return any(clustered(whole, places, out[places], left[places]) for places in whole.sequences)
 
 
 def _steady(problem: Problem, begin: Tensor) -> Problem:

@@ -9,7 +9,7 @@ from torch import Tensor
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.misfit.curves import smooth_columns
 
-__all__ = ["chance_of_pairs", "gross", "lone", "lone_values", "spikes"]
+__all__ = ["chance_of_pairs", "clustered", "gross", "lone", "lone_values", "spikes"]
 
 #: A sample that leaves its neighbours' range by more than this many robust sd, alone or with one beside it, is one.
 SPIKE = 4.5
@@ -87,7 +87,7 @@ def lone(problem: Problem, residual: Tensor, sd: Tensor | None, ends: bool = Fal
         far = (r.abs() > LONE * size) & (size > 0)
         if problem.order is None:
             far = _first(far, r)
-            found[places] = far & (not _clustered(problem, places, far, r))
+            found[places] = far & (not clustered(problem, places, far, r))
             continue
         beside = torch.full_like(r, -math.inf)
         beside[1:] = r[:-1] * r[1:].sign()
@@ -135,7 +135,7 @@ def _off_curves(problem: Problem, places: Tensor, curves: Tensor, r: Tensor, kno
     """Which data of a sequence ``(m,)`` a robust fit of curves misses by far, but not where they lie together."""
     left, scale = _robust_left(curves, r)
     high, far = (_high(values, known) for values in (left, left / scale))
-    return torch.zeros_like(high) if _clustered(problem, places, high, left) else _first(high & far, left / scale)
+    return torch.zeros_like(high) if clustered(problem, places, high, left) else _first(high & far, left / scale)
 
 
 def _twins(r: Tensor, far: Tensor) -> Tensor:
@@ -273,8 +273,9 @@ def _off_curve(at: Tensor, r: Tensor, high: Sequence[bool], k: int, end: int, le
     return False
 
 
-def _clustered(problem: Problem, places: Tensor, high: Tensor, r: Tensor) -> bool:
-    """Whether data that stick out lie together among the conditions, as outliers do not; ``r`` is by how much."""
+def clustered(problem: Problem, places: Tensor, high: Tensor, r: Tensor) -> bool:
+    """Whether data of a sequence that stick out ``(m,)`` lie together among the conditions, as outliers do not; ``r``
+    is by how much."""
     count = int(high.sum())
     if count < 2:
         return False
@@ -282,6 +283,8 @@ def _clustered(problem: Problem, places: Tensor, high: Tensor, r: Tensor) -> boo
     if any(_one_level(column, high, CHANCE / len(columns)) for column in columns):
         return True
     if any(_in_a_row(column, high, r, IN_ROW / len(columns)) for column in columns):
+        return True
+    if any(_at_an_end(column, high, r, IN_ROW / len(columns)) for column in columns):
         return True
     if count < 3:
         return False
@@ -306,17 +309,30 @@ def _in_a_row(column: Tensor, high: Tensor, r: Tensor, chance: float) -> bool:
     return chance_of_pairs(pairs, int((side > 0).sum()), int((side < 0).sum()), m, BESIDE) < chance
 
 
+def _at_an_end(column: Tensor, high: Tensor, r: Tensor, chance: float) -> bool:
+    """Whether the lowest or the highest values of a condition, two at least, stick out to one side, as so many would by
+    chance of less than this: there what a law lacks shows first."""
+    m, order = len(column), column.argsort(stable=True)
+    if 2 * len(column.unique()) < m:
+        return False
+    side = r.sign().where(high, 0.0)[order]
+    ends = ((end != end[0]).long().argmax() if float(end[0]) != 0 else 0 for end in (side, side.flip(0)))
+    most = max(map(int, ends))
+    return most > 1 and 2 * (int(high.sum()) / m) ** most * 0.5 ** (most - 1) < chance
+
+
 def chance_of_pairs(pairs: int, above: int, below: int, m: int, beside: float = 1) -> float:
     """Probability that so many or more pairs of data that stick out to one side lie at most ``beside`` places apart in
     a row; of other arrangements it is half the number of neighbours that a datum has.
 
-    Outliers do not know of each other: of a above and b below among m, as many do as a Poisson variable with a mean of
-    (a (a - 1) + b (b - 1)) ``beside`` / m.
+    Outliers do not know of each other: of a above and b below among m, as many do as a binomial variable of
+    (a - 1) + (b - 1) with a mean of (a (a - 1) + b (b - 1)) ``beside`` / m.
     """
     if pairs == 0:
         return 1.0
-    mean = torch.tensor(beside * (above * (above - 1) + below * (below - 1)) / m, dtype=torch.float64)
-    return float(torch.special.gammainc(torch.tensor(pairs, dtype=torch.float64), mean))
+    most = max(above - 1, 0) + max(below - 1, 0)
+    share = min(beside * (above * (above - 1) + below * (below - 1)) / m / max(most, 1), 1.0)
+    return sum(math.comb(most, k) * share**k * (1 - share) ** (most - k) for k in range(pairs, most + 1))
 
 
 def _one_level(column: Tensor, high: Tensor, chance: float) -> bool:
