@@ -35,8 +35,6 @@ CUTS = 14
 INSIDE, STARTS = 10, 2
 #: Shares of a window by which its ends are moved for other starts; not at all first.
 MOVES = (0.0, -0.15, 0.15, -0.3, 0.3)
-#: Share of a driver's range in which a kick begins, and by how many of these it may lie off the window's end.
-SUDDEN, BESIDE = 0.01, (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0)
 #: What the name of a term that fades begins with.
 FADING = "a fading "
 #: Relative size from which on two effects are independent.
@@ -55,18 +53,14 @@ def wanted_changes(
 ) -> tuple[list[Hypothetical], float]:
     """A constant in a model's window, with steep edges and with edges to fit; an open window closed as well, with a
     change that grows from its end, and with one that fades towards it; and, of a static recording, the best constant on
-    one side of another condition of few levels; or ``only`` some of these, or a short one ("kick") where the window
-    begins and ends at once. And the least χ² of all their beginnings, for linear."""
+    one side of another condition of few levels; or ``only`` some of these. And the least χ² of all their beginnings,
+    for linear."""
     w = model.window
     if w is None:
         return [], math.inf
     driver = search.drivers()[w.driver]
     inside = driver[(driver >= w.low) & (driver <= w.high)]
     span = w.span or search.spans()[w.driver]
-    kicks = [
-        (span.moved(w.low, (k - 0.5) * SUDDEN * span.size), span.moved(w.low, (k + 0.5) * SUDDEN * span.size))
-        for k in BESIDE if "kick" in only
-    ]  # fmt: skip
     moves = [k * span.size * span.share(w.low, w.high) for k in MOVES]
     moved = [(span.moved(w.low, a), span.moved(w.high, b)) for a, b in itertools.product(moves, moves)]
     ends = [list(dict.fromkeys(moved))]
@@ -88,8 +82,6 @@ def wanted_changes(
         term = search.candidates[model.numbers[0]].terms[0]
         if where == places_of(model.candidate) and not term.elapsed:  # whose t is not the window's
             shapes.append(("faded", multiplied(term, f"{FADING}{term.name}", fading), ends[0], ""))
-    if kicks:
-        shapes.append(("kick", constant_change(where, search.problem.in_time), kicks, ""))
     sides = _sides(search, w.driver) if side != 0 else []
     shapes += [("crossed", multiplied(still, still.name, share), ends[0], at) for at, share in sides]
     found, crossed, least = [], [], math.inf

@@ -49,11 +49,6 @@ LACKING, LESS = 0.35, 10.0
 TRIED = 4
 #: Share of an output's data from which on a range of a driver is where an instrument errs.
 ALIKE = 0.9
-#: Share of a driver's range from which on a change without a name is one; and of the time within which something
-#: happens at once in all runs.
-KICK, SUDDENLY = 1e-3, 0.02
-#: What windows in time are along.
-TIME = "t"
 #: Relative difference up to which two effects are one.
 SAME = 1e-4
 
@@ -145,28 +140,9 @@ class _Changes:
                     wanted[place, window.driver] = begun
                 elif chi2 < search.base.chi2:
                     others.append((chi2, place, begun))
-            others += self._kicks(model)
             for _, place, begun in sorted(others, key=lambda one: one[0])[:ELSEWHERE]:
                 wanted[place, window.driver] = begun
         self._refit([one for each in wanted.values() for one in each])
-
-    def _kicks(self, model: Model) -> list[tuple[float, Places, list[Hypothetical]]]:
-        """Something short, of one state each, when a model's window begins or ends: what a kick changes for good looks
-        like what a term does from then on. With the χ² that each would leave, for linear, if that is less than the
-        base's."""
-        at, simulator = _turn(model), self.search.problem.simulator
-        found = list[tuple[float, Places, list[Hypothetical]]]()
-        if at is None or model.window is None or not isinstance(simulator, Trajectories):
-            return []
-        window = dataclasses.replace(model.window, driver=TIME, low=at, high=at, span=self.search.spans()[TIME])
-        there = dataclasses.replace(model, found=self.search.base, window=window)
-        for state in simulator.ode.states:
-            place = (("rates", state),)
-            if (place, TIME, at, at) not in self.tried:
-                self.tried.add((place, TIME, at, at))
-                begun, chi2 = wanted_changes(self.search, there, place, self.prior, {}, ("kick",))
-                found += [(chi2, place, begun)] if begun and chi2 < self.search.base.chi2 else []
-        return found
 
     def hold_in_ranges(self, lead: Model) -> None:
         """Refit changes of the base in ranges of drivers beside a leader that acts everywhere: a step of a parameter
@@ -201,28 +177,9 @@ class _Changes:
         return wanted_changes(self.search, model, place, self.prior, self.named, (kind,))
 
     def _refit(self, wanted: Sequence[Hypothetical]) -> list[Model | None]:
-        # What is short in time has no name, but may be: a kick shows in all that follows.
-        least = {"least": KICK} if self.search.problem.in_time else {}
-        found = [long_enough(one, **least) for one in _refitted(self.search, wanted)]
+        found = [long_enough(one) for one in _refitted(self.search, wanted)]
         self.search.nameless += [one for one in found if one is not None and one.physical]
         return found
-
-
-def _turn(model: Model) -> float | None:
-    """When a model's window begins or ends, where it does once in a recording, and at that time in all runs."""
-    window, problem = model.window, model.found.problem
-    if window is None or not problem.in_time:
-        return None
-    drivers = problem.drivers_at_data(model.found.values[None], None)
-    along, t = drivers[window.driver], drivers[TIME]
-    inside, turns = (along >= window.low) & (along <= window.high), []
-    for places in problem.sequences:
-        turned = (inside[places].diff() != 0).nonzero()[:, 0]
-        turns += (0.5 * (t[places][turned] + t[places][turned + 1])).tolist()
-        if len(turned) > 1:
-            return None
-    once = turns and max(turns) - min(turns) <= SUDDENLY * float(t.max() - t.min())
-    return sum(turns) / len(turns) if once else None
 
 
 def _beyond(search: Search, model: Model) -> list[Model]:

@@ -420,14 +420,13 @@ def _keep_all(search: Search, wanted: Sequence[Hypothetical | None]) -> None:
         _keep(search, model)
 
 
-def long_enough(model: Model | None, least: float = SHORT) -> Model | None:
-    """The model, unless its window has closed or is too short for one, by its share of the range: of several levels of
-    a condition one is not."""
+def long_enough(model: Model | None) -> Model | None:
+    """The model, unless its window has closed or is too short for one: of several levels of a condition one is not."""
     if model is None or model.window is None or model.window.span is None:
         return None
     window, span, found = model.window, model.window.span, model.found
     share = span.share(window.low, window.high)
-    if share < least and not found.problem.in_time:
+    if share < SHORT and not found.problem.in_time:
         along = found.problem.drivers_at_data(found.values[None], None)[window.driver]
         share = float(((along >= window.low) & (along <= window.high)).double().mean())
-    return model if share >= least else None
+    return model if share >= SHORT else None

@@ -24,7 +24,7 @@ APART = 0.1
 UNEVEN = 2.0
 #: Share of the largest sample below which a bend is rounding.
 ROUNDED = 1e-12
-#: Columns of a robust fit at most, in its number of data.
+#: Columns of a robust fit at most, as a share of its data: of more than two in five it bends to what is off.
 MOST_COLUMNS = 0.4
 #: Share of supposed outliers with another one as nearest neighbour above which they are no outliers.
 TOGETHER = 0.4
