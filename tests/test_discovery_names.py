@@ -339,7 +339,7 @@ def test_data_that_stick_out_at_one_level_of_a_grid_are_no_outliers(rows, togeth
     problem = Problem.of(hall, tc.Recording(x={"B": field, "I": current}, y=y))
     high = torch.zeros(25, dtype=torch.bool)
     high[rows] = True
-    assert outliers._clustered(problem, torch.arange(25), high, y) is together
+    assert outliers.clustered(problem, torch.arange(25), high, y) is together
 
 
 @pytest.mark.parametrize(
@@ -356,7 +356,7 @@ def test_data_that_stick_out_on_end_along_one_of_several_conditions_are_no_outli
     problem = Problem.of(flat, tc.Recording(x={"t": t[shuffled], "seeing": seeing[shuffled]}, y=y[shuffled]))
     high = torch.zeros(140, dtype=torch.bool)
     high[on_end] = True
-    found = outliers._clustered(problem, torch.arange(140), high[shuffled], (y - 1)[shuffled])
+    found = outliers.clustered(problem, torch.arange(140), high[shuffled], (y - 1)[shuffled])
     assert found is together
 
 

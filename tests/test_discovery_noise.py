@@ -318,7 +318,7 @@ def test_two_neighbours_alone_that_are_set_aside_are_told(noise):
     (told,) = [line for line in d.symptoms if "neighbours" in line]
     where = "output 'y' at x = 5.306 and output 'y' at x = 5.51, off by +"
     assert told.startswith(f"two that were set aside as outliers are neighbours, {where}")
-    assert "probability of 0.04" in told  # 1 - exp(-2/50)
+    assert "probability of 0.04" in told  # 2 / 50
     y[[5, 40]] += 0.9  # of four on that side two are neighbours with a probability of 0.2
     d = tc.diagnose(DECAY, tc.Recording(x=x, y=y, noise=noise), LIBRARY, seed=0, progress=False)
     assert d.set_aside.nonzero()[:, 0].tolist() == [5, 26, 27, 40]
