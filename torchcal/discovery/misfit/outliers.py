@@ -282,9 +282,8 @@ def clustered(problem: Problem, places: Tensor, high: Tensor, r: Tensor) -> bool
     columns = problem.recording.columns[problem.condition_of[places]].unbind(-1)
     if any(_one_level(column, high, CHANCE / len(columns)) for column in columns):
         return True
-    if any(_in_a_row(column, high, r, IN_ROW / len(columns)) for column in columns):
-        return True
-    if any(_at_an_end(column, high, r, IN_ROW / len(columns)) for column in columns):
+    many = [column for column in columns if 2 * len(column.unique()) >= len(column)]  # levels, so that there is a row
+    if any(test(one, high, r, IN_ROW / len(columns)) for one in many for test in (_in_a_row, _at_an_end)):
         return True
     if count < 3:
         return False
@@ -301,8 +300,6 @@ def _in_a_row(column: Tensor, high: Tensor, r: Tensor, chance: float) -> bool:
     """Whether more data that stick out to one side follow each other along a condition than by chance of less than
     this (`chance_of_pairs`)."""
     m = len(column)
-    if 2 * len(column.unique()) < m:
-        return False
     order = column.argsort(stable=True)
     at, side = high[order].nonzero()[:, 0], r[order][high[order]].sign()
     pairs = int(((at.diff() <= BESIDE) & (side.diff() == 0)).sum())
@@ -312,13 +309,9 @@ def _in_a_row(column: Tensor, high: Tensor, r: Tensor, chance: float) -> bool:
 def _at_an_end(column: Tensor, high: Tensor, r: Tensor, chance: float) -> bool:
     """Whether the lowest or the highest values of a condition, two at least, stick out to one side, as so many would by
     chance of less than this: there what a law lacks shows first."""
-    m, order = len(column), column.argsort(stable=True)
-    if 2 * len(column.unique()) < m:
-        return False
-    side = r.sign().where(high, 0.0)[order]
-    ends = ((end != end[0]).long().argmax() if float(end[0]) != 0 else 0 for end in (side, side.flip(0)))
-    most = max(map(int, ends))
-    return most > 1 and 2 * (int(high.sum()) / m) ** most * 0.5 ** (most - 1) < chance
+    side = r.sign().where(high, 0.0)[column.argsort(stable=True)]
+    most = max(int((end * end[0] > 0).long().cumprod(0).sum()) for end in (side, side.flip(0)))
+    return most > 1 and 2 * (int(high.sum()) / len(column)) ** most * 0.5 ** (most - 1) < chance
 
 
 def chance_of_pairs(pairs: int, above: int, below: int, m: int, beside: float = 1) -> float:
