@@ -139,6 +139,88 @@ def test_a_kick_at_one_moment_is_no_window():
         assert row.region is None or row.probability < 0.5
 
 
+@pytest.fixture(scope="module")
+def knocked():
+    """A cart that rolls out and is knocked at t = 5, with two terms of which one looks like that from then on."""
+    t, k = torch.linspace(0, 10, 81, dtype=F64), 0.3
+    x = 2 / k * (1 - torch.exp(-k * t)) + 0.4 / k * (1 - torch.exp(-k * (t - 5).clamp_min(0)))
+    x += 0.02 * torch.randn(81, generator=torch.Generator().manual_seed(1), dtype=F64)
+    base = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["v"]},
+        states={"x": "m", "v": "m/s"},
+        parameters=[tc.Parameter("k", low=0.0, high=3.0, initial=0.5)],
+        observe=("x",),
+    )
+    slip = tc.Term("slip", rates={"x": lambda t, s, p, u: p["a"] * s["v"]}, parameters=[A])
+    drag = tc.Term("drag", rates={"v": lambda t, s, p, u: -p["a"] * s["v"].abs() * s["v"]}, parameters=[A])
+    return base, tc.Recording(runs=[tc.Run(time=t, outputs={"x": x}, initial={"x": 0.0})], noise=0.02), slip, drag
+
+
+def test_a_kick_is_not_named_for_what_a_term_does_from_then_on(knocked):
+    base, recording, slip, drag = knocked
+    d = diagnose(base, recording, [slip, drag])
+    assert d.verdict in ("ambiguous", "unexplained")
+    assert d.terms == []
+    (unknown,) = [row for row in d.ranking if row.terms == tc.display.NONE]
+    assert unknown.note.startswith("a sudden change of v where ")
+    low, high = (float(one) for one in unknown.note.removeprefix("a sudden change of v where ").split(" < t < "))
+    assert low < 5 < high
+    assert high - low < 0.25
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pushed", [False, True])
+def test_a_push_of_the_list_that_leads_is_held_against_no_kick(knocked, monkeypatch, pushed):
+    base, recording, slip, drag = knocked
+    seen, tried = [], sys.modules["torchcal.discovery.nameless"].sudden_change
+    monkeypatch.setattr(
+        sys.modules["torchcal.discovery.nameless"], "sudden_change",
+        lambda search, model, where, *rest: seen.append(where) or tried(search, model, where, *rest),
+    )  # fmt: skip
+    if pushed:
+        t = recording.runs[0].time
+        grown = (t - 6).clamp_min(0) / 0.3 - (1 - torch.exp(-0.3 * (t - 6).clamp_min(0))) / 0.09
+        x = 2 / 0.3 * (1 - torch.exp(-0.3 * t)) + 0.3 * grown
+        x += 0.02 * torch.randn(81, generator=torch.Generator().manual_seed(0), dtype=F64)
+        recording = tc.Recording(runs=[tc.Run(time=t, outputs={"x": x}, initial={"x": 0.0})], noise=0.02)
+    push = tc.Term("push", rates={"v": lambda t, s, p, u: p["a"] + 0 * s["v"]}, parameters=[A])
+    d = diagnose(base, recording, [push, slip, drag])
+    assert d.terms == (["push"] if pushed else [])
+    assert (("rates", "x"),) in seen
+    assert ((("rates", "v"),) in seen) is not pushed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("burns", [True, False])
+def test_a_burn_in_orbit_is_not_named_for_what_acts_from_then_on(burns):
+    t = np.linspace(0, 18, 61)
+
+    def rates(at, s):
+        along, pull = s[2:] / np.hypot(*s[2:]), -s[:2] / np.hypot(*s[:2]) ** 3
+        more = 2e-3 / (np.sqrt(np.pi) * 0.12) * np.exp(-(((at - 9) / 0.12) ** 2)) * along if burns else -0.004 * pull
+        return np.concatenate([s[2:], pull + (more if burns or at > 9 else 0)])
+
+    true = solve_ivp(rates, (0, 18), [1, 0, 0.02, 1.01], t_eval=t, rtol=1e-10, atol=1e-10, max_step=0.03).y[:2]
+    true += 2e-3 * np.random.default_rng(1).standard_normal(true.shape)
+    cubed = lambda s: (s["x"] ** 2 + s["y"] ** 2) ** 1.5  # noqa: E731
+    base = tc.ODESimulator(
+        rates=lambda t, s, p, u: {"x": s["vx"], "y": s["vy"],
+                                  **{f"v{k}": -p["mu"] * s[k] / cubed(s) for k in "xy"}},
+        states=("x", "y", "vx", "vy"),
+        parameters=[tc.Parameter("mu", low=0.5, high=2.0, initial=0.99)],
+        observe=("x", "y"),
+    )  # fmt: skip
+    light = {f"v{k}": lambda t, s, p, u, k=k: p["a"] * s[k] / cubed(s) for k in "xy"}
+    drag = {f"v{k}": lambda t, s, p, u, k=k: -p["a"] * s[f"v{k}"] for k in "xy"}
+    terms = [tc.Term("light", rates=light, parameters=[A]), tc.Term("drag", rates=drag, parameters=[A])]
+    recording = tc.Recording(runs=[tc.Run(time=t, outputs=dict(zip("xy", true, strict=True)))], noise=2e-3)
+    d = diagnose(base, recording, terms)
+    assert d.terms == ([] if burns else ["light"])
+    if burns:
+        (unknown,) = [row for row in d.ranking if row.terms == tc.display.NONE]
+        assert unknown.note.startswith("a sudden change of vx and vy where ")
+
+
 def test_opposite_terms_of_one_sign_each_are_no_aliases(binding):
     # With the base calibrated, what one of them does is minus what the other does. Six others are refitted before them.
     def term(name, change, **bounds):

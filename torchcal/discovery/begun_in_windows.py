@@ -14,6 +14,7 @@ from torchcal.discovery.fits.changes import Places, constant_change, distance, f
 from torchcal.discovery.fits.local import (
     EDGE,
     ENDS,
+    MOMENT,
     WIDTH_OF_EDGE,
     WIDTHS,
     Span,
@@ -21,12 +22,14 @@ from torchcal.discovery.fits.local import (
     is_window,
     localised,
     multiplied,
+    sudden,
 )
 from torchcal.discovery.hypotheses.model import Hypothetical, Model
+from torchcal.discovery.hypotheses.screen import Window
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.errors import DomainError, SimulatorError
 
-__all__ = ["in_any_window", "wanted_changes"]
+__all__ = ["in_any_window", "sudden_change", "wanted_changes"]
 
 #: Places where a window may begin or end that is any one along a driver.
 CUTS = 14
@@ -134,6 +137,24 @@ def _beyond(condition: str, cut: float, sign: int) -> Callable[..., Any]:
     return lambda *given: (sign * (at(*given) - cut) > 0).to(torch.float64)
 
 
+def sudden_change(
+    search: Search, model: Model, where: Places, prior: float, times: Sequence[float], width: float
+) -> tuple[Hypothetical, float] | None:
+    """A constant for a moment of a given width at one of some times, and the least χ² of its beginnings, for linear and
+    with all that the base fits; None where it cannot be taken."""
+    span = search.spans()["t"]
+    name = f"a sudden change of {' and '.join(name for _, name in where)}"
+    change = sudden(constant_change(where, in_time=True), name, times[0], width, span)
+    ends = [(at - width, at + width) for at in times]
+    try:
+        candidate = prepare(search.base.problem, search.base, [change], search.fixed, screened=False)
+        begin, chi2 = _begin(search, model, candidate, ends, span, project=True)
+    except (SimulatorError, DomainError):
+        return None
+    window = Window(model.numbers[0], "t", *ends[0], math.nan, math.nan, span)
+    return Hypothetical((), candidate, begin, prior, window), chi2
+
+
 def in_any_window(search: Search, model: Model) -> Hypothetical | None:
     """A model's term in all windows along the same driver, open ones too, from the best of them."""
     w, term = model.window, search.candidates[model.numbers[0]].terms[0]
@@ -152,9 +173,15 @@ def in_any_window(search: Search, model: Model) -> Hypothetical | None:
 
 
 def _begin(
-    search: Search, model: Model, candidate: Candidate, ends: Sequence[tuple[float, float]], span: Span
+    search: Search,
+    model: Model,
+    candidate: Candidate,
+    ends: Sequence[tuple[float, float]],
+    span: Span,
+    project: bool = False,
 ) -> tuple[Tensor, float]:
-    """Starting values at a model's base, of the best size each, those of the best few; and the least χ², for linear."""
+    """Starting values at a model's base, of the best size each, those of the best few; and the least χ², for linear;
+    ``project`` it off what the base fits."""
     known, problem = model.found.by_name, candidate.problem
     known |= {f"{FADING}{name}": value for name, value in known.items()}  # a term that fades begins at its shape
     names = [q.name for q in problem.parameters]
@@ -168,6 +195,8 @@ def _begin(
         for i, name in enumerate(names):
             if is_window(name):
                 row[i] = width if name.endswith(WIDTH_OF_EDGE) else low if name.endswith("from") else high
+                if name.endswith(MOMENT):
+                    row[i] = 0.5 * (low + high)
             elif i not in places:
                 row[i] = known.get(name, float(row[i]))
         rows.append(row)
@@ -177,6 +206,8 @@ def _begin(
     left, effect = w.vector(problem.y - y), torch.stack([w(one) for one in slope])
     lost = ~(left.isfinite().all(-1) & effect.square().sum((1, 2)).isfinite())  # solutions that blow up
     left, effect = left.masked_fill(lost[:, None], 0.0), effect.masked_fill(lost[:, None, None], 0.0)
+    if project:
+        left, effect = search.residual.project(left.T).T, torch.stack([search.residual.project(one) for one in effect])
     # Of places where nothing happens the size stays as it is.
     scale = effect.norm(dim=1, keepdim=True).clamp_min(1e-300)
     size = torch.linalg.pinv(effect / scale, rtol=RANK) @ left[..., None]

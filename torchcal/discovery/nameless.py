@@ -7,6 +7,7 @@ A term whose window leaves something is tried in all others: from the base alone
 """
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Sequence
 from contextlib import suppress
@@ -15,7 +16,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from torchcal.discovery.begun_in_windows import in_any_window, wanted_changes
+from torchcal.discovery.begun_in_windows import in_any_window, sudden_change, wanted_changes
 from torchcal.discovery.fits.candidates import Candidate, prepare
 from torchcal.discovery.fits.changes import Places, constant_change, places_of
 from torchcal.discovery.fits.local import is_window
@@ -49,6 +50,11 @@ LACKING, LESS = 0.35, 10.0
 TRIED = 4
 #: Share of an output's data from which on a range of a driver is where an instrument errs.
 ALIKE = 0.9
+#: Standard deviation of a sudden change, as a share of the range of time and of the usual distance of two samples; by
+#: how many of these it is sought off the end of a window; and how many are tried.
+MOMENTARY, BETWEEN, BESIDE, SUDDEN = 0.01, 0.5, (-3.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 3.0), 2
+#: Share of the range of time within which something happens at once in all runs.
+AT_ONCE = 0.02
 #: Relative difference up to which two effects are one.
 SAME = 1e-4
 
@@ -143,6 +149,35 @@ class _Changes:
             for _, place, begun in sorted(others, key=lambda one: one[0])[:ELSEWHERE]:
                 wanted[place, window.driver] = begun
         self._refit([one for each in wanted.values() for one in each])
+        if self.search.problem.in_time:
+            self._hold_against_sudden(near)
+
+    def _hold_against_sudden(self, near: Sequence[Model]) -> None:
+        """Refit what changes a state in a moment when a window begins or ends, where no constant of the list leads:
+        what a kick leaves behind looks like what a term does from then on, or until then."""
+        search, simulator = self.search, self.search.problem.simulator
+        if not isinstance(simulator, Trajectories):
+            return
+        base, found = search.base, list[tuple[float, Hypothetical]]()
+        t = base.problem.drivers_at_data(base.values[None], base.warm)["t"]
+        between = torch.cat([t[places].diff() for places in base.problem.sequences])
+        width = max(MOMENTARY * search.spans()["t"].size, BETWEEN * float(between[between > 0].median()))
+        constant = [places_of(m.candidate) or () for m in near if search.constants.intersection(m.numbers)]
+        named = set(itertools.chain.from_iterable(constant))
+        for model in sorted(near, key=lambda m: -m.weight)[:MOST]:
+            own = places_of(model.candidate) or ()
+            moved = tuple(place for place in own if place[0] == "rates" and place[1] in simulator.ode.states)
+            wanted = [where for where in {*((("rates", state),) for state in simulator.ode.states), moved} if where]
+            there = dataclasses.replace(model, found=base)
+            for at, where in itertools.product(_turns(model), sorted(wanted)):
+                if named.intersection(where) or (where, "t", at, at) in self.tried:
+                    continue
+                self.tried.add((where, "t", at, at))
+                times = [at + k * width for k in BESIDE]
+                if (one := sudden_change(search, there, where, self.prior, times, width)) is not None:
+                    found.append((one[1] + len(where) * math.log(search.problem.n), one[0]))
+        best = [one for _, one in sorted(found, key=lambda one: one[0])[:SUDDEN]]
+        search.nameless += [one for one in _refitted(search, best) if one is not None and one.physical]
 
     def hold_in_ranges(self, lead: Model) -> None:
         """Refit changes of the base in ranges of drivers beside a leader that acts everywhere: a step of a parameter
@@ -180,6 +215,26 @@ class _Changes:
         found = [long_enough(one) for one in _refitted(self.search, wanted)]
         self.search.nameless += [one for one in found if one is not None and one.physical]
         return found
+
+
+def _turns(model: Model) -> list[float]:
+    """When a model's window begins and ends, where it does so once in a recording, and at that time in all runs."""
+    window, problem = model.window, model.found.problem
+    if window is None:
+        return []
+    drivers = problem.drivers_at_data(model.found.values[None], model.found.warm)
+    along, t = drivers[window.driver], drivers["t"]
+    inside = (along >= window.low) & (along <= window.high)
+    begins, ends = list[float](), list[float]()
+    for places in problem.sequences:
+        turned = inside[places].long().diff()
+        middle = 0.5 * (t[places][1:] + t[places][:-1])
+        if int((turned > 0).sum()) > 1 or int((turned < 0).sum()) > 1:
+            return []
+        begins += middle[turned > 0].tolist()
+        ends += middle[turned < 0].tolist()
+    least = AT_ONCE * float(t.max() - t.min())
+    return [sum(each) / len(each) for each in (begins, ends) if each and max(each) - min(each) <= least]
 
 
 def _beyond(search: Search, model: Model) -> list[Model]:

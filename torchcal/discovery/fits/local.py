@@ -14,8 +14,8 @@ from torchcal.simulators import Parameter
 from torchcal.terms import Term
 
 __all__ = [
-    "EDGE", "ENDS", "SHORT", "WIDTHS", "Span", "beyond", "driver_at", "force", "is_window", "localised", "multiplied",
-    "region_text",
+    "EDGE", "ENDS", "MOMENT", "SHORT", "WIDTHS", "Span", "beyond", "driver_at", "force", "is_window", "localised",
+    "multiplied", "region_text", "sudden",
 ]  # fmt: skip
 
 #: Width of a window's edges, as a share of the driver's range: wide enough for a fit to move them; and the limits
@@ -34,6 +34,8 @@ CLOSED = 1e-3
 #: Names of the parameters of a window's ends.
 ENDS = {"from": "window from", "to": "window to"}
 WIDTH_OF_EDGE = "window edge"
+#: Name of the time at the middle of a window of a given length, the parameter of a sudden change.
+MOMENT = "window at"
 
 
 @dataclass(frozen=True)
@@ -124,6 +126,21 @@ def localised(
     return multiplied(term, term.name, share, parameters=ends, formula=formula)
 
 
+def sudden(term: Term, name: str, at: float, width: float, span: Span) -> Term:
+    """The term for a moment, whose time is fitted with it: multiplied by exp(−(t − at)²/(2 width²)).
+
+    Args:
+        term: The term, of a simulator in time.
+        name: What it is called.
+        at: When it begins to be sought.
+        width: Standard deviation of what it is multiplied by, in time.
+        span: Range of time in the recording.
+    """
+    moment = Parameter(MOMENT, low=span.low, high=span.high, initial=at)
+    share = lambda t, s, p, u: torch.exp(-0.5 * ((t - p[MOMENT]) / width) ** 2)  # noqa: E731
+    return multiplied(term, name, share, parameters=[moment])
+
+
 def multiplied(
     term: Term, name: str, share: Callable[..., Any], *, parameters: Sequence[Parameter] = (), formula: str = ""
 ) -> Term:
@@ -177,8 +194,8 @@ def force(span: Span, d: Tensor, p: Mapping[str, Any]) -> Any:
 
 
 def is_window(name: str) -> bool:
-    """Whether a parameter is an end or the edge of a window, by its qualified name."""
-    return name.rsplit(".", 1)[-1] in (*ENDS.values(), WIDTH_OF_EDGE)
+    """Whether a parameter is an end, the edge or the time of a window, by its qualified name."""
+    return name.rsplit(".", 1)[-1] in (*ENDS.values(), WIDTH_OF_EDGE, MOMENT)
 
 
 def beyond(parameter: Parameter) -> float:
