@@ -256,6 +256,11 @@ def test_a_term_in_a_window_is_told_by_its_name_and_steps_by_where_they_are():
     assert "jumps with t (at 2): one constant change on one side removes" in where_in_words(finding(where=[step]))
     steps = Location("output", "y", "t", PART, 0.5, 20.0, extent=10.0, edges=(2.0, 5.0))
     assert "jumps with t (at 2 and 5): one constant change in between removes" in where_in_words(finding(where=[steps]))
+    told = "in the equation v and the equation w and is sudden, at t = 3.457 min: one change in that moment removes"
+    place = Location("equation", "v", "t", PART, 0.5, 20.0, extent=10.0, also=(("equation", "w"),), moment=3.45678)
+    knocked = finding(where=[place])
+    knocked.recording.units = {"time": "min"}
+    assert told in where_in_words(knocked)
     ends = dataclasses.replace(steps, spans=((0.0, 1.9), (5.1, 10.0)))
     assert "(at 2 and 5): one constant change outside of these removes" in where_in_words(finding(where=[ends]))
 

@@ -219,6 +219,8 @@ def test_a_burn_in_orbit_is_not_named_for_what_acts_from_then_on(burns):
     if burns:
         (unknown,) = [row for row in d.ranking if row.terms == tc.display.NONE]
         assert unknown.note.startswith("a sudden change of vx and vy where ")
+        assert d.where[0].moment == pytest.approx(9, abs=0.5)
+        assert "sits in the equation vx and the equation vy and is sudden, at t = " in " ".join(str(d).split())
 
 
 def test_opposite_terms_of_one_sign_each_are_no_aliases(binding):

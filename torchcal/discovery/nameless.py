@@ -53,6 +53,8 @@ ALIKE = 0.9
 #: Standard deviation of a sudden change, as a share of the range of time and of the usual distance of two samples; by
 #: how many of these it is sought off the end of a window; and how many are tried.
 MOMENTARY, BETWEEN, BESIDE, SUDDEN = 0.01, 0.5, (-3.0, -2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 3.0), 2
+#: States up to which each is tried alone; of more only those that the term acts on.
+STATES = 8
 #: Share of the range of time within which something happens at once in all runs.
 AT_ONCE = 0.02
 #: Relative difference up to which two effects are one.
@@ -167,7 +169,8 @@ class _Changes:
         for model in sorted(near, key=lambda m: -m.weight)[:MOST]:
             own = places_of(model.candidate) or ()
             moved = tuple(place for place in own if place[0] == "rates" and place[1] in simulator.ode.states)
-            wanted = [where for where in {*((("rates", state),) for state in simulator.ode.states), moved} if where]
+            alone = simulator.ode.states if len(simulator.ode.states) <= STATES else [name for _, name in moved]
+            wanted = [where for where in {*((("rates", state),) for state in alone), moved} if where]
             there = dataclasses.replace(model, found=base)
             for at, where in itertools.product(_turns(model), sorted(wanted)):
                 if named.intersection(where) or (where, "t", at, at) in self.tried:

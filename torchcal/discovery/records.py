@@ -225,6 +225,7 @@ class Location:
             do together.
         at: The levels of another condition at which it changes alone, in words; empty where it does at all.
         together: The two conditions where it varies with both together, more than with each by itself; else none.
+        moment: Of a change in a moment, when that is; None of any other change.
     """
 
     kind: str
@@ -241,6 +242,7 @@ class Location:
     also: tuple[tuple[str, str], ...] = ()
     at: str = ""
     together: tuple[str, ...] = ()
+    moment: float | None = None
 
     @property
     def called(self) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchcal.discovery.fits.local import MOMENT
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.places import Place
@@ -140,6 +141,9 @@ def locate(
             scale = search.spans()[w.driver]
             ends = (end for end in (w.low, w.high) if math.isfinite(end) and scale.holds(end))
             told: dict[str, Any] = {"edges": tuple(ends), "at": w.at}
+            if any(q.name.endswith(MOMENT) for q in local.found.problem.parameters):
+                more = [("equation", name) for name in _equations(local.candidate.terms[0])[1:]]
+                told = {"moment": 0.5 * (w.low + w.high), "also": tuple(more)}
         else:
             told = {"terms": local.names, "also": tuple(also)}
             span = _met(drivers, low, high) if _has_levels(search, w.driver) else span

@@ -5,7 +5,7 @@ from typing import Any
 
 from torchcal.discovery.fits.local import Span
 from torchcal.discovery.misfit.channels import RUN
-from torchcal.display import ITSELF, between, percent, unit_of, units_of, up_to, with_unit
+from torchcal.display import ITSELF, between, percent, placed, unit_of, units_of, up_to, with_unit
 
 __all__ = ["share_in_words", "where_in_words"]
 
@@ -66,6 +66,12 @@ def where_in_words(d: Any) -> str:
         return (
             f"The mismatch sits in the {place.called} and varies with {place.driver} together: a smooth change there "
             f"{_does(place)}{less}.{_embedded(d)}"
+        )
+    if place.moment is not None:
+        at = with_unit(placed(place.moment, place.extent or 0.0), unit)
+        return (
+            f"The mismatch sits in the {place.called} and is sudden, at {place.driver} = {at}: one change in that "
+            f"moment {_does(place)}{_elsewhere(d)}.{_embedded(d)}"
         )
     if place.edges:
         side = "on one side"
