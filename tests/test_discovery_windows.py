@@ -223,6 +223,27 @@ def test_a_burn_in_orbit_is_not_named_for_what_acts_from_then_on(burns):
         assert "sits in the equation vx and the equation vy and is sudden, at t = " in " ".join(str(d).split())
 
 
+def test_an_instrument_that_saturates_in_the_cold_alone_is_no_name():
+    # A battery's time of discharge: less of it in the cold at small currents, which no term of the list says.
+    rng = np.random.default_rng(6)
+    x = {"I": rng.uniform(0.7, 8, 72), "T": rng.uniform(-10, 40, 72)}
+    less = 0.3 / (1 + np.exp(np.clip(x["T"] / 0.8, -50, 50))) * np.exp(-((x["I"] / 3) ** 2))
+    y = 10 / x["I"] ** 1.12 * (1 - less) + 0.07 * rng.standard_normal(72)
+    base = tc.Simulator(
+        lambda x, p: p["C"] * x["I"] ** -p["k"],
+        parameters=[tc.Parameter("C", low=0.0, initial=8.0), tc.Parameter("k", low=0.8, high=1.6, initial=1.1)],
+    )
+    cold = tc.Term(
+        "loss in the cold", outputs={"y": lambda x, p, y: y * (1 - p["a"] * (25 - x["T"]).clamp_min(0))},
+        parameters=[tc.Parameter("a", low=0.0, high=0.03)],
+    )  # fmt: skip
+    data = tc.Recording(x={name: torch.tensor(values) for name, values in x.items()}, y=torch.tensor(y), noise=0.07)
+    d = diagnose(base, data, [cold, *tc.terms.sensor("y", static=True)])
+    assert d.terms == []
+    assert d.tied[0] == ["saturation of y"]
+    assert "beyond a value of y does so wherever that is reached, and not only where T < " in " ".join(str(d).split())
+
+
 def test_opposite_terms_of_one_sign_each_are_no_aliases(binding):
     # With the base calibrated, what one of them does is minus what the other does. Six others are refitted before them.
     def term(name, change, **bounds):

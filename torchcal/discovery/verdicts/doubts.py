@@ -74,6 +74,7 @@ def unfit(search: Search, model: Model) -> str:
         left_open(search, model)
         or unnatural(model)
         or no_instrument(search, model)
+        or _only_there(model)
         or _no_threshold(model)
         or _no_drive(model)
     )
@@ -139,6 +140,17 @@ def _no_better(search: Search, model: Model) -> str:
         return ""
     what = f"{rival.candidate.name[0].upper()}{rival.candidate.name[1:]} in a range of {rival.window.driver}"
     return f"{what} would do nearly as well: the term's own shape is not seen yet."
+
+
+def _only_there(model: Model) -> str:
+    """Why an instrument that errs beyond a value of its reading does not in a part of a condition's range alone."""
+    found = None if model.window is None else threshold_of(model.candidate.terms, model.found.by_name)
+    if found is None:
+        return ""
+    return (
+        f"An instrument that errs beyond a value of {found[0]} does so wherever that is reached, and not only where "
+        f"{model.where}: something that depends on both looks the same."
+    )
 
 
 def by_hold(search: Search, model: Model) -> str:
