@@ -14,11 +14,11 @@ from torchcal.discovery.fits.changes import Places, constant_change, distance, f
 from torchcal.discovery.fits.local import (
     EDGE,
     ENDS,
-    MOMENT,
     WIDTH_OF_EDGE,
     WIDTHS,
     Span,
     driver_at,
+    is_moment,
     is_window,
     localised,
     multiplied,
@@ -195,7 +195,7 @@ def _begin(
         for i, name in enumerate(names):
             if is_window(name):
                 row[i] = width if name.endswith(WIDTH_OF_EDGE) else low if name.endswith("from") else high
-                if name.endswith(MOMENT):
+                if is_moment(name):
                     row[i] = 0.5 * (low + high)
             elif i not in places:
                 row[i] = known.get(name, float(row[i]))

@@ -164,6 +164,7 @@ class _Changes:
         t = base.problem.drivers_at_data(base.values[None], base.warm)["t"]
         between = torch.cat([t[places].diff() for places in base.problem.sequences])
         width = max(MOMENTARY * search.spans()["t"].size, BETWEEN * float(between[between > 0].median()))
+        first, last = float(t.min()), float(t.max())
         constant = [places_of(m.candidate) or () for m in near if search.constants.intersection(m.numbers)]
         named = set(itertools.chain.from_iterable(constant))
         for model in sorted(near, key=lambda m: -m.weight)[:MOST]:
@@ -173,10 +174,12 @@ class _Changes:
             wanted = [where for where in {*((("rates", state),) for state in alone), moved} if where]
             there = dataclasses.replace(model, found=base)
             for at, where in itertools.product(_turns(model), sorted(wanted)):
+                if search.stop.is_set():
+                    return
                 if named.intersection(where) or (where, "t", at, at) in self.tried:
                     continue
                 self.tried.add((where, "t", at, at))
-                times = [at + k * width for k in BESIDE]
+                times = [at + k * width for k in BESIDE if first < at + k * width < last]
                 if (one := sudden_change(search, there, where, self.prior, times, width)) is not None:
                     found.append((one[1] + len(where) * math.log(search.problem.n), one[0]))
         best = [one for _, one in sorted(found, key=lambda one: one[0])[:SUDDEN]]

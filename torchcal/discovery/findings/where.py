@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchcal.discovery.fits.local import MOMENT
+from torchcal.discovery.fits.local import is_moment
 from torchcal.discovery.hypotheses.model import Model
 from torchcal.discovery.hypotheses.search import Search
 from torchcal.discovery.misfit.places import Place
@@ -141,7 +141,7 @@ def locate(
             scale = search.spans()[w.driver]
             ends = (end for end in (w.low, w.high) if math.isfinite(end) and scale.holds(end))
             told: dict[str, Any] = {"edges": tuple(ends), "at": w.at}
-            if any(q.name.endswith(MOMENT) for q in local.found.problem.parameters):
+            if any(is_moment(local.found.problem.parameters[i].name) for i in local.candidate.own):
                 more = [("equation", name) for name in _equations(local.candidate.terms[0])[1:]]
                 told = {"moment": 0.5 * (w.low + w.high), "also": tuple(more)}
         else:

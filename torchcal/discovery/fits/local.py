@@ -14,8 +14,8 @@ from torchcal.simulators import Parameter
 from torchcal.terms import Term
 
 __all__ = [
-    "EDGE", "ENDS", "MOMENT", "SHORT", "WIDTHS", "Span", "beyond", "driver_at", "force", "is_window", "localised",
-    "multiplied", "region_text", "sudden",
+    "EDGE", "ENDS", "MOMENT", "SHORT", "WIDTHS", "Span", "beyond", "driver_at", "force", "is_moment",
+    "is_window", "localised", "multiplied", "region_text", "sudden",
 ]  # fmt: skip
 
 #: Width of a window's edges, as a share of the driver's range: wide enough for a fit to move them; and the limits
@@ -196,6 +196,11 @@ def force(span: Span, d: Tensor, p: Mapping[str, Any]) -> Any:
 def is_window(name: str) -> bool:
     """Whether a parameter is an end, the edge or the time of a window, by its qualified name."""
     return name.rsplit(".", 1)[-1] in (*ENDS.values(), WIDTH_OF_EDGE, MOMENT)
+
+
+def is_moment(name: str) -> bool:
+    """Whether a parameter is the time of a sudden change, by its qualified name."""
+    return name.rsplit(".", 1)[-1] == MOMENT
 
 
 def beyond(parameter: Parameter) -> float:

@@ -5,7 +5,7 @@ import math
 
 from torchcal.discovery.fits.candidates import usual_starts
 from torchcal.discovery.fits.fitting import Fitted
-from torchcal.discovery.fits.local import ENDS, MOMENT, is_window
+from torchcal.discovery.fits.local import ENDS, is_moment, is_window
 from torchcal.discovery.hypotheses.model import Model
 
 __all__ = ["UNPHYSICAL", "held_back", "judge"]
@@ -29,7 +29,7 @@ def judge(model: Model, base: Fitted) -> None:
         for i in candidate.own:
             low = float(found.values[i]) if names[i].endswith(ENDS["from"]) else low
             high = float(found.values[i]) if names[i].endswith(ENDS["to"]) else high
-            if names[i].endswith(MOMENT):
+            if is_moment(names[i]):
                 by = float(found.values[i]) - 0.5 * (low + high)
                 low, high = low + by, high + by
         model.window = dataclasses.replace(model.window, low=low, high=high)
