@@ -139,12 +139,11 @@ def test_a_kick_at_one_moment_is_no_window():
         assert row.region is None or row.probability < 0.5
 
 
-@pytest.fixture(scope="module")
-def knocked():
-    """A cart that rolls out and is knocked at t = 5, with two terms of which one looks like that from then on."""
+def knocked_at(moment, *, sd, **initial):
+    """A cart that rolls out and is knocked, with two terms of which one looks like that from then on."""
     t, k = torch.linspace(0, 10, 81, dtype=F64), 0.3
-    x = 2 / k * (1 - torch.exp(-k * t)) + 0.4 / k * (1 - torch.exp(-k * (t - 5).clamp_min(0)))
-    x += 0.02 * torch.randn(81, generator=torch.Generator().manual_seed(1), dtype=F64)
+    x = 2 / k * (1 - torch.exp(-k * t)) + 0.4 / k * (1 - torch.exp(-k * (t - moment).clamp_min(0)))
+    x += sd * torch.randn(81, generator=torch.Generator().manual_seed(1), dtype=F64)
     base = tc.ODESimulator(
         rates=lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["v"]},
         states={"x": "m", "v": "m/s"},
@@ -153,7 +152,21 @@ def knocked():
     )
     slip = tc.Term("slip", rates={"x": lambda t, s, p, u: p["a"] * s["v"]}, parameters=[A])
     drag = tc.Term("drag", rates={"v": lambda t, s, p, u: -p["a"] * s["v"].abs() * s["v"]}, parameters=[A])
-    return base, tc.Recording(runs=[tc.Run(time=t, outputs={"x": x}, initial={"x": 0.0})], noise=0.02), slip, drag
+    run = tc.Run(time=t, outputs={"x": x}, initial={"x": 0.0, **initial})
+    return base, tc.Recording(runs=[run], noise=sd), slip, drag
+
+
+@pytest.fixture(scope="module")
+def knocked():
+    return knocked_at(5.0, sd=0.02)
+
+
+def test_a_kick_as_a_recording_begins_is_sought_within_it():
+    base, recording, slip, _ = knocked_at(0.2, sd=0.01, v=2.0)
+    d = diagnose(base, recording, [slip])
+    assert d.terms == []
+    (unknown,) = [row for row in d.ranking if row.terms == tc.display.NONE]
+    assert unknown.note.startswith("a sudden change of v where 0.")
 
 
 def test_a_kick_is_not_named_for_what_a_term_does_from_then_on(knocked):
