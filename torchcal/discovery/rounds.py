@@ -19,6 +19,7 @@ from torchcal.discovery.hypotheses.own_noise import (
     fits_by_chance,
     isolated,
     known_density,
+    likeliest_outliers,
     odds_alone,
     other_growth,
     outdone,
@@ -106,7 +107,7 @@ def _again(search: Search, observed: Problem, detected: bool, confidence: float)
         # What a model misses that leaves more than noise may be that: such ones tell once, or each tells others.
         best = search.leader
         clear = number == 0 or best is None or search.examine(best).p_value >= WHITE
-        sticking = outliers(search, observed.keep) if detected and clear else None
+        sticking = likeliest_outliers(search, observed.keep) if detected and clear else None
         unit = other_growth(search) if detected else None
         if sticking is not None and any(torch.equal(keep, observed.keep & ~sticking) for keep in seen):
             sticking = None

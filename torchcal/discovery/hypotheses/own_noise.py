@@ -27,6 +27,7 @@ __all__ = [
     "isolated",
     "known_density",
     "likeliest_alone",
+    "likeliest_outliers",
     "odds_alone",
     "other_growth",
     "outdone",
@@ -45,6 +46,9 @@ SETTLED, BEHIND = 10, 20.0
 TRIMS = 3
 #: Share of outliers among data, and log odds from which on physics explains better what had been taken for some.
 RARE, EXPLAINED = 0.05, 5.0
+#: Models beside the best that are judged with their own outliers, those at most so far behind in log weight; the sd by
+#: which they must miss a datum; and how many outliers more they may have.
+CONTENDERS, NOT_FAR, STICKS_OUT, FURTHER = 4, 40.0, 4.0, 2
 #: Share of its variance that a fit leaves of any datum at least, where residuals are scaled by it.
 LEAST_FREE = 0.05
 #: Log odds from which on something unknown is clearly likelier than the best model.
@@ -200,15 +204,40 @@ def outliers(search: "Search", observed: Tensor) -> Tensor | None:
     """Data that stick out alone once the best model explains the rest, bool ``(n_total,)``; None where nothing explains
     enough to tell. All ``observed`` data are judged, those that are set aside too."""
     best = search.leader
-    if search.exact or best is None or not explains(search):
+    return None if search.exact or best is None or not explains(search) else _outliers_of(search, best, observed)[0]
+
+
+def likeliest_outliers(search: "Search", observed: Tensor) -> Tensor | None:
+    """The same of that one of the leading models which is likeliest with its own outliers, few more than the best has:
+    what draws a wrong one to itself is what keeps the right one from leading."""
+    lead = search.leader
+    if search.exact or lead is None or not explains(search):
         return None
-    found, keep = best.found, observed
+    best, value = _outliers_of(search, lead, observed)
+    if best is None:
+        return None
+    most = int(best.sum()) + FURTHER
+    close = [m for m in search.models if m is not lead and m.physical and m.weight > lead.weight - NOT_FAR]
+    for model in sorted(close, key=lambda m: -m.weight)[:CONTENDERS]:
+        left = model.found.residual / search.noise.sd[model.found.problem.index]
+        if float(left.abs().max()) < STICKS_OUT:
+            continue
+        own, other = _outliers_of(search, model, observed)
+        if own is not None and int(own.sum()) <= most and other > value + EXPLAINED:
+            best, value = own, other
+    return best
+
+
+def _outliers_of(search: "Search", model: Model, observed: Tensor) -> tuple[Tensor | None, float]:
+    """Data that stick out alone of a model, and the log of its prior times the density of all data with these as
+    outliers; None where they are too many."""
+    found, keep = model.found, observed
     for _ in range(TRIMS):  # what sticks out most draws the fit to itself, and off what sticks out less
-        fitted = dataclasses.replace(best.found.problem, keep=keep)
+        fitted = dataclasses.replace(model.found.problem, keep=keep)
         found = refit(found, search.noise.whitening(fitted), fitted)
         before, keep = keep, observed  # what was set aside may be the effect itself
         for _ in range(2):  # beside what sticks out most an end of a recording is not judged
-            problem = dataclasses.replace(best.found.problem, keep=keep)
+            problem = dataclasses.replace(model.found.problem, keep=keep)
             left = problem.y - problem.evaluate(found.values[None], [], found.warm)[0][0]
             off = _sticking(search, problem, left)
             if bool((observed & ~search.problem.keep).any()):  # an end that has been weighed before stays aside
@@ -217,7 +246,10 @@ def outliers(search: "Search", observed: Tensor) -> Tensor | None:
         if torch.equal(keep, before):
             break
     sticking = observed & ~keep
-    return sticking if float(sticking.sum()) <= MOST_OUTLIERS * float(observed.sum()) else None
+    if float(sticking.sum()) > MOST_OUTLIERS * float(observed.sum()):
+        return None, -math.inf
+    problem = found.problem
+    return sticking, model.prior + _of_outliers(problem) + density(found, search.noise.whitening(problem))
 
 
 def isolated(search: "Search", fit: Fitted) -> Tensor | None:
@@ -295,20 +327,20 @@ def _density(search: "Search", found: Fitted) -> float:
     that they are told by, is not the same for other data.
     """
     noise = alone(found, search.noise, search.tangents)[0]
-    return _of_outliers(search) + density(found, noise.whitening(found.problem))
+    return _of_outliers(search.problem) + density(found, noise.whitening(found.problem))
 
 
 def known_density(search: "Search", found: Fitted) -> float:
     """The same of a model with the noise of the search."""
-    return _of_outliers(search) + density(found, search.noise.whitening(found.problem))
+    return _of_outliers(search.problem) + density(found, search.noise.whitening(found.problem))
 
 
-def _of_outliers(search: "Search") -> float:
+def _of_outliers(problem: Problem) -> float:
     """Log density of what is set aside, with that of normal data without its constant for all others."""
-    recording, value = search.problem.recording, 0.0
+    recording, value = problem.recording, 0.0
     for output in range(len(recording.outputs)):
-        here = mine(search.problem, output) & recording.observed_once
-        y, aside = recording.y[here], int((here & ~search.problem.keep).sum())
+        here = mine(problem, output) & recording.observed_once
+        y, aside = recording.y[here], int((here & ~problem.keep).sum())
         if aside:
             density = RARE / (1 - RARE) * math.sqrt(2 * math.pi) / max(float(y.max() - y.min()), 1e-300)
             value += aside * math.log(density)
