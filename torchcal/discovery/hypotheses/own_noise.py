@@ -217,13 +217,14 @@ def likeliest_outliers(search: "Search", observed: Tensor) -> Tensor | None:
     if best is None:
         return None
     most = int(best.sum()) + FURTHER
-    close = [m for m in search.models if m is not lead and m.physical and m.weight > lead.weight - NOT_FAR]
+    others = [m for m in search.models if m.physical and m.numbers != lead.numbers]
+    close = [m for m in others if m.weight > lead.weight - NOT_FAR]
     for model in sorted(close, key=lambda m: -m.weight)[:CONTENDERS]:
         left = model.found.residual / search.noise.sd[model.found.problem.index]
         if float(left.abs().max()) < STICKS_OUT:
             continue
         own, other = _outliers_of(search, model, observed)
-        if own is not None and int(own.sum()) <= most and other > value + EXPLAINED:
+        if own is not None and int(own.sum()) <= most and other > value + CLEAR:
             best, value = own, other
     return best
 
