@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import itertools
 import math
 import sys
 from types import SimpleNamespace
@@ -18,7 +19,7 @@ from torchcal.discovery.fits.local import Span, localised
 from torchcal.discovery.fits.problem import Problem
 from torchcal.discovery.hypotheses.screen import Window, windows_of
 from torchcal.discovery.hypotheses.search import Search
-from torchcal.discovery.nameless import _Changes, _elsewhere, _where_possible, refit_nameless
+from torchcal.discovery.nameless import _Changes, _elsewhere, _turns, _where_possible, refit_nameless
 from torchcal.discovery.verdicts.doubts import CLEARLY, doubt
 from torchcal.discovery.windows import _beyond_the_edge
 from torchcal.errors import SimulatorError
@@ -179,6 +180,35 @@ def test_a_kick_is_not_named_for_what_a_term_does_from_then_on(knocked):
     low, high = (float(one) for one in unknown.note.removeprefix("a sudden change of v where ").split(" < t < "))
     assert low < 5 < high
     assert high - low < 0.25
+
+
+@pytest.mark.parametrize(
+    ("times", "begins"),
+    [
+        ([[0, 2, 4, 6, 8]], [5.0]),
+        ([[0, 4.5, 5.5, 9], [0, 9]], [5.0]),  # few samples in a run say little, and nothing against it
+        ([[0, 1, 2], [0, 3, 4.9, 5.5]], [5.2]),  # nor does one that ends before
+        ([[0, 2, 4, 6, 8], [6, 7, 8]], [5.0]),
+    ],
+)
+def test_a_window_begins_where_all_runs_have_it(times, begins):
+    t = torch.tensor(list(itertools.chain.from_iterable(times)), dtype=F64)
+    problem = SimpleNamespace(
+        drivers_at_data=lambda values, warm: {"t": t},
+        sequences=torch.arange(len(t)).split([len(each) for each in times]),
+    )
+    found = SimpleNamespace(problem=problem, values=torch.zeros(1), warm=None)
+    window = Window(0, "t", 5.0, math.inf, math.nan, math.nan)
+    assert _turns(SimpleNamespace(window=window, found=found)) == pytest.approx(begins)
+
+
+def test_a_window_that_begins_at_another_time_in_each_run_begins_nowhere():
+    t = torch.tensor([0, 1, 2, 3, 4, 0, 1, 2, 3, 4], dtype=F64)
+    v = torch.tensor([0, 0, 0, 9, 9, 0, 9, 9, 9, 0], dtype=F64)
+    problem = SimpleNamespace(drivers_at_data=lambda *_: {"t": t, "v": v}, sequences=torch.arange(10).split(5))
+    found = SimpleNamespace(problem=problem, values=torch.zeros(1), warm=None)
+    window = Window(0, "v", 5.0, math.inf, math.nan, math.nan)
+    assert _turns(SimpleNamespace(window=window, found=found)) == [3.5]  # where it ends in one
 
 
 @pytest.mark.slow

@@ -231,16 +231,19 @@ def _turns(model: Model) -> list[float]:
     drivers = problem.drivers_at_data(model.found.values[None], model.found.warm)
     along, t = drivers[window.driver], drivers["t"]
     inside = (along >= window.low) & (along <= window.high)
-    begins, ends = list[float](), list[float]()
+    begins, ends = list[Tensor](), list[Tensor]()  # between which samples, (2, k) each
     for places in problem.sequences:
         turned = inside[places].long().diff()
-        middle = 0.5 * (t[places][1:] + t[places][:-1])
+        between = torch.stack([t[places][:-1], t[places][1:]])
         if int((turned > 0).sum()) > 1 or int((turned < 0).sum()) > 1:
             return []
-        begins += middle[turned > 0].tolist()
-        ends += middle[turned < 0].tolist()
-    least = AT_ONCE * float(t.max() - t.min())
-    return [sum(each) / len(each) for each in (begins, ends) if each and max(each) - min(each) <= least]
+        begins.append(between[:, turned > 0])
+        ends.append(between[:, turned < 0])
+    apart, found = AT_ONCE * float(t.max() - t.min()), []
+    for each in (torch.cat(begins, 1), torch.cat(ends, 1)):
+        if each.numel() and float(each[0].max() - each[1].min()) <= apart:
+            found.append(0.5 * float(each[0].max() + each[1].min()))
+    return found
 
 
 def _beyond(search: Search, model: Model) -> list[Model]:
