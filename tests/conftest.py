@@ -48,6 +48,20 @@ def star():
 
 
 @pytest.fixture
+def battery() -> tuple[tc.Simulator, tc.Term]:
+    """A battery's time of discharge by its current (Peukert), and a loss in the cold."""
+    base = tc.Simulator(
+        lambda x, p: p["C"] * x["I"] ** -p["k"],
+        parameters=[tc.Parameter("C", low=0.0, initial=8.0), tc.Parameter("k", low=0.8, high=1.6, initial=1.1)],
+    )
+    cold = tc.Term(
+        "loss in the cold", outputs={"y": lambda x, p, y: y * (1 - p["a"] * (25 - x["T"]).clamp_min(0))},
+        parameters=[tc.Parameter("a", low=0.0, high=0.03)],
+    )  # fmt: skip
+    return base, cold
+
+
+@pytest.fixture
 def binding() -> tuple[tc.Simulator, list[tc.Term]]:
     """Response to a dose by saturation, and terms that a recording at several doses and ages may need."""
     base = tc.Simulator(

@@ -155,20 +155,13 @@ def test_a_base_that_cannot_be_calibrated_without_outliers_ends_no_diagnosis(mon
     assert ["bend"] in [told.terms, *told.tied]
 
 
-def test_a_gross_reading_that_a_wrong_term_bends_to_does_not_keep_the_right_one_from_leading():
+def test_a_gross_reading_that_a_wrong_term_bends_to_does_not_keep_the_right_one_from_leading(battery):
     rng, sd = np.random.default_rng(1005), 0.12
     x = {"I": rng.uniform(0.2, 6, 72), "T": rng.uniform(-10, 45, 72), "N": rng.uniform(0, 500, 72)}
     y = 10 / x["I"] ** 1.12 * (1 - 0.006 * np.clip(25 - x["T"], 0, None))
     y += sd * np.random.default_rng(0).standard_normal(72)
     y[[41, 46]] -= sd * np.array([7, 15])  # of the first a gain error where it is cold takes a part
-    base = tc.Simulator(
-        lambda x, p: p["C"] * x["I"] ** -p["k"],
-        parameters=[tc.Parameter("C", low=0.0, initial=8.0), tc.Parameter("k", low=0.8, high=1.6, initial=1.1)],
-    )
-    cold = tc.Term(
-        "loss in the cold", outputs={"y": lambda x, p, y: y * (1 - p["a"] * (25 - x["T"]).clamp_min(0))},
-        parameters=[tc.Parameter("a", low=0.0, high=0.03)],
-    )  # fmt: skip
+    base, cold = battery
     ageing = tc.Term(
         "ageing", outputs={"y": lambda x, p, y: y * (1 - p["a"] * x["N"])},
         parameters=[tc.Parameter("a", low=0.0, high=0.0018)],

@@ -22,6 +22,33 @@ def diagnose(model, recording, terms):
     return tc.diagnose(model, recording, terms, seed=0, progress=False)
 
 
+# --- terms in a window -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kicked", [True, False])
+def test_a_kick_is_no_term_from_then_on(kicked):
+    """A cart that is hit and rolls on is as much farther ahead as one whose wheels slip less from then on."""
+    t, k = torch.linspace(0, 10, 81, dtype=F64), 0.3
+    after = (t - 5).clamp_min(0)
+    x = 2 / k * (1 - torch.exp(-k * t))
+    x = x + 0.4 / k * (1 - torch.exp(-k * after)) if kicked else x + 0.6 * after.clamp_max(1.5)
+    x = x + 0.02 * torch.randn(81, generator=torch.Generator().manual_seed(3), dtype=F64)
+    base = tc.ODESimulator(
+        lambda t, s, p, u: {"x": s["v"], "v": -p["k"] * s["v"]}, {"x": "m", "v": "m/s"},
+        [tc.Parameter("k", low=0.0, high=3.0, initial=0.5)], observe=("x",),
+    )  # fmt: skip
+    slip = tc.Term("slip", rates={"x": lambda t, s, p, u: p["c"] * s["v"]}, parameters=[tc.Parameter("c")])
+    belt = tc.Term("moving belt", rates={"x": lambda t, s, p, u: p["w"] + 0 * t}, parameters=[tc.Parameter("w")])
+    recording = tc.Recording(runs=[tc.Run(t, {"x": x}, initial={"x": 0.0})], noise=0.02)
+    d = diagnose(base, recording, [slip, belt])
+    if kicked:
+        assert d.verdict == "ambiguous"
+        assert d.tied == [["slip"], [*NONE]]
+    else:
+        assert d.terms == ["moving belt"]
+
+
 # --- instruments that err beyond a value -----------------------------------------------------------------------------
 
 

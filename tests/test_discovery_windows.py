@@ -266,20 +266,13 @@ def test_a_burn_in_orbit_is_not_named_for_what_acts_from_then_on(burns):
         assert "sits in the equation vx and the equation vy and is sudden, at t = " in " ".join(str(d).split())
 
 
-def test_an_instrument_that_saturates_in_the_cold_alone_is_no_name():
+def test_an_instrument_that_saturates_in_the_cold_alone_is_no_name(battery):
     # A battery's time of discharge: less of it in the cold at small currents, which no term of the list says.
     rng = np.random.default_rng(6)
     x = {"I": rng.uniform(0.7, 8, 72), "T": rng.uniform(-10, 40, 72)}
     less = 0.3 / (1 + np.exp(np.clip(x["T"] / 0.8, -50, 50))) * np.exp(-((x["I"] / 3) ** 2))
     y = 10 / x["I"] ** 1.12 * (1 - less) + 0.07 * rng.standard_normal(72)
-    base = tc.Simulator(
-        lambda x, p: p["C"] * x["I"] ** -p["k"],
-        parameters=[tc.Parameter("C", low=0.0, initial=8.0), tc.Parameter("k", low=0.8, high=1.6, initial=1.1)],
-    )
-    cold = tc.Term(
-        "loss in the cold", outputs={"y": lambda x, p, y: y * (1 - p["a"] * (25 - x["T"]).clamp_min(0))},
-        parameters=[tc.Parameter("a", low=0.0, high=0.03)],
-    )  # fmt: skip
+    base, cold = battery
     data = tc.Recording(x={name: torch.tensor(values) for name, values in x.items()}, y=torch.tensor(y), noise=0.07)
     d = diagnose(base, data, [cold, *tc.terms.sensor("y", static=True)])
     assert d.terms == []

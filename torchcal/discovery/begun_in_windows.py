@@ -193,10 +193,10 @@ def _begin(
     for width, (low, high) in itertools.product(widths, ends):
         row = candidate.begin.clone()
         for i, name in enumerate(names):
-            if is_window(name):
+            if is_moment(name):
+                row[i] = 0.5 * (low + high)
+            elif is_window(name):
                 row[i] = width if name.endswith(WIDTH_OF_EDGE) else low if name.endswith("from") else high
-                if is_moment(name):
-                    row[i] = 0.5 * (low + high)
             elif i not in places:
                 row[i] = known.get(name, float(row[i]))
         rows.append(row)

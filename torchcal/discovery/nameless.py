@@ -130,8 +130,9 @@ class _Changes:
         those elsewhere that come nearest."""
         search = self.search
         near = [m for m in search.models if m.physical and m.window is not None and m.weight > lead.weight - CLOSE]
+        near.sort(key=lambda m: -m.weight)
         wanted: dict[tuple[Places, str], list[Hypothetical]] = {}
-        for model in sorted(near, key=lambda m: -m.weight)[:MOST]:
+        for model in near[:MOST]:
             where, window = places_of(model.candidate), model.window
             if where is None or window is None:
                 continue
@@ -151,12 +152,11 @@ class _Changes:
             for _, place, begun in sorted(others, key=lambda one: one[0])[:ELSEWHERE]:
                 wanted[place, window.driver] = begun
         self._refit([one for each in wanted.values() for one in each])
-        if self.search.problem.in_time:
-            self._hold_against_sudden(near)
+        self._hold_against_sudden(near)
 
     def _hold_against_sudden(self, near: Sequence[Model]) -> None:
         """Refit what changes a state in a moment when a window begins or ends, where no constant of the list leads:
-        what a kick leaves behind looks like what a term does from then on, or until then."""
+        what a kick leaves behind looks like what a term does from then on, or until then; the likeliest are first."""
         search, simulator = self.search, self.search.problem.simulator
         if not isinstance(simulator, Trajectories):
             return
@@ -167,7 +167,7 @@ class _Changes:
         first, last = float(t.min()), float(t.max())
         constant = [places_of(m.candidate) or () for m in near if search.constants.intersection(m.numbers)]
         named = set(itertools.chain.from_iterable(constant))
-        for model in sorted(near, key=lambda m: -m.weight)[:MOST]:
+        for model in near[:MOST]:
             own = places_of(model.candidate) or ()
             moved = tuple(place for place in own if place[0] == "rates" and place[1] in simulator.ode.states)
             alone = simulator.ode.states if len(simulator.ode.states) <= STATES else [name for _, name in moved]

@@ -138,12 +138,14 @@ def locate(
         share, evidence, extent = removed(search, local), _evidence(search, local), _extent(drivers)
         span = (low, high)
         if local is search.unnamed:
-            scale = search.spans()[w.driver]
-            ends = (end for end in (w.low, w.high) if math.isfinite(end) and scale.holds(end))
-            told: dict[str, Any] = {"edges": tuple(ends), "at": w.at}
+            told: dict[str, Any]
             if any(is_moment(local.found.problem.parameters[i].name) for i in local.candidate.own):
                 more = [("equation", name) for name in _equations(local.candidate.terms[0])[1:]]
                 told = {"moment": 0.5 * (w.low + w.high), "also": tuple(more)}
+            else:
+                scale = search.spans()[w.driver]
+                ends = (end for end in (w.low, w.high) if math.isfinite(end) and scale.holds(end))
+                told = {"edges": tuple(ends), "at": w.at}
         else:
             told = {"terms": local.names, "also": tuple(also)}
             span = _met(drivers, low, high) if _has_levels(search, w.driver) else span

@@ -14,7 +14,7 @@ from torchcal.simulators import Parameter
 from torchcal.terms import Term
 
 __all__ = [
-    "EDGE", "ENDS", "MOMENT", "SHORT", "WIDTHS", "Span", "beyond", "driver_at", "force", "is_moment",
+    "EDGE", "ENDS", "SHORT", "WIDTHS", "Span", "beyond", "driver_at", "force", "is_moment",
     "is_window", "localised", "multiplied", "region_text", "sudden",
 ]  # fmt: skip
 
